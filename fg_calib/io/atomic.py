@@ -13,8 +13,6 @@ from tempfile import TemporaryDirectory
 
 from fg_calib.errors import InputError
 
-NO_MEMORY = "there is not enough memory for it"
-
 _noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
 
 
@@ -35,20 +33,16 @@ def read_bytes(path: Path) -> bytes:
     Raises:
         InputError: There is no such file, it may not be read, or it is a folder, a pipe or a device.
     """
-    name = _short(str(path))
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
-            raise InputError(name, "is a folder" if stat.S_ISDIR(mode) else "is a pipe or a device", "a file")
+            raise InputError(str(path), "is a folder" if stat.S_ISDIR(mode) else "is a pipe or a device", "a file")
         content = path.read_bytes()
     except FileNotFoundError:
-        raise InputError(name, "no such file") from None
-    except PermissionError:
-        raise InputError(name, "may not be read", hint="check the permissions of file and folder") from None
-    except MemoryError:
-        raise InputError(name, NO_MEMORY) from None
-    except (OSError, ValueError) as error:  # ValueError: a path with a null character
-        raise InputError(name, f"cannot be read: {getattr(error, 'strerror', None) or error}", "a file") from None
+        raise InputError(_short(str(path)), "no such file") from None
+    except (OSError, ValueError, MemoryError) as error:  # ValueError: a path with a null character
+        found = f"cannot be read: {getattr(error, 'strerror', None) or error or 'there is not enough memory for it'}"
+        raise InputError(_short(str(path)), found, "a file that can be") from None
     noted = _noted.get()
     if noted is not None:
         noted[path] = hashlib.sha256(content).hexdigest()
@@ -70,18 +64,14 @@ def decoded(content: bytes, name: str) -> str:
     Raises:
         InputError: It is something else; the message names the line and the byte.
     """
-    if content.startswith((b"\xff\xfe", b"\xfe\xff", b"\0\0\xfe\xff")):
-        raise InputError(name, "UTF-16 or UTF-32 text", "UTF-8 text", "save it as UTF-8")
-    if b"\0" in content:
-        line = content.partition(b"\0")[0].count(b"\n") + 1
-        hint = "is it UTF-16, or no text at all? save it as UTF-8"
-        raise InputError(f"{name}:{line}", "a null character", "UTF-8 text", hint)
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        hint = "is it Latin-1 or Windows text? save it as UTF-8"
-        raise InputError(f"{name}:{line}", f"byte {content[error.start]:#04x}", "UTF-8 text", hint) from None
+    at, found = content.find(b"\0"), "a null character"
+    if at < 0:
+        try:
+            return content.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            at, found = error.start, f"byte {content[error.start]:#04x}"
+    line = content.count(b"\n", 0, at) + 1
+    raise InputError(f"{name}:{line}", found, "UTF-8 text", "is it UTF-16, Latin-1 or Windows text? save it as UTF-8")
 
 
 def digest_of(path: Path) -> str:
@@ -95,19 +85,16 @@ def digest_of(path: Path) -> str:
 
 def exists(path: Path) -> bool:
     """Whether there is a file or folder; False for a name that no file can have."""
-    return _answered(path.exists)
+    with suppress(OSError, ValueError):
+        return path.exists()
+    return False
 
 
 def is_folder(path: Path) -> bool:
     """Whether there is a folder; False for a name that no folder can have."""
-    return _answered(path.is_dir)
-
-
-def _answered(ask: Callable[[], bool]) -> bool:
-    try:
-        return ask()
-    except (OSError, ValueError):
-        return False
+    with suppress(OSError, ValueError):
+        return path.is_dir()
+    return False
 
 
 def _short(path: str) -> str:
@@ -124,16 +111,11 @@ def replacing(path: Path) -> Iterator[Path]:
     if not is_folder(path.parent):
         raise InputError(_short(str(path)), f"there is no folder {path.parent}")
     try:
-        with _temporary_in(path.parent) as temporary:
-            yield Path(temporary, path.name)
-            os.replace(Path(temporary, path.name), path)
+        with TemporaryDirectory(prefix=".fg-calib-", dir=path.parent, ignore_cleanup_errors=True) as made:
+            yield Path(made, path.name)  # on the same disk, where a move is atomic
+            os.replace(Path(made, path.name), path)
     except OSError as error:
         raise InputError(str(path), f"cannot be written: {error.strerror or error}") from None
-
-
-def _temporary_in(folder: Path) -> TemporaryDirectory[str]:
-    """A temporary folder beside the files that will be moved out of it: on the same disk, a move is atomic."""
-    return TemporaryDirectory(prefix=".fg-calib-", dir=folder, ignore_cleanup_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -165,10 +147,9 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
     missing = [f for f in (folder, *folder.parents) if not exists(f)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with _temporary_in(folder) as made:
-            temporary = Path(made)
-            _write_to(temporary, write, folder)
-            names = sorted((file.name for file in temporary.iterdir()), key=lambda name: name == last)
+        with TemporaryDirectory(prefix=".fg-calib-", dir=folder, ignore_cleanup_errors=True) as made:
+            _write_to(Path(made), write, folder)
+            names = sorted((file.name for file in Path(made).iterdir()), key=lambda name: name == last)
             require_own(folder, own)
             for name in names:
                 if (folder / name).is_dir():
@@ -176,7 +157,7 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
             for name in set(own).difference(names):
                 (folder / name).unlink(missing_ok=True)
             for name in names:
-                os.replace(temporary / name, folder / name)
+                os.replace(Path(made, name), folder / name)
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         found = f"cannot be written: {getattr(error, 'strerror', None) or error}"
         raise InputError(_short(str(folder)), found, "a folder that can be") from error
@@ -229,9 +210,7 @@ def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
     first = next(iter(own), "")
     for name, beginning in own.items():
         path = folder / name
-        if path.is_symlink() and not exists(path):
-            raise InputError(str(path), "is a link to nothing", "a place for a file")
-        if not exists(path):
+        if not os.path.lexists(path):
             continue
         if not path.is_file():
             raise InputError(str(path), "is no file", "a place for a file")
@@ -240,8 +219,6 @@ def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
 
 
 def _begins(path: Path, beginning: bytes) -> bool:
-    try:
-        with path.open("rb") as file:
-            return file.read(len(beginning)) == beginning
-    except OSError:
-        return False
+    with suppress(OSError), path.open("rb") as file:
+        return file.read(len(beginning)) == beginning
+    return False

@@ -58,32 +58,17 @@ _log = logging.getLogger(__name__)
 UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
 """Where the noise starts from if it is to be estimated and nothing was stated."""
 
-_UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m"}
+_UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
 _UNITS |= {name: column.si for name, column in GENERIC_COLUMNS.items()}
-"""Units of the kinds of noise; that of joints is in the joint's unit, that of pixels in pixels."""
+"""Units of the kinds of noise; that of joints is in the joint's unit."""
 
 
-class _NoiseOfFields(Schema):
-    position: Positive | None = None
-    orientation: Positive | None = None
-    joint: Any = 0.0
-    distance: Positive | None = None
-    angle: Positive | None = None
-    point: Positive | None = None
-    pixel: Positive | None = None
-    estimate: StrictBool = False
-
-
-_GENERIC: dict[str, Any] = dict.fromkeys(GENERIC_COLUMNS, (Positive | None, None))
-_Noise = create_model("_Noise", __base__=_NoiseOfFields, **_GENERIC)
-
-
-class _OneJointNoise(Schema):
-    joint: NotNegative
+_SIGMAS: dict[str, Any] = dict.fromkeys(_UNITS, (Positive | None, None))
+_Noise = create_model("_Noise", __base__=Schema, joint=(Any, 0.0), estimate=(StrictBool, False), **_SIGMAS)
 
 
 class _JointNoises(Schema):
-    joint: tuple[NotNegative, ...]
+    joint: Annotated[tuple[NotNegative, ...], BeforeValidator(lambda one: one if isinstance(one, list) else (one,))]
 
 
 class _RandomPairing(Schema):
@@ -91,13 +76,15 @@ class _RandomPairing(Schema):
     seed: Seed = 0
 
 
-class _Column(Schema):
-    name: str
-    scale: Number = 1.0
-    zero: Number = 0.0
-
-
-_Columns = dict[str, Annotated[_Column, BeforeValidator(lambda c: {"name": c} if isinstance(c, str) else c)]]
+_Columns = dict[
+    str,
+    Annotated[
+        Column,
+        BeforeValidator(refuse_unknown_keys("name", "scale", "zero")),
+        BeforeValidator(lambda one: {"name": one} if isinstance(one, str) else one),
+    ],
+]
+"""What a table calls its columns: by the name that is known here."""
 
 
 class _Point(Schema):
@@ -149,7 +136,9 @@ class _Job(Schema):
     truth: FilePath | None = None
     targets: Mapping[str, _Point] = Field(default_factory=dict)
     anchors: Mapping[str, _Point] = Field(default_factory=dict)
-    tolerance: Any = None
+    tolerance: Annotated[
+        _Tolerances, BeforeValidator(lambda one: {"estimate": "kind"} if one == "estimate" else one or {})
+    ] = _Tolerances()
     offset: Literal["estimate"] | None = None
     camera: Any = None
     columns: _Columns | None = None
@@ -165,13 +154,8 @@ _CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encode
 _OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
 """Keys of a job that say nothing of how a table is read."""
 
-_USED_BY: dict[str, tuple[Model, ...]] = {
-    "targets": tuple(POSE_MODELS),
-    "anchors": ("anchor",),
-    "offset": ("anchor",),
-    "camera": ("pixels",),
-}
-"""Models that keys are for."""
+_USED_BY: dict[str, tuple[Model, ...]] = {"targets": tuple(POSE_MODELS), "anchors": ("anchor",)}
+"""Models that known points are for."""
 
 
 @checked
@@ -205,7 +189,7 @@ def _read_job(path: Path) -> Job:
     options = Options.of(
         **{key: getattr(file, key) for key in _CHOICES if key in file.model_fields_set} | {"model": tables[0].model},
         estimate_noise=estimate_noise,
-        estimate_tolerance=_tolerances(file.tolerance, path.name).estimate,
+        estimate_tolerance=file.tolerance.estimate,
         pairing=pairing_of(file.pairing, f"{path.name}: pairing"),
         accept=_limits(file.accept, file.units, f"{path.name}: accept"),
     )
@@ -296,13 +280,9 @@ def _tables(file: _Job, robot: Robot, path: Path) -> list[Table]:
     read: list[_Entry] = [validate(_Entry, one, place) for one, place in zip(entries, places, strict=True)]
     points: list[str] = []  # of all tables, as pairs may name those of another
     if len(read) > 1 and any(entry.pairs is not None for entry in read):
-        for entry, place in zip(read, places, strict=True):
-            points += read_points(folder / entry.table, _columns(entry, file, place, path.name))
-    tables = [_table(*one, file, robot, path, points) for one in zip(read, places, strict=True)]
-    for key, models in _USED_BY.items():
-        if getattr(file, key) and not any(table.model in models for table in tables):
-            _log.warning("%s: %s is not used: no table is of model %s", path.name, key, " or ".join(models))
-    return tables
+        for entry in read:
+            points += read_points(folder / entry.table, entry.columns or file.columns)
+    return [_table(*one, file, robot, path, points) for one in zip(read, places, strict=True)]
 
 
 def _table(entry: _Entry, place: str, file: _Job, robot: Robot, path: Path, points: Sequence[str]) -> Table:
@@ -324,7 +304,7 @@ def _table(entry: _Entry, place: str, file: _Job, robot: Robot, path: Path, poin
         noise=noise,
         points=points,
         model=model,
-        columns=_columns(entry, file, place, path.name),
+        columns=entry.columns or file.columns,
     )
     camera, fixed = camera_in(
         file.camera if entry.camera in (None, "fixed") else entry.camera, f"{place}: camera", folder
@@ -342,24 +322,12 @@ def _table(entry: _Entry, place: str, file: _Job, robot: Robot, path: Path, poin
     )
 
 
-def _columns(entry: _Entry, file: _Job, place: str, job: str) -> dict[str, Column]:
-    """What a table calls its columns: by the name that is known here."""
-    given, place = (file.columns, job) if entry.columns is None else (entry.columns, place)
-    found = {}
-    for name, one in (given or {}).items():
-        try:
-            found[name] = Column(one.name, one.scale, one.zero)
-        except InputError as error:
-            raise InputError(f"{place}: columns: {name}", error.found, error.expected) from None
-    return found
-
-
 def _known_points(file: _Job, model: Model, place: str) -> dict[str, KnownPoint]:
     """Targets or anchors, whatever a model has, that the job says something of."""
     key = "anchors" if model == "anchor" else "targets"
     if model not in _USED_BY[key]:
         return {}
-    for_all, found = getattr(_tolerances(file.tolerance, place), key), {}
+    for_all, found = getattr(file.tolerance, key), {}
     for name, point in getattr(file, key).items():
         sigma, said_by = point.tolerance, f"{place}: {key}: {name}: tolerance"
         if sigma is None:
@@ -392,13 +360,6 @@ def camera_in(given: object, place: str, folder: Path) -> tuple[Camera | None, b
     return (read_camera(folder / given) if isinstance(given, str) else camera_of(given, place)), fixed
 
 
-def _tolerances(given: object, place: str) -> _Tolerances:
-    """Tolerances of targets and anchors, and whether the robot's are estimated."""
-    if given == "estimate":
-        return _Tolerances(estimate="kind")
-    return validate(_Tolerances, {} if given is None else given, f"{place}: tolerance")
-
-
 def _limits(given: object, units: Units, place: str) -> Limits:
     """The errors that the user accepts, in [m] and [rad]."""
     if not isinstance(given, dict):
@@ -421,7 +382,6 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     file = validate(_JobOfOneTable, {"robot": ".", "measurements": ".", **choices}, place)
     pairing_of(file.pairing, f"{place}: pairing")
     _limits(file.accept, file.units, f"{place}: accept")
-    _tolerances(file.tolerance, place)
     check_names(f"{place}: prefer", file.prefer, names_of(robot.parameters))
 
 
@@ -481,12 +441,11 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
         raise InputError(place, f"found {shown(given)}", "a mapping of sigmas, or estimate")
     file: Any = validate(_Noise, given or {}, place)
     stated: dict[str, Any] = {
-        key: units.sigma(sigma, unit, f"{place}: {key}")
+        key: units.sigma(sigma, unit, f"{place}: {key}") if unit in ("m", "rad") else sigma
         for key, unit in _UNITS.items()
         if (sigma := getattr(file, key)) is not None
     }
-    noise = Noise(joint=joint_noise(file.joint, units, robot, place), pixel=file.pixel)
-    noise = noise.updated(**stated)
+    noise = Noise(joint=joint_noise(file.joint, units, robot, place)).updated(**stated)
     if not file.estimate:
         return noise, False
     missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1] if getattr(noise, f.name) is None}
@@ -499,17 +458,11 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
     Raises:
         InputError: It is neither.
     """
-    if isinstance(given, list):
-        sigmas = validate(_JointNoises, {"joint": given}, place).joint
-        if len(sigmas) != robot.n_joints:
-            expected = f"one for all or {robot.n_joints}, one a joint"
-            raise InputError(f"{place}: joint", f"{len(sigmas)} figures", expected)
-    else:
-        sigmas = (validate(_OneJointNoise, {"joint": given}, place).joint,) * robot.n_joints
-        kinds = {joint.unit: joint.name for joint in reversed(robot.joints)}
-        if sigmas[0] > 0.0 and len(kinds) > 1:
-            words = " and ".join(f"{given} {units.name(unit)} for {name}" for unit, name in sorted(kinds.items()))
-            _log.warning("%s: joint: %s is %s; a list has one figure a joint", place, given, words)
+    sigmas = validate(_JointNoises, {"joint": given}, place).joint
+    if not isinstance(given, list):
+        sigmas *= robot.n_joints
+    if len(sigmas) != robot.n_joints:
+        raise InputError(f"{place}: joint", f"{len(sigmas)} figures", f"one for all or {robot.n_joints}, one a joint")
     return tuple(units.sigma(s, j.unit, f"{place}: joint") for s, j in zip(sigmas, robot.joints, strict=True))
 
 

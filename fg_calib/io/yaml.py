@@ -117,6 +117,8 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
         return schema.model_validate(value)
     except ValidationError as error:
         raise first_misfit(error, place) from None
+    except InputError as error:  # of a type that checks itself
+        raise InputError(f"{place}: {error.place}", error.found, error.expected, error.hint) from None
 
 
 def first_misfit(error: ValidationError, place: str) -> InputError:

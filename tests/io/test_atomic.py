@@ -82,7 +82,7 @@ def test_asking_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
             "is there already, not written by this command, expected another folder",
         ),
         (lambda path: path.mkdir(), "is no file, expected a place for a file"),
-        (lambda path: path.symlink_to("nowhere"), "is a link to nothing, expected a place for a file"),
+        (lambda path: path.symlink_to("nowhere"), "is no file, expected a place for a file"),
     ],
 )
 def test_what_others_wrote_is_not_replaced(tmp_path, make, message):

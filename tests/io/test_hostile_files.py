@@ -19,7 +19,7 @@ from fg_calib.sizes import ORDINARY
 ROWS_OF_DH = [[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]]
 ARM = Robot.from_dh(ROWS_OF_DH, convention="dh")
 ROWS = "q1,q2,q3,x,y,z\n0.1,0.2,0.3,1,2,3\n0.4,0.5,0.6,4,5,6\n"
-UTF_16 = "UTF-16 or UTF-32 text, expected UTF-8 text; save it as UTF-8"
+UTF_16 = "a null character, expected UTF-8 text; is it UTF-16, Latin-1 or Windows text? save it as UTF-8"
 
 YAML = {
     "a: &a [*a]\n": "robot.yaml:1: found unconstructable recursive node",
@@ -28,7 +28,7 @@ YAML = {
     "a: !!bool abc\n": "robot.yaml:1: 'abc' is no YAML of type bool",
     "a: !!timestamp x\n": "robot.yaml:1: 'x' is no YAML of type timestamp",
     "a: !!float x\n": "robot.yaml:1: 'x' is no YAML of type float",
-    "a: 1".encode("utf-16"): f"robot.yaml: {UTF_16}",
+    "a: 1".encode("utf-16"): f"robot.yaml:1: {UTF_16}",
 }
 
 
@@ -42,7 +42,7 @@ def test_no_yaml_hangs_or_ends_in_a_traceback(tmp_path, text):
 
 
 TABLES = {
-    ROWS.encode("utf-16"): f"poses.csv: {UTF_16}",
+    ROWS.encode("utf-16"): f"poses.csv:1: {UTF_16}",
     ROWS.replace("0.2", "9" * 200_000): f"poses.csv:2: q2: found '{'9' * 47}...999999..., expected a finite number",
     ROWS.replace("0.2", '"0.2'): "poses.csv:2: a quote that is not closed, expected whole cells in quotes, or none",
     "\n\n" + ROWS.replace("0.2", ""): "poses.csv:4: q2: found an empty cell, expected a finite number",

@@ -1,7 +1,5 @@
 """Tables and jobs of instruments: what is read is what stands there, and what cannot be used is named."""
 
-import json
-
 import numpy as np
 import pytest
 import yaml
@@ -205,17 +203,6 @@ def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):
     assert str(error.value).startswith(message)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("instrument", ["anchors offset", "targets stations"])
-def test_the_command_compares_instruments(instrument, fg_calib, tmp_path):
-    robot, _, table = measured_by(instrument, np.random.default_rng(27))
-    ended = fg_calib("compare", write_files(tmp_path, robot, table, KEYS[instrument]), "--json")
-    assert (ended.code, ended.err) == (0, "")
-    document = json.loads(ended.out)
-    assert (document["model"], document["frame"]) == (table.model, table.frame)
-    assert all(e["converged"] for e in document["estimates"])
-
-
 @pytest.mark.parametrize(("column", "word"), [("anchor", "NA"), ("plane", "nan"), ("station", "-"), ("target", "None")])
 def test_a_word_for_nothing_is_no_name(column, word, tmp_path):
     """R writes NA where there is none, Python nan or None: an unknown of that name would take the row's error up."""
@@ -236,24 +223,6 @@ def test_a_place_of_a_misspelt_name_is_not_left_out(tmp_path):
     with pytest.raises(InputError) as error:
         calibrate_job(write_files(tmp_path, robot, table, {"anchors": {"A0": place}}))
     assert str(error.value) == "anchors: no row is of 'A0', expected one of a0, a1, a2; did you mean a0?"
-
-
-@pytest.mark.slow
-def test_a_place_of_what_no_row_is_of_is_told_of(tmp_path, caplog):
-    """One list of anchors may serve many jobs."""
-    robot, _, table = measured_by("anchors", np.random.default_rng(31))
-    place = {"x": 0, "y": 0, "z": 0}
-    calibrate_job(write_files(tmp_path, robot, table, {"anchors": {"ceiling": place}}))
-    assert "anchors: no row is of 'ceiling'; it is not used" in caplog.messages
-
-
-def test_a_key_of_another_instrument_is_told_of(tmp_path, caplog):
-    robot, _, table = measured_by("planes", np.random.default_rng(33))
-    read_job(write_files(tmp_path, robot, table, {"offset": "estimate", "camera": "camera.yaml"}))
-    assert caplog.messages == [
-        "job.yaml: offset is not used: no table is of model anchor",
-        "job.yaml: camera is not used: no table is of model pixels",
-    ]
 
 
 def test_contacts_alone_say_nothing_of_an_offset(tmp_path):
@@ -283,14 +252,3 @@ def test_a_camera_of_arrays_is_checked_too(figures, message):
     with pytest.raises(InputError) as error:
         Camera(**({"fx": 900, "fy": 900, "cx": 640, "cy": 480} | figures))
     assert str(error.value) == message
-
-
-@pytest.mark.slow
-def test_observe_knows_them_before_and_after_they_are_measured(fg_calib, tmp_path):
-    robot, _, table = measured_by("anchors", np.random.default_rng(28))
-    write_files(tmp_path, robot, table, {})
-    for more in ((), ("--configurations", tmp_path / "table.csv", "--length", "mm", "--angle", "deg")):
-        ended = fg_calib("observe", tmp_path / "robot.yaml", "--model", "anchor", *more)
-        assert ended.code == 0
-        assert "rank 10 of 16" in ended.out
-        assert "the measurement is blind to the base" in " ".join(ended.out.split())

@@ -99,11 +99,6 @@ def test_noise_fills_what_the_table_does_not_state(write):
     assert (m.rotation, m.sigma_orientation) == (None, None)
 
 
-def test_a_quaternion_is_normalised(write):
-    path = write("q1,q2,q3,qx,qy,qz,qw\n0,0,0,0,0,0.6005,0.8005\n")
-    assert np.linalg.det(read_measurements(path, ARM).rotation[0]) == pytest.approx(1, abs=rounding(1.0))
-
-
 def test_columns_may_bear_the_joints_names_in_any_order(write):
     robot = arm(Joint("base_yaw"), Joint("q1"))
     m = read_measurements(write("q1,base_yaw\n1,2\n"), robot)
@@ -149,11 +144,6 @@ def test_cells_may_have_semicolons_or_tabs_between_and_numbers_decimal_commas(wr
     assert found.position.tolist() == [[1.5, 2.0, 3.0], [1.5, 2.0, 3.0]]
     assert found.ids.tolist() == ["p1", "a,b"]
     assert read_measurements(write(SPREADSHEET), ARM).ids.tolist() == ["p1", "a;b"]
-
-
-def test_pairs_may_have_semicolons_too(write):
-    found = read_measurements(write(POSES), ARM, pairs=write("a;b;distance\np1;p2;0,5\n", "pairs.csv"))
-    assert found.pairs.distance.tolist() == [0.5]
 
 
 OWN = {"q1": Column("J1 [counts]", scale=0.001, zero=32768), "q2": Column(" A2 "), "q3": Column("lift axis")}
@@ -237,14 +227,6 @@ def test_a_written_table_reads_back_exactly(tmp_path, rows, units):
     assert np.array_equal(m.readings, values * [units.factor(j.unit) for j in robot.joints])
 
 
-def test_columns_of_all_types_are_written(tmp_path):
-    write_csv(tmp_path / "out.csv", {"id": np.array(["a", "b"]), "n": [1, 2], "v": [0.1, np.nan], "t": [True, False]})
-    assert (tmp_path / "out.csv").read_text() == "id,n,v,t\na,1,0.1,true\nb,2,NaN,false\n"
-    with pytest.raises(InputError) as caught:
-        write_csv(tmp_path / "nowhere" / "out.csv", {"n": [1]})
-    assert str(caught.value) == f"{tmp_path / 'nowhere' / 'out.csv'}: there is no folder {tmp_path / 'nowhere'}"
-
-
 def test_pairs_name_configurations_by_id(write):
     noise = Noise(distance=0.02, angle=0.03)
     pairs = read_measurements(write(POSES), ARM, pairs=write(PAIRS, "pairs.csv"), noise=noise).pairs
@@ -298,58 +280,29 @@ JOINTS = "expected q1 to q3 for the robot's 3 joints, or their names q1, q2, lif
 WIDEN = "; widen the joint's limits if the reading is right"
 
 MISTAKES = [
-    ("", "poses.csv:1: an empty file, expected a header and rows"),
-    ("q1,q2,q3\n", "poses.csv: no rows, expected at least one"),
     ("q1,q2,q3\n\n\n", "poses.csv: no rows, expected at least one"),
-    ("q1,q2,q2\n0,0,0\n", "poses.csv:1: two columns called 'q2', expected different names"),
-    (changed("q3,id", "id"), "poses.csv:2: 13 cells, expected 12 as in the header"),
     (changed("q3,id", "q3,q4"),
      f"poses.csv: 4 joint columns (q1, q2, q3, q4), {JOINTS} q1, q2, q3, q4, {COLUMNS[4:]}"),
     ("q1,lift\n0,0\n", f"poses.csv: 2 joint columns (q1, lift), {JOINTS} q1, lift"),
-    (changed(",z,", ",w,"), "poses.csv: no column z, expected x y z together"),
-    (changed(",qw,", ",w,"), "poses.csv: no column qw, expected qx qy qz qw together"),
-    ("q1,q2,q3,roll,yaw\n0,0,0,0,0\n", "poses.csv: no column pitch, expected roll pitch yaw together"),
     ("q1,q2,q3,roll,pitch,yaw,qx,qy,qz,qw\n0,0,0,0,0,0,0,0,0,1\n",
      "poses.csv: both qx qy qz qw and roll pitch yaw, expected one of the two"),
-    ("q1,q2,q3,x,y,z,sigma_position,sigma_y\n0,0,0,0,0,0,1,1\n",
-     "poses.csv: both sigma_position and sigma_y, expected one of the two"),
-    ("q1,q2,q3,x,y,z,sigma_x,sigma_y\n0,0,0,0,0,0,1,1\n",
-     "poses.csv: no column sigma_z, expected sigma_x sigma_y sigma_z together"),
-    (changed("0.2,0.3", "abc,0.3"), "poses.csv:2: q2: found 'abc', expected a finite number"),
-    (changed("-0.2,0.1", ",0.1"), "poses.csv:3: q2: found an empty cell, expected a finite number"),
     (changed("-0.2,0.1", "  ,0.1"), "poses.csv:3: q2: found an empty cell, expected a finite number"),
     (changed("1.5,2,3", "NaN,2,3"), "poses.csv:3: x: found 'NaN', expected a finite number"),
-    (changed("-1,2,3", "-1,-inf,3"), "poses.csv:4: y: found '-inf', expected a finite number"),
     (changed("0,0.6,0,0.8", "0,0.6,0,0.802"), "poses.csv:4: quaternion of norm 1.0016, expected 1 within 0.001"),
-    (changed("1,0,0,0", "0,0,0,0"), "poses.csv:3: quaternion of norm 0, expected 1 within 0.001"),
-    (changed(",test", ",Test"), "poses.csv:4: split: found 'Test', expected train or test"),
-    (changed("p3", "p1"), "poses.csv:4: id: found 'p1', expected different ids; the same as poses.csv:2"),
-    (changed("p2", ""), "poses.csv:3: id: found an empty cell, expected an id"),
     (changed("p2,", ""), "poses.csv:3: 12 cells, expected 13 as in the header"),
     (changed("first", "first,2"), "poses.csv:2: 14 cells, expected 13 as in the header"),
-    ('q1,q2,q3\n"0,0,0\n', "poses.csv:2: 1 cell, expected 3 as in the header; "
+    ('q1,q2,q3\n"0,0,0\n0",1,1\n', "poses.csv:2: q1: found '0,0,0\\n0', expected a finite number"),
+    ('q1,q2,q3\n"0,0,\n0,1,1"\n', "poses.csv:2: 1 cell, expected 3 as in the header; "
      "a quote joins it with lines below: is one missing?"),
-    (
-        b"q1,q2,q3\n0,0,\xe9\n",
-        "poses.csv:2: byte 0xe9, expected UTF-8 text; is it Latin-1 or Windows text? save it as UTF-8",
-    ),
-    (changed("1e-3", "2.092"), f"poses.csv:3: q1 = 2.092 rad is outside [-2.09, 2.09]{WIDEN}"),
-    (changed("1e-3", "4.71"), "poses.csv:3: q1 = 4.71 rad is outside [-2.09, 2.09]; is q1 in deg?"),
-    (changed("1e-3", "200"), f"poses.csv:3: q1 = 200 rad is outside [-2.09, 2.09]{WIDEN}"),
     (changed("0.2,0.3", "0.2,300"), "poses.csv:2: q3 = 300 m is outside [0, 0.5]; is the table in mm?"),
     (changed("0.2,0.3", "0.2,-0.01"), f"poses.csv:2: q3 = -0.01 m is outside [0, 0.5]{WIDEN}"),
-    ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,1\n0,0,0,0,0,0,-1\n",
-     "poses.csv:3: sigma_position: found '-1', expected a number above 0"),
     ("q1,q2,q3,x,y,z,sigma_x,sigma_y,sigma_z\n0,0,0,0,0,0,1,0,1\n",
      "poses.csv:2: sigma_y: found '0', expected a number above 0"),
-    ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,inf\n",
-     "poses.csv:2: sigma_position: found 'inf', expected a finite number"),
     ("q1,q2,q3,x,y,z,sigma_position\n0,0,0,0,0,0,\n",
      "poses.csv:2: sigma_position: found an empty cell, expected a finite number"),
 ]  # fmt: skip
 
 
-@pytest.mark.sampled(22)
 @pytest.mark.parametrize(("table", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_a_mistake_is_named_in_one_line(write, table, message):
     with pytest.raises(InputError) as caught:
@@ -394,19 +347,9 @@ def test_a_joint_without_limits_that_seems_to_be_in_degrees_is_warned_of(write, 
 
 
 PAIR_MISTAKES = [
-    (changed("a,b", "a,c", PAIRS), "pairs.csv: no column b, expected a and b, the two configurations of a pair"),
     ("a,b\np1,p2\n", "pairs.csv: neither distance nor angle, expected at least one of the columns"),
     ("a,b,distance\n", "pairs.csv: no rows, expected at least one"),
-    (changed("p1,p3", "p1,p99", PAIRS), "pairs.csv:4: b = 'p99' is not an id of poses.csv"),
-    (changed("p1,p3", ",p3", PAIRS), "pairs.csv:4: a: found an empty cell, expected a configuration"),
-    (changed("p1,p3", "p3,p3", PAIRS), "pairs.csv:4: a and b are both 'p3', expected two different configurations"),
-    (changed("0.5,,", "-0.5,,", PAIRS), "pairs.csv:2: distance: found '-0.5', expected a number not below 0"),
-    (changed("0.5,,", "long,,", PAIRS), "pairs.csv:2: distance: found 'long', expected a finite number"),
-    (changed("3.1", "3.2", PAIRS),
-     "pairs.csv:3: angle: found '3.2', expected 0 to 3.14159 rad; is the table in deg?"),
-    (changed("3.1", "-0.1", PAIRS), "pairs.csv:3: angle: found '-0.1', expected 0 to 3.14159 rad"),
     (changed("0.01", "-0.01", PAIRS), "pairs.csv:2: sigma_distance: found '-0.01', expected a number above 0"),
-    (changed("train", "fit", PAIRS), "pairs.csv:4: split: found 'fit', expected train or test"),
 ]  # fmt: skip
 
 
