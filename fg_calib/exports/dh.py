@@ -132,8 +132,6 @@ def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHE
     if robot.convention == convention != "dh-hayati":
         return TableRobot(robot, ())
     farthest = farthest * robot.reach
-    if convention != "dh-hayati":
-        links = _with_slides_placed(robot, links, farthest)
     rows, base, tool, nearly = _rows(links, convention, farthest)
     builder = RobotBuilder(robot.name, convention)
     builder.add_frame("base", frame_values("base", _tidy(base)), 0, False)
@@ -270,33 +268,6 @@ def _is_same(first: Floats, second: Floats) -> bool:
 def _tidy(T: Floats) -> Floats:
     """A transform without what is rounding."""
     return np.eye(4) if _is_same(T, np.eye(4)) else rigid(T[:3, :3], np.where(np.abs(T[:3, 3]) > SAME, T[:3, 3], 0.0))
-
-
-def _with_slides_placed(robot: Robot, links: Links, farthest: float) -> Links:
-    """The same arm with the axes of slides where rows can hold them: of a slide only the direction matters.
-
-    An axis that is nearly parallel to a neighbour is put through the neighbour's origin, so that they meet there.
-    """
-    between = list(links.between)
-    for i, joint in enumerate(robot.joints):
-        if not joint.prismatic:
-            continue
-        before, behind = between[i], between[i + 1]
-        shifts = [np.zeros(3), -before[:3, :3].T @ before[:3, 3], behind[:3, 3]]  # in the frame of the slide
-        for shift in shifts:
-            moved = rigid(np.eye(3), shift)
-            placed = before @ moved, inverse(moved) @ behind
-            inner = [M for k, M in zip((i, i + 1), placed, strict=True) if 0 < k < robot.n_joints]
-            if all(_away(M) <= farthest for M in inner):
-                between[i : i + 2] = placed
-                break
-    return replace(links, between=tuple(between))
-
-
-def _away(M: Floats) -> float:
-    """How far along either axis their common normal is, [m]."""
-    row = common_normal(M)
-    return max(abs(row["d"]), abs(float(left_over(M, row)[2, 3])))
 
 
 # --- rigid transforms between joints ----------------------------------------------------------------------------------

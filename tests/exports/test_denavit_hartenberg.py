@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from exported import matrix, off, scara, ur10
+from exported import matrix, off, scara
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Robot, export
+from fg_calib import Robot
 from fg_calib.exports.dh import (
     FARTHEST,
     PARALLEL,
@@ -32,7 +32,7 @@ def lines(M):
     return abs(p @ n) / np.linalg.norm(n), np.arctan2(np.linalg.norm(n), z[2])
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_and_alpha_are_distance_and_angle_of_the_axes(seed):
     rng = np.random.default_rng(seed)
     M = matrix(Rotation.random(random_state=seed).as_matrix(), rng.uniform(-1, 1, 3))
@@ -46,7 +46,7 @@ def test_a_and_alpha_are_distance_and_angle_of_the_axes(seed):
     assert rest[:2, 3] == pytest.approx([0, 0], abs=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_hayatis_row_ends_on_the_next_axis_within_the_plane_of_the_frame(seed):
     rng = np.random.default_rng(seed)
     R = Rotation.from_rotvec([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-3, 3)]).as_matrix()
@@ -110,23 +110,6 @@ def test_there_and_back_is_the_same_arm(there, back):
         assert max(error.position_max, error.rotation_max) < EXACT
 
 
-@pytest.mark.parametrize("convention", ["dh", "mdh"])
-def test_the_axis_of_a_slide_is_put_where_a_row_can_hold_it(convention):
-    """Only its direction matters: a slide that is nearly parallel to a neighbour meets it, whatever the tilt."""
-    rows = [
-        [0.3, 1.2, 0.2, 0.1, 0.0],
-        [0.4, 1e-4, 0.1, 0.2, 2e-4],
-        [0.2, 1.0, 0.1, 0.0, 0.0],
-        [0.1, 0.7, 0.0, 0.0, 0.0],
-    ]
-    types = ["revolute", "revolute", "prismatic", "revolute"]
-    robot = Robot.from_dh(rows, "dh-hayati", types=types)
-    table = in_table(robot, convention)
-    assert table.nearly == ()
-    error = errors(table.robot, robot, drawn(robot, 1000, 0))
-    assert max(error.position_max, error.rotation_max) < EXACT
-
-
 def test_links_of_an_arm_are_its_chain():
     robot = off(scara())
     links = links_of(robot)
@@ -138,10 +121,3 @@ def test_links_of_an_arm_are_its_chain():
         T = T @ L @ moved
     at = poses(robot, q[None])
     assert T @ links.between[-1] @ links.tool == pytest.approx(matrix(at.rotation[0], at.position[0]), abs=1e-14)
-
-
-@pytest.mark.slow
-def test_what_a_ur10_misses_in_a_table_of_four_figures_is_what_the_page_says():
-    made = export(off(ur10()), "dh")
-    assert "axes 2 and 3 are parallel within 0.041 deg, not exactly: their common normal is 429 m away" in made.text
-    assert made.details["error"]["position_rms"] == pytest.approx(0.17e-3, abs=5e-6)

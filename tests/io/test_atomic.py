@@ -56,15 +56,6 @@ def test_a_failure_leaves_nothing_and_no_folder(tmp_path, own):
     assert [*tmp_path.iterdir()] == []
 
 
-def test_errors_name_the_folder_where_files_were_to_appear(tmp_path):
-    def fail(into):
-        raise InputError(str(into / "table"), "wrong")
-
-    with pytest.raises(InputError) as error:
-        fill_folder(tmp_path, fail)
-    assert str(error.value) == f"{tmp_path / 'table'}: wrong"
-
-
 def test_asking_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
     require_writable(tmp_path / "a" / "b")
     assert [*tmp_path.iterdir()] == []
@@ -152,15 +143,3 @@ def test_results_do_not_replace_what_they_are_of(example, fg_calib):
     expected = f"error: {name}: the job was read from it, expected another folder for the results\n"
     assert ended == (1, "", expected)
     assert {file.name: file.read_bytes() for file in example.iterdir()} == before
-
-
-@pytest.mark.slow
-def test_a_simulation_replaces_a_simulation_and_nothing_else(fg_calib, tmp_path):
-    assert fg_calib("simulate", "space-robot", "--out", tmp_path).code == 0
-    assert fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 3).code == 0
-    (tmp_path / "calibration.yaml").write_text("model: pose\n")
-    ended = fg_calib("simulate", "space-robot", "--out", tmp_path, "--seed", 4)
-    found = "is there already, not written by this command, expected another folder"
-    expected = f"error: {tmp_path / 'calibration.yaml'}: {found}\n"
-    assert ended == (1, "", expected)
-    assert (tmp_path / "calibration.yaml").read_text() == "model: pose\n"
