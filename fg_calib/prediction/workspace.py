@@ -33,21 +33,14 @@ _NAMED = 5
 _LEAST_SHARE = 0.05
 """Share from which a parameter is named as responsible."""
 
-_CLIMBERS, _STEPS, _TRIED, _FIRST_STEP, _SHORTER = 6, 14, 50, 0.2, 0.7
-"""Random search of the largest error: starts, steps, trials of each, 1 sigma of the first step in the range of each
-joint, and how the steps shrink."""
-
 N_DRAWN = 12_000
 """Configurations that are drawn."""
 
 FAR = 0.15
 """Distance from the nearest measured position, in the radius of the workspace, beyond which nothing was measured."""
 
-LEAST_WIDTH = 1e-3
-"""Width that pictures of a workspace have at least, [m]: a tool on its arm's only axis stays where it is."""
-
 _N_SAMPLED = 1000
-"""Drawn configurations that give the radius of the workspace, and the responsible parameters."""
+"""Configurations that give the radius of the workspace where these are given, and the responsible parameters."""
 
 
 @dataclass(frozen=True)
@@ -67,63 +60,6 @@ class JointRange(FrozenArrays):
     limits: tuple[float, float]
     range: tuple[float, float]
     gap: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Workspace(FrozenArrays):
-    """Expected errors of the tool over the workspace.
-
-    Attributes:
-        errors: At configurations that were drawn.
-        radius: From the mean of the drawn positions to the farthest, [m].
-        measured: Where the tool was measured, shape (m, 3), [m].
-        fitted: Whether errors count after the best rigid fit, instead of in the base frame.
-        joints: Joint by joint.
-    """
-
-    errors: ToolErrors
-    radius: float
-    measured: Floats
-    fitted: bool
-    joints: tuple[JointRange, ...]
-
-    @property
-    def position(self) -> Floats:
-        """Tool points of the drawn configurations in the base frame, shape (n, 3), [m]."""
-        return self.errors.position
-
-    @property
-    def error(self) -> Floats:
-        """RMS position error expected of each, shape (n,), [m]; nan where it depends on what is not determined."""
-        return self.errors.of(self.fitted)[:, 0]
-
-    @property
-    def far(self) -> Booleans:
-        """Whether no measured position is near the drawn ones, shape (n,)."""
-        return self.far_from_measured(self.position)
-
-    def far_from_measured(self, points: Floats) -> Booleans:
-        """Whether no measured position is near points, shape (n, 3): shape (n,)."""
-        return np.asarray(cKDTree(self.measured).query(points)[0] > FAR * self.radius)
-
-
-def survey(robot: Robot, model: ToolPoseUncertainty, readings: Floats, *, fitted: bool, n: int = N_DRAWN) -> Workspace:
-    """Expected errors over the workspace, and where nothing was measured.
-
-    A joint that turns without limits is taken to turn by +-180 degrees, one that slides without them between its lowest
-    and its highest reading.
-
-    Args:
-        robot: The calibrated robot, with its limits.
-        model: Expected errors of its tool.
-        readings: Of the measured configurations, shape (m, n_joints), [rad] (prismatic: [m]).
-        fitted: Whether errors count after the best rigid fit.
-        n: Number of configurations that are drawn.
-    """
-    errors = model.at(random_readings(_bounded(robot, readings), n, np.random.default_rng(0)))
-    radius = float(np.max(np.linalg.norm(errors.position - errors.position.mean(axis=0), axis=1), initial=0.0))
-    joints = tuple(_range(joint, readings[:, i]) for i, joint in enumerate(robot.joints))
-    return Workspace(errors, radius, pose(robot, readings).position, fitted, joints)
 
 
 def _bounded(robot: Robot, readings: Floats) -> Robot:
@@ -170,7 +106,7 @@ class WorstConfiguration(FrozenArrays):
 
     Attributes:
         errors: Expected there, of one configuration.
-        row: Its row among the configurations that were given; None where it was looked for.
+        row: Its row among the configurations that were given; None among drawn ones.
         axes: Directions of the error ellipsoid from the longest axis to the shortest, rows of shape (3, 3), in the base
             frame.
         sigma: 1 sigma along each, shape (3,), [m].
@@ -265,6 +201,9 @@ def predict_errors(
 ) -> PredictedErrors:
     """Expected errors at configurations, or all over the workspace, and where they are largest.
 
+    In the workspace a revolute joint without limits rotates by +-180 degrees. A prismatic one without them moves
+    between its lowest and its highest reading.
+
     Args:
         robot: The calibrated robot, with its limits.
         model: Expected errors of its tool.
@@ -273,47 +212,33 @@ def predict_errors(
         fitted: Whether errors count after the best rigid fit.
         limit: Largest allowed position error, [m].
     """
-    workspace = survey(robot, model, measured, fitted=fitted, n=N_DRAWN if readings is None else _N_SAMPLED)
-    errors = workspace.errors if readings is None else model.at(readings)
+    n, rng = N_DRAWN if readings is None else _N_SAMPLED, np.random.default_rng(0)
+    drawn = random_readings(_bounded(robot, measured), n, rng)
+    errors = model.at(drawn if readings is None else readings)
+    points = errors.position if readings is None else pose(robot, drawn).position
+    radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
+    measured_points = pose(robot, measured).position
+    far = np.asarray(cKDTree(measured_points).query(errors.position)[0]) > FAR * radius
     expected, worst = errors.of(fitted)[:, 0], None
     known = errors.readings[np.isfinite(expected)]
     sampled = known[np.unique(np.linspace(0, len(known) - 1, min(_N_SAMPLED, len(known))).astype(np.int64))]
     named = zip(model.covariance.variables.names, np.diag(model.covariance.named()), strict=False)
-    if np.isfinite(expected).any():
-        row = int(np.nanargmax(expected)) if readings is not None else None
-        there = model.at(_climbed(model, errors, fitted) if row is None else errors.readings[row : row + 1])
-        worst = _worst(model, there, fitted, row, bool(workspace.far_from_measured(there.position)[0]))
+    if len(known):
+        row = int(np.nanargmax(expected))
+        at = model.at(errors.readings[row : row + 1])
+        worst = _worst(model, at, fitted, None if readings is None else row, bool(far[row]))
     return PredictedErrors(
         errors=errors,
         fitted=fitted,
         given=readings is not None,
-        far=workspace.far_from_measured(errors.position),
-        measured=workspace.measured,
-        joints=workspace.joints,
+        far=far,
+        measured=measured_points,
+        joints=tuple(_range(joint, measured[:, i]) for i, joint in enumerate(robot.joints)),
         worst=worst,
         responsible=_responsible(model, sampled, fitted),
         undetermined=tuple(name for name, one in named if np.isnan(one)) if len(known) < len(expected) else (),
         limit=limit,
     )
-
-
-def _climbed(model: ToolPoseUncertainty, drawn: ToolErrors, fitted: bool) -> Floats:
-    """The configuration with the largest error in a random local search from the worst drawn, shape (1, n_joints)."""
-    rng, q = np.random.default_rng(0), drawn.readings
-    low, high = q.min(axis=0), q.max(axis=0)
-    height = np.nan_to_num(drawn.of(fitted)[:, 0], nan=-1.0)
-    best = np.argsort(-height, kind="stable")[:_CLIMBERS]
-    at, height = q[best], height[best]
-    for k in range(_STEPS):
-        steps = rng.normal(size=(len(at), _TRIED, q.shape[1])) * (_FIRST_STEP * _SHORTER**k * (high - low))
-        tried = np.clip(at[:, None] + steps, low, high)
-        found = model.at(tried.reshape(-1, q.shape[1])).of(fitted)[:, 0].reshape(len(at), _TRIED)
-        found = np.nan_to_num(found, nan=-1.0)
-        most, row = np.argmax(found, axis=1), np.arange(len(at))
-        higher = found[row, most] > height
-        at = np.where(higher[:, None], tried[row, most], at)
-        height = np.where(higher, found[row, most], height)
-    return at[[int(np.argmax(height))]]
 
 
 def _worst(
@@ -343,7 +268,7 @@ def _responsible(
     if not len(readings):
         return ()
     posterior, variables = model.covariance, model.covariance.variables
-    v = model.motions(readings, fitted=fitted)[:, 3:].reshape(-1, variables.n_columns)
+    v = model.motions(readings, fitted=fitted)[:, 3:].reshape(3 * len(readings), variables.n_columns)
     named = variables.named_derivative(posterior.parameters)[: variables.n_robot_columns]
     with np.errstate(invalid="ignore", divide="ignore"):  # nan: yaw and roll at a pitch of a quarter turn
         covariance = named @ posterior.tangent  # of parameters with the columns

@@ -13,7 +13,7 @@ from fg_calib.arrays import Booleans, Floats
 from fg_calib.io.result import Result
 from fg_calib.observability.identifiability import Identifiability
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty
-from fg_calib.prediction.workspace import Workspace, survey
+from fg_calib.prediction.workspace import PredictedErrors, predict_errors
 from fg_calib.report.charts import (
     BOTTOM,
     LEFT,
@@ -99,12 +99,12 @@ class Drawn:
         return (self.configurations["split"] == "test").to_numpy()
 
     @cached_property
-    def workspace(self) -> Workspace | None:
+    def workspace(self) -> PredictedErrors | None:
         """Expected errors over the workspace; None where nothing says what was measured."""
         if self.configurations is None or not len(self.configurations):
             return None
         model = ToolPoseUncertainty.of(self.posterior, self.readings)
-        return survey(self.robot, model, self.readings, fitted=self.result.free_of_frame)
+        return predict_errors(self.robot, model, self.readings, fitted=self.result.free_of_frame)
 
     @cached_property
     def rms(self) -> tuple[str, Floats] | None:
@@ -122,7 +122,7 @@ class Drawn:
 def figures_of(drawn: Drawn) -> dict[str, Sequence[Chart]]:
     """All figures of a calibration by name; those that its tables lack are left out."""
     correlations, space = correlation_matrix(drawn), drawn.workspace
-    known = space is not None and not drawn.result.evaluated_only and bool(np.isfinite(space.error).any())
+    known = space is not None and not drawn.result.evaluated_only and space.unknown < 1.0
     every: dict[str, Sequence[Chart]] = {
         "accuracy": [accuracy_bars(drawn)],
         "joints": error_over_joints(drawn),
@@ -173,7 +173,7 @@ def _colours(test: Booleans) -> str:
     return ", ".join(["blue fitted"] * (not test.all()) + ["orange held out"] * bool(test.any()))
 
 
-def joint_ranges(space: Workspace) -> Chart:
+def joint_ranges(space: PredictedErrors) -> Chart:
     """The readings of every joint within its limits, and the widest gap."""
     row, elements = 24.0, []
     for i, joint in enumerate(space.joints):
@@ -287,9 +287,9 @@ def _histogram(values: Floats, caption: str) -> Chart:
     return plot.chart(caption)
 
 
-def workspace_slices(space: Workspace) -> list[Chart]:
+def workspace_slices(space: PredictedErrors) -> list[Chart]:
     """Expected error of the tool in three slices through the middle of the measured configurations."""
-    return error_slices(space.position, space.error, space.measured)
+    return error_slices(space.errors.position, space.expected[:, 0], space.measured)
 
 
 def error_slices(position: Floats, error: Floats, measured: Floats) -> list[Chart]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fg_calib.errors import escaped
-from fg_calib.prediction.workspace import Workspace
+from fg_calib.prediction.workspace import PredictedErrors
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import Drawn, arm_scene, figures_of
 from fg_calib.report.tables import SHOWN, in_words, relations_by_reason, shortened, weak_rows
@@ -115,7 +115,7 @@ def _tiles(drawn: Drawn) -> Iterator[tuple[str, str]]:
     yield f"{known} of {len(result.estimated)}", "parameters estimated with a known uncertainty"
 
 
-def _limits_in_words(space: Workspace) -> str:
+def _limits_in_words(space: PredictedErrors) -> str:
     """The range over which the workspace is drawn."""
     missing = [joint for joint in space.joints if not np.isfinite(joint.limits).all()]
     if not missing:
@@ -125,7 +125,7 @@ def _limits_in_words(space: Workspace) -> str:
     return f"within {'the' if len(missing) < len(space.joints) else 'no'} joint limits ({instead} without any)"
 
 
-def _gaps(space: Workspace) -> Iterator[str]:
+def _gaps(space: PredictedErrors) -> Iterator[str]:
     """The widest part of each joint's range without a reading, where it is wide."""
     for joint in space.joints:
         factor, unit, _ = SHOWN[joint.unit]
@@ -160,11 +160,11 @@ def _suspects(drawn: Drawn) -> tuple[int, list[list[str]]]:
 def _workspace(drawn: Drawn) -> dict[str, Any] | None:
     """Quantiles of the expected error over the workspace, and the share where it is unknown."""
     space = drawn.workspace
-    if space is None or not np.isfinite(space.error).any():
+    if space is None or space.unknown == 1.0:
         return None
-    quantiles = [in_words(float(v), "m") for v in np.nanquantile(space.error, [0.05, 0.5, 0.95])]
-    unknown, far = float(np.mean(~np.isfinite(space.error))), float(np.mean(space.far))
-    return {"n": len(space.error), "quantiles": quantiles, "unknown": 100.0 * unknown, "far": 100.0 * far}
+    quantiles = [in_words(float(v), "m") for v in np.nanquantile(space.expected[:, 0], [0.05, 0.5, 0.95])]
+    far = 100.0 * float(np.mean(space.far))
+    return {"n": len(space.far), "quantiles": quantiles, "unknown": 100.0 * space.unknown, "far": far}
 
 
 def _command(drawn: Drawn) -> str:

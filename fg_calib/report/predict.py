@@ -179,7 +179,6 @@ def build_prediction_report(
 
 def _size_table(found: PredictedErrors) -> RenderableType:
     """RMS and quantiles, in both frames, with joint noise and without."""
-    words = SIZES if found.given else {**SIZES, "largest": "largest drawn"}
     order = ("fitted", "base") if found.fitted else ("base", "fitted")
     errors = {FRAMES[name]: found.errors.of(name == "fitted") for name in order}
     if found.with_joint_noise is not None:
@@ -190,7 +189,7 @@ def _size_table(found: PredictedErrors) -> RenderableType:
             sizes = summed_up(column)
             name = frame if kind == "position" else ""
             rows.append((name, SHOWN[unit][1], *(figure(sizes[key], unit) for key in SIZES)))
-    return table_of(("", "", *words.values()), rows, left="ll", wrap=True)
+    return table_of(("", "", *SIZES.values()), rows, left="ll", wrap=True)
 
 
 def _percentages(found: PredictedErrors) -> Iterator[str]:
@@ -258,8 +257,7 @@ def _prediction_notes(found: PredictedErrors) -> Iterator[str]:
     if not found.given:
         unlimited = [j.name for j in found.joints if not np.isfinite(j.limits).all()]
         instead = f" ({', '.join(unlimited)} without any: +-180 deg, or what was read)" if unlimited else ""
-        sought = "; the largest error was then searched for" if found.worst is not None else ""
-        yield f"{len(found.errors.readings)} configurations were drawn within the joint limits{instead}{sought}."
+        yield f"{len(found.errors.readings)} configurations were drawn within the joint limits{instead}."
     if found.fitted:
         yield "Nothing was measured in the base frame: errors count after the best rigid fit to all measurements."
     if found.errors.joint_noise is None:

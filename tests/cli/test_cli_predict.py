@@ -76,10 +76,8 @@ def test_the_workspace_is_drawn_and_written(result, fg_calib, tmp_path, few):
     assert document["expected"]["base"]["position"]["rms"] == pytest.approx(np.sqrt(np.mean(error**2)) / 1e3)
     worst = document["worst"]
     assert worst["base"]["position"] == pytest.approx(np.linalg.norm(worst["sigma"]), rel=1e-9)
-    assert worst["base"]["position"] * 1e3 >= error.max()
-    files = {file.name: file.read_bytes()[:5] for file in (tmp_path / "out").iterdir()}
-    assert set(files) == {"predict.csv", "predict.json", "predict.png", "predict.svg"}
-    assert (files["predict.png"][1:4], files["predict.svg"]) == (b"PNG", b"<?xml")
+    assert worst["base"]["position"] * 1e3 == pytest.approx(error.max(), rel=1e-6)
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {"predict.csv", "predict.json", "predict.svg"}
 
 
 @pytest.mark.slow
