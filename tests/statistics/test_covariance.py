@@ -16,7 +16,7 @@ from fg_calib.measurements.dataset import Measurements
 from fg_calib.options import Pairing
 from fg_calib.prediction.tool_pose import pose_rms
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Joint, Robot, RobotBuilder
+from fg_calib.robot.model import Robot
 from fg_calib.statistics.goodness_of_fit import chi2_bounds
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3, "beta": 2e-3, "tool": 5e-3}
@@ -197,39 +197,6 @@ def test_frame_estimate_is_world_T_base():
     assert found.xyz == pytest.approx(frame[1], abs=0.01)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["distance-rotation", "pose", "position"])
-def test_every_gauge_predicts_the_same_where_prediction_is_possible(model):
-    rng = np.random.default_rng(10)
-    robot = paper_robot(tolerance={"a": 1.0, "d": 1.0, "alpha": 1.0, "theta": 1.0, "beta": 1.0})  # hardly a prior
-    measurements = measure(true_robot(paper_robot(), rng), 80, rng)
-    q = rng.uniform(-2, 2, (2, 7))
-
-    def distance(r):
-        p = pose(r, q).position
-        return [np.linalg.norm(p[1] - p[0])]
-
-    found = {}
-    for gauge in ("prior", "keep", "none"):
-        solution = solve(build_problem(robot, measurements, model=model, gauge=gauge))
-        assert solution.converged
-        found[gauge] = assess(solution)
-    values = {gauge: u.predict(distance) for gauge, u in found.items()}
-    sigma = values["none"].sigma[0]
-    assert np.isfinite(sigma)
-    for gauge in ("prior", "keep"):
-        # priors of 1 m and 1 rad pull by some millionths of a sigma; null directions turn with the estimate
-        assert values[gauge].value[0] == pytest.approx(values["none"].value[0], abs=1e-2 * sigma)
-        assert values[gauge].sigma[0] == pytest.approx(sigma, rel=1e-2)
-    assert found["keep"].names == found["none"].names
-    assert np.isfinite(found["keep"].covariance).all()  # what was left out is known to its tolerance
-    assert found["keep"].dof == found["none"].dof
-    classes = [[p.identifiability for p in found[g].parameters] for g in ("keep", "none")]
-    assert classes[0] == classes[1]
-    left_out = {p.name for p in found["keep"].parameters if p.sigma == 1.0 and p.correction == 0.0}
-    assert left_out == set(found["none"].names) - set(found["none"].observability.kept)
-
-
 def test_a_sum_is_known_although_its_terms_are_not():
     rng = np.random.default_rng(11)
     robot = paper_robot()
@@ -282,16 +249,6 @@ def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all(rms < 1.0 + 3.0 / np.sqrt(24.0))  # three standard errors of 12 draws
     assert np.all(rms > 0.4)
-
-
-def scara(tolerance):
-    """Three parallel axes."""
-    builder = RobotBuilder("scara", "mdh-hayati")
-    builder.add_frame("base", {}, 0, False)
-    for i, a in enumerate((0.0, 0.4, 0.3)):
-        builder.add_convention_joint(Joint(f"q{i + 1}"), {"alpha": 0.0, "a": a, "d": 0.0, "theta": 0.0, "beta": 0.0})
-    builder.add_frame("tool", {"x": 0.1}, 4, False)
-    return builder.build(tolerance=tolerance)
 
 
 @pytest.mark.filterwarnings("error")

@@ -1,12 +1,11 @@
 """Cross-validation by configuration."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from instruments import measured_by
-from simulated import measure, small_arm, true_robot, write_job
+from simulated import measure, small_arm, true_robot
 
 from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, calibrate, solve_job
 from fg_calib.measurements.kinds.pose import Position
@@ -56,15 +55,6 @@ def test_every_configuration_is_predicted_once_by_the_others():
 
 
 @pytest.mark.slow
-def test_rows_of_one_configuration_stay_together():
-    robot, _, table = measured_by("targets", np.random.default_rng(0), n=30)
-    found = cross_validate(job_of(robot, table), 5)
-    assert found.fold.shape == (30,)
-    assert np.bincount(found.fold).tolist() == [6] * 5
-    assert found.kinds["position"].n == 90
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
 def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(0), n=40)
@@ -76,17 +66,6 @@ def test_what_few_configurations_know_of_is_spread_over_the_folds(instrument):
             assert np.ptp(np.bincount(mine, minlength=5)) <= 2
     assert sum(held.n for held in found.kinds.values()) == 40 * len(found.kinds)
     assert all(held.after < 3.0 * held.noise for held in found.kinds.values())
-
-
-@pytest.mark.long
-def test_who_alone_knows_of_a_station_is_never_held_out():
-    robot, _, table = measured_by("targets stations", np.random.default_rng(0), n=20)
-    m = table.measurements
-    station = m.labels["station"]
-    one = np.where(m.ids == m.ids[0], 1, 0)
-    m = replace(m, labels=m.labels | {"station": replace(station, index=one)})
-    found = cross_validate(job_of(robot, replace(table, measurements=m)), 4)
-    assert np.sum(found.fold == -1) == 1
 
 
 def with_measured_pairs(ends, seed=0):
@@ -146,13 +125,6 @@ def test_limits_without_test_rows_are_judged_by_the_folds():
     assert one.error == result.result.folds.kinds["position"].after
 
 
-@pytest.mark.slow
-def test_test_rows_come_before_folds():
-    robot, m = poses(n_test=6)
-    result = calibrate(robot, m, model="pose", folds=5, accept={"position": 5e-4})
-    assert result.result.acceptance.judgements[0].n == 6
-
-
 @pytest.mark.parametrize("n", [1, 0, -3, 2.5, True])
 def test_a_number_of_folds_that_cannot_be_is_one_line(n):
     with pytest.raises(InputError, match="folds: found"):
@@ -170,13 +142,6 @@ def test_a_fold_that_leaves_too_little_is_named():
     robot, m = poses(n=5)
     with pytest.raises(ProblemError, match="folds: without fold 1 of 5: "):
         cross_validate(job_of(robot, m, gauge="keep", model="position"), 5)
-
-
-@pytest.mark.slow
-def test_a_job_may_ask_for_it(tmp_path, fg_calib):
-    robot, m = poses()
-    job = write_job(tmp_path, robot, m, model="pose", folds=3)
-    assert json.loads(fg_calib("calibrate", job, "--json").out)["folds"]["n"] == 3
 
 
 def test_only_what_chance_does_not_explain_is_wide():

@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from reported import format_report
-from scipy.linalg import block_diag
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
 from sparing import diagonal
@@ -15,17 +14,13 @@ from touches import SIGMA, TOOL_POINT, corners, touch
 from fg_calib.assessment import assess
 from fg_calib.graph import problem as problem_module
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.error_states import ErrorStates
 from fg_calib.graph.noise_models import NoiseState
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.graph.variables import prior_rows
-from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
-from fg_calib.statistics import goodness_of_fit as goodness_module
 from fg_calib.statistics import variance_components as noise
 from fg_calib.statistics.covariance import spread_of
 from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit, RowStatistics
@@ -128,22 +123,6 @@ def test_leverages_are_those_of_the_hat_matrix():
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("without_reasons")
-def test_studentised_residuals_of_fitted_and_predicted_rows_have_a_variance_of_one():
-    rng = np.random.default_rng(3)
-    robot = small_arm(tolerance=TOLERANCE)
-    fitted, predicted = [], []
-    for _ in range(40):
-        m = measure(true_robot(robot, rng), 10, rng, sigma=(1e-3, 5e-4), n_test=10)
-        uncertainty = assess(solve(build_problem(robot, m, model="pose")))
-        table, z = uncertainty.residuals, uncertainty.goodness.studentised
-        fitted.append(np.mean(z[table.used] ** 2))
-        predicted.append(np.mean(z[table.test] ** 2))
-    for values in (fitted, predicted):
-        assert np.mean(values) == pytest.approx(1.0, abs=4 * np.std(values) / np.sqrt(40))
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "wrong"), diagonal(["star", "all", "pose"], [0, 7]))
 def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     rng = np.random.default_rng(4)
@@ -205,15 +184,6 @@ def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):
     assert "too few rows to estimate it: as stated" in " ".join(format_report(solution, assess(solution)).split())
 
 
-@pytest.mark.slow
-def test_factors_that_do_not_settle_are_a_finding(monkeypatch):
-    monkeypatch.setattr(noise, "MAX_ROUNDS", 1)
-    rng = np.random.default_rng(11)
-    solution = estimate_noise(case("pose", small_arm(tolerance=TOLERANCE), rng, 16, 2.0))
-    assert not solution.converged
-    assert assess(solution).findings[0].startswith("not converged: the estimated noise still moved by 0.")
-
-
 def test_kept_parameters_are_estimated_with_estimated_noise_too():
     rng = np.random.default_rng(12)
     robot = small_arm()
@@ -257,32 +227,6 @@ def test_pairs_that_a_model_of_poses_does_not_use_are_named(caplog):
     solution = solve(build_problem(robot, replace(m, pairs=direct.pairs), model="pose"))
     assert caplog.messages == ["pairs: not used, model pose is of poses"]
     assert "pairs is not used: model pose is of poses, not of pairs" in format_report(solution, assess(solution))
-
-
-@pytest.mark.slow
-def test_leverage_in_chunks_is_leverage_at_once(monkeypatch):
-    rng = np.random.default_rng(15)
-    robot = small_arm(tolerance=TOLERANCE)
-    solution = solve(case("star joint", robot, rng, 20))
-    at_once = assess(solution).goodness
-    monkeypatch.setattr(goodness_module, "_FEW", 7)
-    in_chunks = assess(solution).goodness
-    assert in_chunks.studentised == pytest.approx(at_once.studentised)
-    p = [fit.p_value for fit in at_once.kinds]
-    assert [fit.p_value for fit in in_chunks.kinds] == pytest.approx(p)
-
-
-@pytest.mark.slow
-def test_a_table_too_long_to_keep_is_judged_nearly_the_same(monkeypatch):
-    """Without derivatives kept, independent rows are judged by their variances alone."""
-    rng = np.random.default_rng(16)
-    robot = small_arm(tolerance=TOLERANCE)
-    solution = solve(case("direct", robot, rng, 100))
-    kept = assess(solution).goodness.kinds
-    monkeypatch.setattr(goodness_module, "MAX_DENSE", 0)
-    for fit, exact in zip(assess(solution).goodness.kinds, kept, strict=True):
-        assert fit.expected == pytest.approx(exact.expected)
-        assert fit.p_value == pytest.approx(exact.p_value, abs=0.02)
 
 
 def test_robust_weights_count_rows_and_flag_outliers():
@@ -439,60 +383,6 @@ def test_the_only_touch_of_a_point_is_met_whatever_was_measured():
         points = goodness.test.kinds[0]
         assert (points.kind, points.n) == ("point", 3 * (3 + 8))
         assert np.isfinite([points.chi2, points.expected, points.p_value, points.largest]).all()
-
-
-@pytest.mark.slow
-def test_rows_that_count_as_independent_but_are_not_have_their_covariance_with_touched_points_too():
-    """Touches, and pairs formed from poses of the same configurations, which share the errors of the readings.
-
-    By dense matrices: with J of core and points, W the weights and C the covariance that there is, residuals of the
-    estimate are (1 - H) e with H = J (J^T W J + priors)^-1 J^T W.
-    """
-    rng = np.random.default_rng(24)
-    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
-    true = true_robot(robot, rng)
-    m = touched(robot, rng, sigma_joint=2e-4)
-    at = pose(true, m.readings)
-    n = len(m.readings)
-    m = replace(
-        m,
-        test=np.zeros(n, dtype=bool),
-        position=at.position + 1e-3 * rng.normal(size=(n, 3)),
-        rotation=at.rotation,
-        sigma_position=np.full((n, 3), 1e-3),
-        sigma_orientation=np.full((n, 3), 5e-4),
-        groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.zeros(3, dtype=bool))),
-    )
-    solution = solve(build_problem(robot, m, model="distance", pairing=Pairing("chain"), pair_errors="independent"))
-    problem, spread, table = solution.problem, spread_of(solution), residual_table(solution)
-    at, n_core = problem.variables.at(solution.parameters), problem.variables.n_columns
-    J = np.concatenate([rows.linearise(at)[1] for rows in problem.rows])
-    errors, W, C = ErrorStates(problem.noises), [], []
-    for rows, given in zip(problem.rows, problem.noises, strict=True):
-        (part,), residual_dim = rows.parts, rows.parts[0].block.residual_dim
-        shaped = [residuals.unpack(block.whitening, residual_dim) for block in (part.block, given.rows)]
-        W.append(block_diag(*(shaped[0] @ np.linalg.inv(shaped[1]))))
-        every = np.arange(given.series.n)
-        C.append((errors.loading(given, every).toarray(), block_diag(*given.own_at(every))))
-    L, W = np.vstack([L for L, _ in C]), block_diag(*W)
-    C = W @ (L @ L.T + block_diag(*(own for _, own in C))) @ W.T
-    assert np.abs(C - np.diag(np.diag(C))).max() > 0.1  # much is shared
-    prior = np.zeros((J.shape[1],) * 2)
-    P = prior_rows(problem.variables, solution.parameters)[1]
-    prior[:n_core, :n_core] = P.T @ P
-    K = np.linalg.inv(J.T @ J + prior)
-    actual = K @ (J.T @ C @ J + prior) @ K
-    size = np.sqrt(np.diag(actual)[:n_core])
-    assert spread.actual / np.outer(size, size) == pytest.approx(
-        (actual[:n_core, :n_core]) / np.outer(size, size), abs=1e-4
-    )
-    left = np.eye(len(J)) - J @ K @ J.T
-    A = np.linalg.inv(W) @ (left @ C @ left.T + J @ K @ prior @ K @ J.T) @ np.linalg.inv(W).T
-    variance = np.diag(A) / table.sigma**2
-    for fit in RowStatistics(solution, spread, table).fit_kinds():
-        family = table.family == table.families.index(fit.kind)
-        assert fit.expected == pytest.approx(variance[family].sum(), rel=1e-4), fit.kind
-    assert [fit.kind for fit in RowStatistics(solution, spread, table).fit_kinds()] == ["distance", "point"]
 
 
 def differences(function, x, step=1e-5):

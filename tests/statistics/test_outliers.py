@@ -10,7 +10,7 @@ import scipy.sparse
 from instruments import measured_by
 from reported import format_report
 from scipy.stats import beta
-from simulated import measure, plus, small_arm, true_robot, write_job
+from simulated import measure, plus, small_arm, true_robot
 from sparing import diagonal
 from systematic import measured, of_joint, problem_of
 
@@ -145,32 +145,6 @@ def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     assert [name.removeprefix("0 and ") for name in found.goodness.gross.names] == [wrong]
     assert found.goodness.gross.ratio < 1.5
     assert not found.noise_may_be_estimated
-
-
-@pytest.mark.slow
-def test_the_report_offers_a_robust_loss_and_one_solves_it(tmp_path, fg_calib):
-    robot = small_arm(tolerance=TOLERANCE)
-    rng = np.random.default_rng(6)
-    m = measure(true_robot(robot, rng), 24, rng, sigma=(1e-3, 5e-4), n_test=6)
-    wrong = replace(m, position=plus(plus(m.position, (9, 1), 0.2), (4, 0), -0.3))
-    ended = fg_calib("calibrate", write_job(tmp_path, robot, wrong, model="pose"))
-    report = " ".join(ended.out.split())
-    assert ended.code == 3
-    assert "2 outliers (" in report
-    assert "let a robust loss do so (loss: gnc)" in report
-    assert "few rows far too large: outliers" in report
-    assert "effects not modelled" not in report
-    assert fg_calib("calibrate", write_job(tmp_path, robot, wrong, model="pose", loss="gnc")).code == 0
-
-
-@pytest.mark.slow
-def test_labels_exchanged_at_one_stop_are_outliers_of_that_stop():
-    robot, _, table = measured_by("targets", np.random.default_rng(7))
-    m = table.measurements
-    m = replace(m, position=m.position[np.r_[0:21, 22, 21, 23 : len(m.position)]])
-    found = assess(solve(build_problem(robot, [replace(table, measurements=m)])))
-    assert {fit.verdict for fit in found.goodness.kinds} == {"outliers"}
-    assert found.goodness.gross.names == ("c7",)
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Scales of prior sigmas: their posterior against dense formulas, and estimated with the fit of whole arms."""
 
-import contextlib
 from dataclasses import replace
 from functools import cache
 
@@ -11,15 +10,11 @@ from simulated import TOOL, measure, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
-from fg_calib.calibration import calibrate
-from fg_calib.errors import InputError, SolverError
+from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.tolerances import FIRST
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.options import Options, Pairing
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Robot
+from fg_calib.options import Options
 from fg_calib.statistics.priors import (
     COMMON_SIGMA,
     GROUP_SIGMA,
@@ -127,18 +122,6 @@ def test_many_good_rows_leave_what_the_corrections_themselves_say():
     assert found.mean.determined[0] == pytest.approx(6.0, abs=1e-6)
 
 
-@pytest.mark.slow
-def test_intervals_of_scales_hold_the_true_ones_as_often_as_they_say():
-    """True scales drawn as the guess has them; 95 % of 240 within four sigma."""
-    rng = np.random.default_rng(6)
-    held = []
-    for _ in range(80):
-        theta = rng.multivariate_normal(np.zeros(3), guess(3))
-        low, high = fit_scales(drawn(rng, np.exp(theta))[2]).interval
-        held += ((low <= theta) & (theta <= high)).tolist()
-    assert abs(np.mean(held) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 80)
-
-
 STATED = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
 TRUE = {"a": 3e-3, "d": 3e-4, "alpha": 8e-3, "theta": 1e-3}
 
@@ -221,19 +204,6 @@ def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
 
 
 @pytest.mark.slow
-def test_pairs_taken_for_independent_do_not_tell_of_more_corrections():
-    """All pairs of ten poses: what they share is counted in what they say of corrections, and the estimate is that."""
-    choices = {"n": 10, "pairing": Pairing("all"), "estimate_tolerance": "kind"}
-    shared, independent = (
-        estimate_tolerances(drawn_problem("distance", pair_errors=errors, **choices)[0])
-        for errors in ("shared", "independent")
-    )
-    for a, b in zip(shared.estimated_tolerances.scales, independent.estimated_tolerances.scales, strict=True):
-        assert b.seen < a.seen + 0.05
-        assert b.low < a.scale < b.high
-
-
-@pytest.mark.slow
 def test_noise_and_tolerances_are_estimated_together():
     problem, _ = drawn_problem(n=30, estimate_tolerance="kind", estimate_noise=True)
     tripled = replace(problem.measurements, sigma_position=3.0 * problem.measurements.sigma_position)
@@ -259,20 +229,6 @@ def test_without_priors_there_is_nothing_to_estimate(choices):
 def test_an_unknown_group_is_refused():
     with pytest.raises(InputError, match=r"^estimate_tolerance: found 'kinds', expected one of kind, joint"):
         Options.of(estimate_tolerance="kinds")
-
-
-@pytest.mark.parametrize("seed", [1, 3])
-def test_two_rows_that_tell_no_tolerance_at_all_are_one_line(seed):
-    """Wide tolerances beside two exact positions: the covariance ran over."""
-    rows = [[0.4, 0.3, 0.2, 0], [0.3, -1.2, 0.1, 0], [0.5, 0.7, 0.1, 0]]
-    robot = Robot.from_dh(rows, convention="dh", tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.1))
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(-2, 2, (2, 3))
-    position = pose(robot, q).position + 1e-4 * rng.normal(size=(2, 3))
-    m = Measurements.from_arrays(q, position=position, sigma_position=1e-4)
-    with contextlib.suppress(SolverError):  # or it is calibrated, where rounding falls otherwise
-        found = calibrate(robot, m, model="position", frame="unknown", estimate_tolerance="kind")
-        assert np.isfinite(found.result.chi2)
 
 
 def test_a_correction_varies_by_what_the_data_take_off_its_prior_variance():
