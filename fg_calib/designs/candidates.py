@@ -29,7 +29,6 @@ from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.obstacles import blocked_foot
 from fg_calib.simulation.scenario import (
     NOISE_KINDS,
     BoardCamera,
@@ -246,8 +245,7 @@ def find_candidates(robot: Robot, of: Configurations, n: int, generator: np.rand
     """
     found = draw_candidates(robot, of, generator, n, "candidates")
     if not len(found.readings):
-        hint = blocked_foot(robot, of.keep_out)
-        raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take", hint)
+        raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take")
     return found
 
 

@@ -55,9 +55,6 @@ N_EXACT = 20
 MIN_CURVE = 4
 """Number of poses with which the curve begins."""
 
-MAX_FEWER = 4
-"""How many poses fewer are tried for a target, each time that fewer suffice."""
-
 N_CURVE = 10
 """Number of points of the curve, about."""
 
@@ -88,18 +85,6 @@ class CurvePoint:
     n: int
     designed: float
     random: tuple[float, float, float]
-
-
-def choose(system: System, n: int, criterion: Criterion = "I") -> Chosen:
-    """Choose the best n candidates that greedy choice and exchange find.
-
-    Args:
-        system: The candidates.
-        n: How many, each at most once.
-        criterion: What is minimised.
-    """
-    measure = Measure(criterion, system)
-    return exchange(measure, choose_greedily(measure, n))
 
 
 def choose_greedily(measure: Measure, n: int, start: Integers | None = None) -> Integers:
@@ -251,23 +236,13 @@ class Chooser:
             if enough == most:
                 return Chosen(self.starts(most)[0], np.inf)
             enough = min(most, enough + max(1, enough // 10))
-        low, high, found = 0, enough, min(self.starts(enough), key=self.error)
-        while high - low > 1:
-            middle = max(low + 1, high - max(1, (high - low) // 4))
-            better = self.quickly(middle).candidates
-            if self.error(better) <= target:
-                high, found = middle, better
-            else:
-                low = middle
-        last = exchange(self.measure, found)  # by another criterion it may miss the target again
-        last = last if self.error(last.candidates) <= target else Chosen(found, self._value(found))
-        n = len(last.candidates)
-        while n > max(1, len(last.candidates) - MAX_FEWER):
-            n -= 1
-            fewer = self.thoroughly(n, generator)
-            if self.error(fewer.candidates) <= target:
-                last = fewer
-        return last
+        chosen = min(self.starts(enough), key=self.error)
+        while len(chosen) > 1:
+            fewer = self.quickly(len(chosen) - 1).candidates
+            if self.error(fewer) > target:
+                break
+            chosen = fewer
+        return Chosen(chosen, self._value(chosen))
 
     def _draw(self, n: int, generator: np.random.Generator) -> Integers:
         return generator.choice(self.system.n_candidates, size=n, replace=False).astype(np.int64)

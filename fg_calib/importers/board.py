@@ -18,7 +18,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool
 
-from fg_calib.arrays import NOTHING
 from fg_calib.errors import InputError
 from fg_calib.executors import tell
 from fg_calib.importers.opencv import (
@@ -35,10 +34,12 @@ from fg_calib.io.yaml import Count, Positive, Schema, read_yaml, shown, validate
 from fg_calib.measurements.dataset import Floats
 from fg_calib.options import did_you_mean
 
-_MOST = 1000
+MAX_COUNT = 1000
 """Columns or rows."""
-_LARGEST = 2.0
+
+MAX_SQUARE_M = 2.0
 """Side of a square, [m]: larger ones are in another unit."""
+
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
 
 
@@ -47,8 +48,8 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".
 
 class _Board(Schema):
     type: Literal["checkerboard", "charuco"]
-    columns: Annotated[Count, Field(ge=3, le=_MOST)]
-    rows: Annotated[Count, Field(ge=3, le=_MOST)]
+    columns: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
+    rows: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
     square: Positive
     marker: Positive | None = None
     dictionary: str | None = None
@@ -68,52 +69,42 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
     place = path.name
     file = validate(_Board, read_yaml(path), place)
     length = file.units.factor("m")
-    if file.square * length > _LARGEST:
+    if file.square * length > MAX_SQUARE_M:
         found = f"found {shown(file.square)} {file.units.length}"
-        raise InputError(f"{place}: square", found, f"at most {_LARGEST:g} m", "is it in mm? units: {length: mm}")
-    return (_checkerboard if file.type == "checkerboard" else _charuco)(file, length, place)
-
-
-def _checkerboard(file: _Board, length: float, place: str) -> CalibrationBoard:
-    for key in ("marker", "dictionary", "legacy"):
-        if getattr(file, key):
-            raise InputError(f"{place}: {key}", f"found {shown(getattr(file, key))}", "none with a checkerboard")
-    upright = file.upright
+        raise InputError(f"{place}: square", found, f"at most {MAX_SQUARE_M:g} m", "is it in mm? units: {length: mm}")
     board = CalibrationBoard(
-        "checkerboard", file.columns, file.rows, file.square * length, upright=upright, name=file.name
+        *(file.type, file.columns, file.rows, file.square * length, (file.marker or 0.0) * length),
+        dictionary=file.dictionary or "",
+        legacy=file.legacy,
+        upright=file.upright,
+        name=file.name,
     )
-    if not board.ambiguous and upright:
-        expected = f"none with {file.columns} x {file.rows} inner corners, whose ends differ"
-        raise InputError(f"{place}: upright", "found true", expected)
-    if file.columns == file.rows:
-        found = f"{file.columns} x {file.rows} inner corners look the same from several sides"
-        raise InputError(place, found, "columns + rows odd, or a charuco board")
-    if board.ambiguous and not file.upright:
+    if file.type == "charuco":
+        _check_charuco(file, board, place)
+    elif board.ambiguous and (not file.upright or file.columns == file.rows):
         found = f"{file.columns} x {file.rows} inner corners look the same after half a turn"
         hint = "where the camera never turns more than a quarter about its axis, say upright: true"
         raise InputError(place, found, "columns + rows odd, or a charuco board", hint)
     return board
 
 
-def _charuco(file: _Board, length: float, place: str) -> CalibrationBoard:
-    if file.upright:
-        raise InputError(f"{place}: upright", "found true", "none with a charuco board")
-    if file.marker is None or file.dictionary is None:
-        raise InputError(place, f"missing key {'marker' if file.marker is None else 'dictionary'!r}")
-    if file.marker >= file.square:
-        found = f"found {shown(file.marker)}"
-        raise InputError(f"{place}: marker", found, f"a side shorter than a square's, {shown(file.square)}")
+def _check_charuco(file: _Board, board: CalibrationBoard, place: str) -> None:
+    """Check the markers of a ChArUco board.
+
+    Raises:
+        InputError: They are missing, too large or of an unknown dictionary.
+    """
+    for key in ("marker", "dictionary"):
+        if getattr(file, key) is None:
+            raise InputError(place, f"missing key {key!r}")
+    if board.marker >= board.square:
+        expected = f"a side shorter than a square's, {shown(file.square)}"
+        raise InputError(f"{place}: marker", f"found {shown(file.marker)}", expected)
     known = dictionaries()
-    if file.dictionary not in known:
-        found, hint = f"found {shown(file.dictionary)}", did_you_mean(file.dictionary, known)
+    if board.dictionary not in known:
+        found, hint = f"found {shown(board.dictionary)}", did_you_mean(board.dictionary, known)
         raise InputError(f"{place}: dictionary", found, "one of OpenCV's, such as DICT_5X5_100", hint)
-    board = CalibrationBoard(
-        *("charuco", file.columns, file.rows, file.square * length, file.marker * length, file.dictionary),
-        legacy=file.legacy,
-        name=file.name,
-    )
     charuco_board(board, place)
-    return board
 
 
 # --- images -----------------------------------------------------------------------------------------------------------
@@ -156,8 +147,6 @@ def image_files(given: Sequence[Path]) -> list[Path]:
         name = _name(file)
         if names.setdefault(name, file) != file:
             raise InputError(str(file), f"a second image called {name!r}", f"one, as {names[name].name} is called so")
-        if name.lower() in NOTHING or not name.isprintable():
-            raise InputError(str(file), f"an image called {name!r}", "a name that a table can have under id")
     return list(dict.fromkeys(files))
 
 

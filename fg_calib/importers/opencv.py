@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Floats, Integers
@@ -19,18 +20,13 @@ from fg_calib.measurements.kinds import Camera
 
 Image = NDArray[np.uint8]
 
-_OLDEST = (4, 11)
-"""The oldest OpenCV that is tested."""
-
 _SEARCHED = 1600
 """Longest side, [px], to which an image is reduced before a checkerboard is searched in it: in 12 megapixels without a
 board the search takes seconds, or minutes where there is much texture."""
 
 
-FEWEST_CORNERS = 6
-"""Of a ChArUco board: four say where it is, and more are needed to say how well."""
-_LEAST_SPAN = 0.5
-"""RMS distance of corners from a line, in squares, that says how the board is turned about it: that of two rows."""
+MIN_CORNERS = 6
+"""Of a ChArUco board: four determine its pose, and more its accuracy."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class CalibrationBoard:
         legacy: Whether the ChArUco board was drawn by an OpenCV before 4.6, which began boards with an even number of
             rows with a white square.
         upright: Whether the camera never turned more than a quarter turn about its axis between images, seen from the
-            first one: what tells apart the two ends of a checkerboard that looks the same after half a turn.
+            first one: this orients a checkerboard that looks the same after half a turn.
         name: What the board is called in a column `board`; without a name there is no such column.
     """
 
@@ -84,28 +80,18 @@ class CalibrationBoard:
         """Whether it looks the same after half a turn: a checkerboard whose opposite end squares are of one colour."""
         return self.type == "checkerboard" and (self.columns + self.rows) % 2 == 0
 
-    def span(self, corners: Integers) -> float:
-        """Least extent of some of its corners, in squares: RMS distance from the line that they are nearest to."""
-        places = self.corners[corners] / self.square
-        off = places - places.mean(axis=0)
-        return float(np.linalg.svd(off, compute_uv=False)[-1] / np.sqrt(len(places)))
-
 
 @cache
 def opencv() -> Any:
     """The module `cv2`.
 
     Raises:
-        InputError: It is not installed, or too old.
+        InputError: It is not installed.
     """
     try:
         import cv2
     except ImportError:
         raise InputError("fg-calib board needs OpenCV", "pip install 'fg_calib[camera]'") from None
-    version = tuple(int(part) for part in cv2.__version__.split(".")[:2])
-    if version < _OLDEST:
-        oldest = ".".join(map(str, _OLDEST))
-        raise InputError("OpenCV", f"version {cv2.__version__}", f"{oldest} or newer", "pip install 'fg_calib[camera]'")
     logging = getattr(cv2.utils, "logging", cv2)  # 4.11 has it in the module itself
     logging.setLogLevel(0)  # what it could not read is said by us
     return cv2
@@ -122,17 +108,14 @@ def decode(content: bytes, name: str) -> Image:
         InputError: OpenCV cannot read it.
     """
     cv2 = opencv()
-    image = None
-    if content:
-        try:
-            flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-            image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
-        except cv2.error:  # of absurd size, say
-            image = None
+    try:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image: Image | None = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    except cv2.error:  # of absurd size, or of no content
+        image = None
     if image is None:
         raise InputError(name, "no image that OpenCV can read", "PNG, JPEG, TIFF, BMP or the like")
-    found: Image = image
-    return found
+    return image
 
 
 def dictionaries() -> list[str]:
@@ -182,10 +165,10 @@ def find_corners(image: Image, board: CalibrationBoard) -> tuple[Integers, Float
     if isinstance(found, str):
         return found
     corners, uv = found
-    if len(corners) < FEWEST_CORNERS or board.span(corners) < _LEAST_SPAN - 1e-9:
-        return f"no more than {len(corners)} corners" + (" along a line" if len(corners) >= FEWEST_CORNERS else "")
+    if len(corners) < MIN_CORNERS:
+        return f"no more than {len(corners)} corners"
     free = 0.45 if board.type == "checkerboard" else min(0.45, (board.square - board.marker) / board.square / 2)
-    half = int(np.clip(free * _spacing(board, corners, uv), 2, 20))
+    half = int(np.clip(free * pdist(uv).min(), 2, 20))
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
     exact = cv2.cornerSubPix(image, np.ascontiguousarray(uv[:, None], np.float32), (half, half), (-1, -1), criteria)
     return corners, exact[:, 0].astype(np.float64)
@@ -238,15 +221,6 @@ def in_order(image: Image, grid: Floats) -> Floats:
     if (sum(grid.shape[:2]) % 2) and grey[like_first].mean() > grey[~like_first].mean():
         grid = grid[::-1, ::-1]
     return grid
-
-
-def _spacing(board: CalibrationBoard, corners: Integers, uv: Floats) -> float:
-    """Least distance of neighbouring corners, [px]."""
-    columns, rows = board.shape
-    grid = np.full((rows, columns, 2), np.nan)
-    grid.reshape(-1, 2)[corners] = uv
-    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=2).ravel() for axis in (0, 1)]
-    return float(np.nanmin(np.concatenate(steps), initial=np.inf))
 
 
 def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats, Floats]]:
@@ -306,3 +280,15 @@ def _matrices(camera: Camera) -> tuple[Floats, Floats]:
     """The camera's matrix, and k1 k2 p1 p2 k3."""
     K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
     return K, np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+
+
+def camera_derivatives(camera: Camera, points: Floats) -> Floats:
+    """Derivatives of image points in the camera's parameters, in the order of its fields, shape (n, 2, 9).
+
+    Args:
+        camera: The camera.
+        points: Points in its frame, in front of it, shape (n, 3), [m].
+    """
+    K, lens = _matrices(camera)
+    J = opencv().projectPoints(points, np.zeros(3), np.zeros(3), K, lens)[1]
+    return np.asarray(J[:, 6:15].reshape(len(points), 2, 9), dtype=np.float64)

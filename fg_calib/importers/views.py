@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import InputError
-from fg_calib.importers.opencv import CalibrationBoard, both_poses, first_camera
+from fg_calib.importers.opencv import CalibrationBoard, both_poses, camera_derivatives, first_camera
 from fg_calib.measurements.dataset import Floats, Integers
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera
@@ -24,9 +25,11 @@ from fg_calib.measurements.kinds.pixel import RoomPixel
 FIGURES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """A camera's figures, in the order of its covariance."""
 
-FEWEST_IMAGES = 3
-"""From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns beside the
-lens."""
+UNDETERMINED = ("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
+
+MIN_IMAGES = 3
+"""From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
+the lens."""
 
 _PRIOR_RESIDUALS = 10
 """How many residuals of its own weigh as much in an image's sigma as those of all images."""
@@ -92,8 +95,6 @@ class View:
     @property
     def rotation_vector(self) -> Floats:
         """`rotation` as an axis times an angle, shape (3,), [rad]."""
-        from scipy.spatial.transform import Rotation
-
         return Rotation.from_matrix(self.rotation.copy()).as_rotvec()
 
 
@@ -248,27 +249,8 @@ def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _
     n = len(points)
     at = Frames(np.broadcast_to(R, (n, 1, 3, 3)), np.broadcast_to(t, (n, 1, 3)))
     rows = RoomPixel(camera).rows(at, np.column_stack([uv, points]), np.empty((n, 0)))
-    places = t + points @ R[:, :2].T
-    K = camera_derivatives(camera, places)
+    K = camera_derivatives(camera, t + points @ R[:, :2].T)
     return _Fit((R, t), float(np.sum(rows.residual**2)), rows.wrenches.reshape(2 * n, 6), K.reshape(2 * n, 9))
-
-
-def camera_derivatives(camera: Camera, points: Floats) -> Floats:
-    """What a change of a camera's `FIGURES` does to where points are seen, shape (n, 2, 9), [px] per unit of each.
-
-    Args:
-        camera: The camera.
-        points: Points in its frame, before it, shape (n, 3), [m].
-    """
-    x, y = (points[:, :2] / points[:, 2:]).T
-    s = x * x + y * y
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    K = np.empty((len(points), 2, 9))
-    u, v = ((camera.image(points)[0] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]).T
-    K[:, 0, :4], K[:, 1, :4] = np.stack([u, zero, one, zero], axis=1), np.stack([zero, v, zero, one], axis=1)
-    K[:, 0, 4:] = camera.fx * np.stack([x * s, x * s**2, 2.0 * x * y, s + 2.0 * x * x, x * s**3], axis=1)
-    K[:, 1, 4:] = camera.fy * np.stack([y * s, y * s**2, s + 2.0 * y * y, 2.0 * x * y, y * s**3], axis=1)
-    return K
 
 
 def _camera_of(found: Sequence[Corners], points: dict[str, Floats], size: tuple[int, int]) -> Camera:
@@ -277,17 +259,13 @@ def _camera_of(found: Sequence[Corners], points: dict[str, Floats], size: tuple[
     Raises:
         InputError: There are too few of them, or they do not say what it is.
     """
-    if len(found) < FEWEST_IMAGES:
+    if len(found) < MIN_IMAGES:
         n = len(found)
-        raise InputError("images", f"{n} with a board", f"at least {FEWEST_IMAGES} to estimate a camera from")
+        raise InputError("images", f"{n} with a board", f"at least {MIN_IMAGES} to estimate a camera from")
     camera = first_camera([points[one.name] for one in found], [one.uv for one in found], size)
     if camera is None or camera.fx <= 0.0 or camera.fy <= 0.0:
-        raise _undetermined()
+        raise InputError(*UNDETERMINED)
     return camera
-
-
-def _undetermined() -> InputError:
-    return InputError("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
 
 
 def _scaled_inverse(A: Floats) -> Floats:
@@ -300,6 +278,6 @@ def _scaled_inverse(A: Floats) -> Floats:
     try:
         L = np.linalg.inv(np.linalg.cholesky(A / np.outer(size, size))) / size
     except np.linalg.LinAlgError:
-        raise _undetermined() from None
+        raise InputError(*UNDETERMINED) from None
     C: Floats = L.T @ L
     return C

@@ -67,23 +67,6 @@ def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
     return hit
 
 
-def blocked_foot(robot: Robot, boxes: Sequence[Box]) -> str:
-    """Which of some boxes keeps every configuration out, as the moving arm begins inside it; empty if none does.
-
-    Args:
-        robot: The robot, at its nominal values.
-        boxes: What must stay free.
-    """
-    points = link_points(robot, _probes(robot))
-    moves = _moving(points)
-    for number, box in enumerate(boxes, start=1):
-        for p in points[0, :-1][~moves[:-1] & moves[1:]]:
-            if np.all((p > box.lower + MAX_CONTACT_M) & (p < box.upper - MAX_CONTACT_M)):
-                at = ", ".join(f"{v:.4g}" for v in p.tolist())
-                return f"keep_out {number} holds the foot of the moving arm, ({at}) m, in every configuration"
-    return ""
-
-
 def _probes(robot: Robot) -> Floats:
     """Two configurations that show what stands still in all of them."""
     return np.outer([0.3, 1.1], np.linspace(0.7, 1.0, robot.n_joints))

@@ -20,7 +20,7 @@ from fg_calib.measurements.limits import outside_limits
 from fg_calib.robot.inverse import Inverse, random_readings, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.obstacles import blocked_foot, enters
+from fg_calib.simulation.obstacles import enters
 from fg_calib.simulation.scenario import BoardViews, Configurations, GivenReadings, RandomReadings, TargetViews
 
 Floats = NDArray[np.float64]
@@ -393,7 +393,7 @@ def find_readings(robot: Robot, of: Configurations, generator: np.random.Generat
     n = number_of(of)
     found = draw_candidates(robot, of, generator, n, place)
     if len(found.readings) < n:
-        hint = blocked_foot(robot, of.keep_out) or "ask for fewer, or relax their conditions"
+        hint = "ask for fewer, or relax their conditions"
         raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
     return found.readings
 

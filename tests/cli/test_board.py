@@ -260,33 +260,18 @@ def test_without_opencv_it_says_what_to_install(job, fg_calib, monkeypatch):
     assert (ended.code, ended.err) == (1, "error: fg-calib board needs OpenCV: pip install 'fg_calib[camera]'\n")
 
 
-def test_an_opencv_that_is_too_old_is_refused(job, fg_calib, monkeypatch):
-    monkeypatch.setattr(cv2, "__version__", "4.6.0")
-    opencv.cache_clear()
-    try:
-        ended = run(fg_calib, job)
-    finally:
-        opencv.cache_clear()
-    hint = "expected 4.11 or newer; pip install 'fg_calib[camera]'"
-    assert (ended.code, ended.err) == (1, f"error: OpenCV: version 4.6.0, {hint}\n")
-
-
 BOARDS = [
     ({"colums": 9}, "board.yaml: unknown key 'colums', expected one of type, columns, rows, square, marker"),
     ({"type": "chequerboard"}, "board.yaml: type: found 'chequerboard', expected one of checkerboard, charuco"),
     ({"columns": 2}, "board.yaml: columns: found 2, expected a number not below 3"),
     ({"square": 20, "units": {}}, "board.yaml: square: found 20.0 m, expected at most 2 m; is it in mm? units: {"),
-    ({"marker": 14}, "board.yaml: marker: found 14.0, expected none with a checkerboard"),
     ({"columns": 8}, "board.yaml: 8 x 6 inner corners look the same after half a turn, expected columns + rows odd, or "
      "a charuco board; where the camera never turns more than a quarter about its axis, say upright: true"),
-    ({"columns": 6}, "board.yaml: 6 x 6 inner corners look the same from several sides, expected columns + rows odd"),
-    ({"upright": True}, "board.yaml: upright: found true, expected none with 9 x 6 inner corners, whose ends differ"),
     (CHARUCO | {"dictionary": "DICT_5x5_1000000"}, "board.yaml: dictionary: found 'DICT_5x5_1000000', expected one of "
      "OpenCV's, such as DICT_5X5_100; did you mean DICT_5X5_1000?"),
     (CHARUCO | {"dictionary": None}, "board.yaml: missing key 'dictionary'"),
     (CHARUCO | {"marker": None}, "board.yaml: missing key 'marker'"),
     (CHARUCO | {"marker": 20}, "board.yaml: marker: found 20.0, expected a side shorter than a square's, 20.0"),
-    (CHARUCO | {"upright": True}, "board.yaml: upright: found true, expected none with a charuco board"),
     (CHARUCO | {"columns": 20, "rows": 20}, "board.yaml: dictionary: DICT_5X5_100 has 100 markers, expected 200"),
 ]  # fmt: skip
 
@@ -322,10 +307,6 @@ CASES = {
         lambda job: shutil.copy(job / "images" / "view1.png", job / "images" / "view1.bmp"),
         "{job}/images/view1.png: a second image called 'view1', expected one, as view1.bmp is called so",
     ),
-    "an image of no name": (
-        lambda job: shutil.copy(job / "images" / "view1.png", job / "images" / "nan.png"),
-        "{job}/images/nan.png: an image called 'nan', expected a name that a table can have under id",
-    ),
     "no images": (
         lambda job: [file.unlink() for file in (job / "images").iterdir()],
         "{job}/images: no images, expected files that end in .png, .jpg, .jpeg, .tif, .tiff, .bmp, .pgm, .ppm,",
@@ -337,7 +318,7 @@ CASES = {
     ),
     "a camera of other images": (
         lambda job: (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"width": 1280, "height": 960})),
-        "camera.yaml: width: found 1280, expected 640 px as the images have; figures of other images would have to be",
+        "camera.yaml: width: found 1280, expected 640 px as the images have; the intrinsics of other",
     ),
     "a camera with an unknown key": (
         lambda job: (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"k4": 0.1})),

@@ -12,7 +12,6 @@ from fg_calib.designs import search
 from fg_calib.designs.criteria import Measure
 from fg_calib.designs.search import (
     Chooser,
-    choose,
     choose_greedily,
     draw_sets,
     exchange,
@@ -142,7 +141,7 @@ def test_a_target_that_none_reaches_takes_all_there_are():
 @pytest.mark.parametrize("criterion", ["D", "O2"])
 def test_a_target_is_of_the_error_whatever_the_criterion(criterion):
     system = random_system(np.random.default_rng(5), 40)
-    target = np.sqrt(value(system, "I", choose(system, 10).candidates)) * 1.1
+    target = np.sqrt(value(system, "I", Chooser(system, "I").best(10).candidates)) * 1.1
     found = Chooser(system, criterion).reaching(target, np.random.default_rng(0))
     assert np.sqrt(value(system, "I", found.candidates)) <= target
 

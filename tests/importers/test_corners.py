@@ -72,11 +72,6 @@ def test_an_image_without_the_board_has_none(board):
     assert find_corners(grey, board) == "no board"
 
 
-def test_corners_along_a_line_say_too_little():
-    assert CHECKERBOARD.span(np.arange(9)) == pytest.approx(0.0, abs=1e-12)
-    assert CHECKERBOARD.span(np.arange(18)) == pytest.approx(0.5)
-
-
 def test_a_dictionary_with_too_few_markers_is_refused():
     with pytest.raises(InputError) as error:
         charuco_board(CalibrationBoard("charuco", 15, 11, 0.02, 0.014, "DICT_4X4_50"), "board.yaml")

@@ -10,8 +10,8 @@ from scipy.stats import chi2, kstest
 from tolerances import sigmas_apart
 
 from fg_calib.errors import InputError
-from fg_calib.importers.opencv import CalibrationBoard, find_corners
-from fg_calib.importers.views import FIGURES, Corners, camera_derivatives, fit_board
+from fg_calib.importers.opencv import CalibrationBoard, camera_derivatives, find_corners
+from fg_calib.importers.views import FIGURES, Corners, fit_board
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.kinds.board import BoardPose
