@@ -16,7 +16,7 @@ from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import pose
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
-"""World_T_base of a tracker beside the robot."""
+"""World_T_base of a tracker next to the robot."""
 
 SLOW = ("pixels", "camera in the room", "contact", "faces", "sockets")
 """Instruments whose simulation, or placing, takes longest."""
@@ -49,7 +49,7 @@ def said(found):
 
 
 @pytest.mark.slow
-def test_the_bundled_example_is_ready_and_nothing_is_to_be_said_of_it(whole_example):
+def test_the_bundled_example_is_ready_without_a_note(whole_example):
     found = inspect_job(read_job(whole_example / "calibration.yaml"))
     assert found.ready
     assert said(found) == ()
@@ -89,23 +89,12 @@ def test_rows_to_test_alone_are_inspected_as_an_evaluation(arm):
 
 # --- mistakes in the set-up ------------------------------------------------------------------------------------------
 
-MISTAKES = {
-    "x, y, z are in mm, not m": lambda m: replace(m, position=m.position * 1e3),
-    "joint readings are in deg, not rad": lambda m: replace(m, readings=np.rad2deg(m.readings)),
-    "the poses are inverted": lambda m: replace(
-        m, rotation=np.swapaxes(m.rotation, 1, 2), position=-np.einsum("nji,nj->ni", m.rotation, m.position)
-    ),
-    "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
-    "joint 2 moves the other way": lambda m: replace(m, readings=m.readings * [1, -1, 1, 1, 1, 1]),
-}
 
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_in_the_set_up_is_a_finding(arm, mistake):
-    found = inspected(arm, MISTAKES[mistake](measured(arm)))
-    assert len(found.findings) == 1
-    assert f"if {mistake}" in found.findings[0]
+def test_a_mistake_in_the_set_up_is_a_finding(arm):
+    m = measured(arm)
+    found = inspected(arm, replace(m, position=m.position * 1e3))
+    (finding,) = found.findings
+    assert "if x, y, z are in mm, not m" in finding
     assert found.disagreements.found == ()  # not looked for: all rows would
 
 
@@ -127,7 +116,7 @@ def test_rows_that_disagree_with_the_arm_are_named(arm, model, frame, size):
 
 
 @pytest.mark.parametrize("n_test", [0, 10])
-def test_limits_that_cannot_be_evaluated_are_told_of(arm, n_test):
+def test_limits_that_cannot_be_evaluated_are_reported(arm, n_test):
     m = measured(arm)
     m = replace(m, test=np.arange(m.n_configurations) < n_test)
     limits = {"position": 1e-3, "distance": 1e-3}
@@ -175,7 +164,7 @@ def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
     assert found.cautions[0].endswith(": 1 (7)")
 
 
-def test_of_a_long_table_some_rows_are_looked_at_and_it_is_said(arm, monkeypatch):
+def test_some_rows_of_a_long_table_are_screened(arm, monkeypatch):
     monkeypatch.setattr(disagreement, "MAX_ROWS", 25)
     m = measured(arm)
     found = inspected(arm, replace(m, position=plus(m.position, [49], 0.05)))
@@ -186,7 +175,7 @@ def test_of_a_long_table_some_rows_are_looked_at_and_it_is_said(arm, monkeypatch
 # --- what rows hold --------------------------------------------------------------------------------------------------
 
 
-def test_copies_of_rows_are_told_from_repeats(arm):
+def test_copies_of_rows_are_distinguished_from_repeats(arm):
     """A repeat has the same readings and another measurement."""
     m = measured(arm)
     again = m.select(np.array([*range(50), 3]))
@@ -202,19 +191,19 @@ def test_copies_of_rows_are_told_from_repeats(arm):
     assert (repeated.tables[0].n_copies, repeated.tables[0].n_repeats) == (0, 1)
 
 
-def test_test_rows_at_train_configurations_are_told_of(arm):
+def test_test_rows_at_train_configurations_are_reported(arm):
     q = np.random.default_rng(5).uniform(-2, 2, (50, 6))
     q[[41, 42]] = q[[1, 2]] + 5e-4
     found = inspected(arm, measured(arm, readings=q))
     assert found.cautions == ("measurements: test rows at configurations of train rows, no check of a prediction: 2",)
 
 
-def test_a_table_without_test_rows_is_told_of(arm):
+def test_a_table_without_test_rows_is_reported(arm):
     (caution,) = said(inspected(arm, measured(arm, n_test=0, n=50)))
     assert caution.startswith("no test rows")
 
 
-def test_a_joint_that_hardly_moves_is_told_of(arm):
+def test_a_joint_that_hardly_moves_is_reported(arm):
     q = np.random.default_rng(5).uniform(-2, 2, (50, 6))
     q[:, 3] = 0.3
     found = inspected(arm, measured(arm, readings=q))
@@ -234,17 +223,7 @@ def test_readings_far_outside_limits_are_a_finding():
     assert found.joints[0].n_outside == 1
 
 
-def test_pairs_near_nothing_are_counted():
-    robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
-    rng = np.random.default_rng(0)
-    q = rng.uniform(-2, 2, (30, 4))
-    q[1:8] = q[0] + 1e-4 * rng.normal(size=(7, 4))  # the star's first
-    m = measure(robot, 30, rng, sigma=(1e-4, 1e-4), readings=q)
-    found = inspected(robot, m, "distance-rotation", "known")
-    assert (found.tables[0].n_pairs, found.tables[0].n_near_singular) == (29, 7)
-
-
-def test_pairs_whose_vectors_may_point_either_way_are_told_of():
+def test_pairs_whose_vectors_may_point_either_way_are_reported():
     """Eight configurations that bring the tool to one place: what lies between them is what the arm is off by."""
     robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
     rng = np.random.default_rng(0)
@@ -267,10 +246,9 @@ def test_a_job_whose_rows_determine_nothing_is_not_ready():
 
 
 def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
-    robot = Robot.from_dh([[0.5, 0, 0, 0], [0.4, 0, 0, 0]], "dh").with_estimated(["a1", "a2", "theta1"])
+    robot = Robot.from_dh([[0.5, 0, 0, 0], [0.4, 0, 0, 0]], "dh").with_estimated(["a1", "a2", "d1"])
     at = pose(robot, [[0.3, 1.0]])
     m = Measurements.from_arrays([[0.3, 1.0]], position=at.position, sigma_position=1e-3)
-    found = inspected(robot.with_estimated(["a1", "a2"]), m, "position", "known", gauge="none")
-    assert found.dof == 1
-    found = inspected(robot.with_estimated(["a1", "a2", "d1"]), m, "position", "known", gauge="none")
+    found = inspected(robot, m, "position", "known", gauge="none")
+    assert found.dof == 0
     assert found.findings[-1].startswith("no degree of freedom is left")

@@ -97,8 +97,8 @@ def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypa
     assert assess(solution).trustworthy
 
 
-def test_a_descent_from_elsewhere_that_cannot_be_made_is_no_fault_of_the_first(tmp_path, monkeypatch):
-    """Elsewhere a step may have no solution at all, or noise be lost in rounding."""
+def test_a_descent_from_another_start_that_fails_is_left_out(tmp_path, monkeypatch):
+    """There a step may have no solution at all, or noise be lost in rounding."""
 
     def fail(*_, **__):
         raise SolverError("the linear system has no unique solution near J1")

@@ -37,7 +37,7 @@ MEASURED = ["targets known", "targets stations", "anchors offset", "targets", "b
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("instrument", MEASURED)
 def test_the_bound_is_what_a_calibration_of_the_table_says(instrument):
-    """Which has it at the estimate, where noise bends little: some percent of a sigma."""
+    """Which has it at the estimate, where rows are nearly linear: some percent of a sigma."""
     robot, true, table = measured_by(instrument, np.random.default_rng(3), sigma_joint=1e-4)
     found = assess(solve(build_problem(robot, table)))
     bound = cramer_rao(true, table)
