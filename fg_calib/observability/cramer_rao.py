@@ -35,7 +35,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.errors import InputError, shown
 from fg_calib.graph.build import predicted_problem, true_problem
-from fg_calib.graph.problem import Problem, correlation, named_triangle
+from fg_calib.graph.problem import correlation, named_triangle
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
@@ -134,7 +134,14 @@ def cramer_rao(
     check_names("kept", () if kept is None else kept, names, "or fixed parameter")
     check_flag("prior", prior)
     k = np.array([kept is None or name in kept for name in names])
-    problem = _problem_of(robot, measurements, model, pairing, frame, pair_errors)
+    if isinstance(measurements, Measurements):
+        chosen = check("model", model, Model)
+        problem = predicted_problem(robot, measurements, chosen, frame=frame, pairing=pairing, pair_errors=pair_errors)
+    else:
+        for key, given, default in (("model", model, None), ("pairing", pairing, None), ("frame", frame, "known")):
+            if given != default:
+                raise InputError(key, f"found {shown(given)} with tables", "none: each table has its own")
+        problem = true_problem(robot, measurements, Options("pose", gauge="none", pair_errors=pair_errors))
     J = named_triangle(problem, problem.start)  # (m, n_names)
     sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])
     gain, claimed, rank = _linear_estimate(J, np.diag(1.0 / sigma) if prior else np.zeros((0, len(names))), k)
@@ -150,24 +157,6 @@ def cramer_rao(
         back = problem.variables.tangent_derivative(problem.start)
         covariance = covariance + claimed @ (back.T @ added @ back) @ claimed
     return Bound(robot, names, covariance, claimed, rank)
-
-
-def _problem_of(
-    robot: Robot,
-    measurements: Measurements | Table | Sequence[Table],
-    model: Model | None,
-    pairing: Pairing | None,
-    frame: FrameKnowledge,
-    pair_errors: PairErrors,
-) -> Problem:
-    """The problem of what would be measured at a table's configurations, or of tables as they are."""
-    if isinstance(measurements, Measurements):
-        chosen = check("model", model, Model)
-        return predicted_problem(robot, measurements, chosen, frame=frame, pairing=pairing, pair_errors=pair_errors)
-    for key, given, default in (("model", model, None), ("pairing", pairing, None), ("frame", frame, "known")):
-        if given is not default and given != default:
-            raise InputError(key, f"found {shown(given)} with tables", "none: each table has its own")
-    return true_problem(robot, measurements, Options("pose", gauge="none", pair_errors=pair_errors))
 
 
 def _linear_estimate(J: Floats, P: Floats, k: Booleans) -> tuple[Floats, Floats, int]:
