@@ -18,29 +18,17 @@ from fg_calib.diagnostics.unmodelled_effects import find_change, forgotten_offse
 from fg_calib.diagnostics.verdict import LIKE_NOISE, NOT_NOISE, check_systematic
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.observability.parallel_axes import end_of_link
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.variance_components import estimate_noise
 
 
-def sagging(radians_per_metre, weight_of_links=0.3):
-    """Joints that yield to a weight at the tool and to those of the links."""
-
-    def effect(true, q):
-        at, n = pose(true, q), true.n_joints
-        J = at.jacobian[:, :, len(true.parameters) :]
-        torque = J[:, 5].copy()
-        for owner in range(1, n):
-            link = pose(replace(true, elements=true.elements[: end_of_link(true, owner)]), q)
-            lever = (link.position - at.position)[:, :, None]
-            torque[:, :owner] += weight_of_links * (J[:, 5] + np.cross(J[:, :3], lever, axis=1)[:, 2])[:, :owner]
-        return radians_per_metre * torque
-
-    return effect
+def gravity(true, q):
+    """Joints that yield to a weight at the tool."""
+    return 2e-4 * pose(true, q).jacobian[:, 5, len(true.parameters) :]
 
 
 EFFECTS = {
-    "gravity": sagging(2e-4),
+    "gravity": gravity,
     "reach": of_joint(1, lambda true, q: 1e-3 * np.linalg.norm(pose(true, q).position[:, :2], axis=1)[:, None]),
     "gain": of_joint(2, lambda _, q: 3e-4 * q),
     "backlash": of_joint(1, lambda _, q: 3e-4 * np.sign(np.sin(q))),
@@ -186,20 +174,3 @@ def test_a_forgotten_offset_is_reported_with_its_size():
     verdict, healthy = assess(solution).verdict, assess(estimated).verdict
     assert any("use offset: estimate" in text for text in (*verdict.errors, *verdict.warnings))
     assert not any("offset: estimate" in text for text in (*healthy.errors, *healthy.warnings, *healthy.notes))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("offset", "loss", "least", "most"), [(0.0, "gnc", 0, 0), (5e-3, "gnc", 8, 12), (0.0, "none", 0, 0)]
-)
-def test_offsets_are_found_behind_a_robust_loss_and_nowhere_by_chance(offset, loss, least, most):
-    """Of 12 tables with gross errors; the loss takes a part of what the offset does to the lengths for outliers."""
-    n = 0
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        robot, table = lengths(rng, offset)
-        m = table.measurements
-        gross = 0.03 * rng.normal(size=len(m.length)) * (rng.random(len(m.length)) < 0.08) * (loss == "gnc")
-        table = replace(table, measurements=replace(m, length=m.length + gross))
-        n += len(forgotten_offsets(solve(build_problem(robot, [table], loss=loss))))
-    assert least <= n <= most

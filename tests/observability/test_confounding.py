@@ -57,20 +57,6 @@ def test_unknown_targets_take_up_what_a_known_one_shows(instrument):
         assert seen(without, relation) < 1e-6 * seen(with_one, relation)
 
 
-@pytest.mark.slow
-def test_how_many_places_must_be_given_is_counted():
-    """The tool may turn about two of three known targets."""
-    robot, _, table = measured_by("targets", np.random.default_rng(0))
-    robot = replace(robot, parameters=tuple(
-        replace(p, estimated=p.name.startswith("tool.")) for p in robot.parameters))  # fmt: skip
-    _, found = looked_at(robot, table)
-    ((reason, relations),) = by_reason(found).items()
-    assert reason == f"{TARGETS_DO}: to see it, give the places of 3 targets (key targets)"
-    assert len(relations) == 6
-    for names, rank in ((["t0"], 3), (["t0", "t1"], 5), (["t0", "t1", "t2"], 6)):
-        assert looked_at(robot, given(table, names))[1].observability.rank == rank
-
-
 def test_what_an_instrument_adds_takes_up_a_length():
     """A slide that only moves towards its anchor."""
     robot = Robot.from_dh([[0.0, 0.0, 0.3, 0.0]], convention="dh", types="prismatic", tolerance={"d": 1e-3})
