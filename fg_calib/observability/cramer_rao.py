@@ -118,16 +118,13 @@ def cramer_rao(
         measurements: Readings and sigmas; or tables, such as those of a simulation.
         model: Which measurements take part; each table has its own.
         pairing: How pairs are formed, a star if None; each table has its own.
-        frame: `unknown` estimates world_T_base with the parameters; each table has its own. Of no meaning for models of
-            pairs.
+        frame: `unknown` estimates world_T_base with the parameters; each table has its own.
         prior: Whether the tolerances are priors.
         kept: The parameters that are estimated, all if None; the others stay at nominal and keep their errors.
-            Directions that nothing determines are left where they are, by minimum norm, metres and radians alike.
         pair_errors: `shared`: the exact noise of pairs; `independent`: pairs are weighted as if independent.
 
     Raises:
-        InputError: An unknown parameter, or one without tolerance whose error enters the estimate's; a choice that
-            tables make themselves.
+        InputError: An unknown parameter, one whose error enters without a tolerance, a choice that tables make.
         ProblemError: A table lacks what its model needs.
     """
     names = tuple(p.name for p in robot.parameters if p.estimated)
