@@ -26,6 +26,7 @@ from fg_calib.graph.build import problem_of
 from fg_calib.graph.problem import Problem, eliminated, tables_of
 from fg_calib.graph.solver import Solution, unsolved
 from fg_calib.job import Job
+from fg_calib.measurements.build import find_copies
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.limits import outside_limits
 from fg_calib.measurements.table import Table
@@ -207,7 +208,7 @@ def inspect_job(job: Job) -> Inspection:
 def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
     """The counts of a table, with the test rows that it states."""
     m, problem = table.measurements, at_nominal.problem
-    copies, copy, repeats = _same_rows(m, table.uses_pairs)
+    copies, copy, repeats = find_copies(m, table.uses_pairs)
     series = [s for s in problem.data.series if s.table == number]
     pairs = find_ambiguous_rows(at_nominal, np.zeros((problem.variables.n_columns, 0)), 0, number)
     n_residuals = Counter[str]()
@@ -232,33 +233,6 @@ def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
         n_near_singular=pairs.n_near,
         n_ambiguous=len(set(pairs.names)),
     )
-
-
-def _same_rows(m: Measurements, measured_pairs: bool) -> tuple[int, str, int]:
-    """How many rows, or measured pairs, equal an earlier one, two names, and how many have its place but other values.
-
-    Args:
-        m: The measurements.
-        measured_pairs: Whether its pairs are looked at, whichever end is a.
-    """
-    if measured_pairs and m.pairs is not None:
-        a, b = np.sort(np.stack([m.pairs.a, m.pairs.b]), axis=0)
-        names = [f"{m.ids[i]}-{m.ids[j]}" for i, j in zip(a.tolist(), b.tolist(), strict=True)]
-        columns, measured = [a[:, None], b[:, None]], [m.pairs.distance[:, None], m.pairs.angle[:, None]]
-    else:
-        names, n = m.ids.tolist(), m.n_configurations
-        columns = [m.readings, *(of.index[:, None] for of in m.labels.values())]
-        columns += [] if m.groups is None else [m.groups.index[:, None]]
-        columns += [] if m.image is None else [m.image[:, 2:]]
-        measured = [v.reshape(n, -1) for v in (m.position, m.rotation, m.length, m.image) if v is not None]
-    if not measured:
-        return 0, "", len(names) - len(np.unique(np.hstack(columns) + 0.0, axis=0))
-    values = np.hstack([*columns, *(np.nan_to_num(v, nan=-1e300) for v in measured)]) + 0.0  # no -0
-    first, of = np.unique(values, axis=0, return_index=True, return_inverse=True)[1:]
-    same: Integers = first[of.ravel()]
-    copied = np.flatnonzero(same != np.arange(len(same))).tolist()
-    two = dict.fromkeys([names[same[copied[0]]], names[copied[0]]] if copied else [])
-    return len(copied), " and ".join(two), len(first) - len(np.unique(np.hstack(columns) + 0.0, axis=0))
 
 
 def _n_leaked(m: Measurements) -> int:

@@ -26,7 +26,7 @@ from fg_calib.graph.problem import (
 from fg_calib.graph.tolerances import with_first_tolerances
 from fg_calib.graph.variables import Variables, preference, prior_rows
 from fg_calib.job import Job
-from fg_calib.measurements.build import Dataset, build_dataset, check_repeats
+from fg_calib.measurements.build import Dataset, build_dataset, warn_of_copies
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import INSTRUMENTS, Frames, check_derivatives, check_start, is_ours
 from fg_calib.measurements.kinds.pair import missing_values
@@ -91,7 +91,7 @@ def build_problem(
             _log.warning("%s: not used, model %s is of poses", source, table.model)
         for text in missing_values(table):
             _log.warning("%s", text)
-        check_repeats(table)
+        warn_of_copies(table)
     return problem_of_tables(robot, tables, options)
 
 

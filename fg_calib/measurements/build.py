@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Brief
-from fg_calib.errors import InputError, ProblemError, shown
+from fg_calib.errors import InputError, ProblemError
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.initialization.start import FrameStart
-from fg_calib.measurements.dataset import Measurements, Pairs, are_same
+from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Kind, is_ours
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
 from fg_calib.measurements.kinds.contact import POINT
@@ -214,55 +214,52 @@ def _places_of_named(
     return place
 
 
-def check_repeats(table: Table) -> None:
+def warn_of_copies(table: Table) -> None:
     """Warn where measurements of a table are there twice, all figures the same.
 
     Honest repeats have other figures at the same readings; but what instruments round, or nothing disturbs, may repeat.
     """
-    m, groups = table.measurements, table.measurements.groups
-    if m.pairs is None or not table.uses_pairs:
-        figures = [v.reshape(-1, n) for v, n in ((m.position, 3), (m.rotation, 9)) if v is not None]
-        if figures:
-            labels = [of.index[:, None] for of in m.labels.values()]
-            rows = np.hstack([m.readings, *figures, m.test[:, None], *labels])
-            _check_different(m.source, "poses", rows, lambda i: str(m.ids[i]))
-    if m.pairs is not None and table.uses_pairs:
-        _check_pairs_different(m.pairs, m.readings, m.ids)
-    if groups is not None and table.uses_pairs:
-        _check_pairs_different(groups.pairs, np.arange(groups.n_groups)[:, None], groups.names)
-
-
-def _check_pairs_different(pairs: Pairs, places: Integers | Floats, names: Sequence[str] | NDArray[np.str_]) -> None:
-    """Check that pairs differ, whichever end is a; one of the same place tells nothing and takes no part."""
-    if pairs.n_pairs - np.sum(are_same(places, pairs.a, pairs.b)) > MOST_LOOKED_AT:
+    m = table.measurements
+    if (m.n_configurations if m.pairs is None else m.pairs.n_pairs) > MOST_LOOKED_AT:
         return
-    ends = np.stack([places[pairs.a], places[pairs.b]], axis=1).astype(np.float64)
-    step = ends[:, 1] - ends[:, 0]
-    first = np.argmax(step != 0.0, axis=1)[:, None]  # the figure that tells the ends apart
-    sign = np.take_along_axis(step, first, axis=1)[:, 0]
-    ends[sign < 0.0] = ends[sign < 0.0][:, ::-1]
-    rows = np.hstack([ends[:, 0], ends[:, 1], np.stack([pairs.distance, pairs.angle, pairs.test], axis=1)])
-    chosen = np.flatnonzero(sign != 0.0)
-    ends_of = np.stack([pairs.a, pairs.b], axis=1)[chosen]
-    _check_different(pairs.source, "pairs", rows[chosen], lambda i: "-".join(names[k] for k in ends_of[i]))
+    n, two, _ = find_copies(m, table.uses_pairs)
+    if n:
+        found = f"{n} rows have the readings and figures of an earlier one, such as {two}"
+        _log.warning("%s: %s; were they copied? They count as often", m.source, found)
 
 
-def _check_different(source: str, what: str, rows: Floats, called: Callable[[int], str]) -> None:
-    """Warn where rows stand more than once; of very many that is not looked for."""
-    if not 1 < len(rows) <= MOST_LOOKED_AT:
-        return
-    whole = np.ascontiguousarray(rows + 0.0)  # no -0
-    keys = whole.view(np.dtype((np.void, whole.itemsize * whole.shape[1])))[:, 0]
-    _, of, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    repeated = counts[of] > 1
-    if not repeated.any():
-        return
-    row = int(np.argmax(repeated))
-    first, second = (called(i) for i in np.flatnonzero(of == of[row])[:2].tolist())
-    found = f"{int(np.sum(repeated))} of {len(rows)} {what} have the readings and figures of another"
-    _log.warning(
-        "%s: %s, as %s and %s; were they copied? They count as often", source, found, shown(first), shown(second)
+def find_copies(m: Measurements, measured_pairs: bool) -> tuple[int, str, int]:
+    """How many rows, or measured pairs, equal an earlier one, two names, and how many have its place but other values.
+
+    Args:
+        m: The measurements.
+        measured_pairs: Whether its pairs are looked at, whichever end is a.
+    """
+    if measured_pairs and m.pairs is not None:
+        a, b = np.sort(np.stack([m.pairs.a, m.pairs.b]), axis=0)
+        columns, measured = [a[:, None], b[:, None]], [m.pairs.distance[:, None], m.pairs.angle[:, None]]
+        test = m.pairs.test
+    else:
+        a = b = np.arange(m.n_configurations)
+        columns = [m.readings, *(of.index[:, None] for of in m.labels.values())]
+        columns += [] if m.groups is None else [m.groups.index[:, None]]
+        columns += [] if m.image is None else [m.image[:, 2:]]
+        figures = (m.position, m.rotation, m.length, m.image, *m.columns.values())
+        measured = [v.reshape(len(a), -1) for v in figures if v is not None]
+        test = m.test
+    n_places = len(np.unique(np.hstack(columns) + 0.0, axis=0))
+    if not measured:
+        return 0, "", len(a) - n_places
+    values = np.hstack([*columns, *(np.nan_to_num(v, nan=-1e300) for v in measured), test[:, None]]) + 0.0  # no -0
+    first, of = np.unique(values, axis=0, return_index=True, return_inverse=True)[1:]
+    copied = np.flatnonzero(first[of.ravel()] != np.arange(len(values)))
+    names = (
+        [f"{m.ids[i]}" if i == j else f"{m.ids[i]}-{m.ids[j]}" for i, j in zip(a, b, strict=True)]
+        if len(copied)
+        else []
     )
+    two = dict.fromkeys(names[i] for k in copied[:1] for i in (first[of.ravel()[k]], k))
+    return len(copied), " and ".join(two), len(first) - n_places
 
 
 def _check_once(table: Table, other: Table) -> None:

@@ -369,10 +369,10 @@ def test_a_block_that_was_pasted_twice_into_a_table_is_told_of(model, caplog):
     rng = np.random.default_rng(9)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
-    found = "have the readings and figures of another, as '0' and '12'; were they copied? They count as often"
-    for rows, n in (([*range(12), *range(12)], 24), ([*range(12), 0], 2)):
+    found = "have the readings and figures of an earlier one, such as 0 and 12; were they copied? They count as often"
+    for rows, n in (([*range(12), *range(12)], 12), ([*range(12), 0], 1)):
         build_problem(robot, [Table(pasted(m, rows), model)])
-        assert [r.message for r in caplog.records] == [f"measurements: {n} of {len(rows)} poses {found}"]
+        assert [r.message for r in caplog.records] == [f"measurements: {n} rows {found}"]
         caplog.clear()
     again = pasted(m, [*range(12), *range(12)])
     build_problem(robot, [Table(replace(again, position=again.position + rng.normal(size=(24, 3)) * 1e-4), model)])
@@ -386,10 +386,10 @@ def test_pairs_in_both_directions_are_told_of_and_repeats_are_not(caplog):
     twice = p.select(np.tile(np.arange(p.n_pairs), 2))
     back = np.arange(twice.n_pairs) >= p.n_pairs
     both = replace(twice, a=np.where(back, twice.b, twice.a), b=np.where(back, twice.a, twice.b))
-    for pairs, other in ((twice, "0-1"), (both, "1-0")):
+    for pairs in (twice, both):
         build_problem(robot, [Table(replace(m, pairs=pairs), "distance")])
-        found = f"30 of 30 pairs have the readings and figures of another, as '0-1' and '{other}'"
-        assert [r.message for r in caplog.records] == [f"pairs.csv: {found}; were they copied? They count as often"]
+        assert ["15 rows have the readings and figures of an earlier one, such as 0-1;" in r.message
+                for r in caplog.records] == [True]  # fmt: skip
         caplog.clear()
     repeats = replace(both, distance=both.distance + 1e-4 * back)
     assert build_problem(robot, [Table(replace(m, pairs=repeats), "distance")]).n_residuals == 30
