@@ -290,7 +290,7 @@ def _position_error(posterior: Posterior, task: Task) -> float:
 
 
 def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Callable[[Integers], float] | None:
-    """The error with some candidates where pairs are formed otherwise than in a star; None elsewhere.
+    """The error with some candidates where pairs are formed otherwise than in a star; else None.
 
     Candidates are chosen there as poses in an unknown frame, which hold at least as much (see `MEASURED`), and compared
     with random ones by this error: a chain of pairs may hold far less, and of other poses more.

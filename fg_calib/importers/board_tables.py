@@ -1,4 +1,4 @@
-"""Tables of what a camera saw of a calibration board: `pixels.csv`, `board.csv`, and the camera beside them."""
+"""Tables of what a camera saw of a calibration board: `pixels.csv`, `board.csv`, and the camera's file."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class BoardTables:
             "image_size": list(fit.size),
             "rms_pixel": fit.rms,
             "sigma_pixel": fit.sigma,
-            "images": [_image_document(view, fit.camera_covariance is not None) for view in fit.views],
+            "images": [_image_document(view, fit) for view in fit.views],
             "camera": asdict(fit.camera),
             "camera_sigma": fit.camera_sigma,
             "without_board": dict(self.without),
@@ -140,18 +140,16 @@ class BoardTables:
         }
 
 
-def _image_document(view: View, estimated: bool) -> dict[str, Any]:
+def _image_document(view: View, fit: BoardFit) -> dict[str, Any]:
+    """A board in an image, as in `board.json`."""
+    arrays = ("position", "rotation_vector", "covariance")
     return {
         "id": view.name,
         "n_corners": len(view.corners),
-        "rms_pixel": view.rms,
-        "sigma_pixel": view.sigma,
-        "position": view.position.tolist(),
-        "rotation_vector": view.rotation_vector.tolist(),
-        "covariance": view.covariance.tolist(),
-        "covariance_by_camera": view.by_camera.tolist() if estimated else None,
-        "ambiguous": bool(view.ambiguous),
-        "poor": bool(view.poor),
+        **{f"{key}_pixel": getattr(view, key) for key in ("rms", "sigma")},
+        **{key: getattr(view, key).tolist() for key in arrays},
+        "covariance_by_camera": None if fit.camera_covariance is None else view.by_camera.tolist(),
+        **{key: bool(getattr(view, key)) for key in ("ambiguous", "poor")},
     }
 
 

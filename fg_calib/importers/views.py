@@ -38,7 +38,7 @@ _AS_GOOD = 10.8
 """Chi-square by which a second pose may fit worse and still be the true one: its 99.9 % point."""
 
 _POOR = 3.0
-"""RMS of an image's residuals over the median of all from which something is wrong with it: blur, a bent board."""
+"""RMS of an image's residuals over the median of all from which it is poor: blur, or a board that is not flat."""
 
 _FAR_OFF = 0.002
 """RMS of all residuals, in diagonals of the image, that no lens unlike its model leaves: a camera of other images."""

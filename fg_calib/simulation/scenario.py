@@ -404,7 +404,7 @@ class BoardViews(Conditions):
         radius: Of the half sphere about A, [m].
         distance: Smallest and largest distance from the centre, [m]; None for the half sphere.
         cone: Largest angle between the normal and the direction from the centre to the camera, [rad].
-        roll: Of the camera about its optical axis, [rad]; at 0 its x axis at A is the board's, and elsewhere the
+        roll: Of the camera about its optical axis, [rad]; at 0 its x axis at A is the board's, and at other views the
             smallest rotation of the optical axis applied to that. None draws it.
         self_motion: `random`: every configuration has its own, from a random start of the inverse kinematics;
             `held`: all continue from that of A by steps of minimum norm.

@@ -94,9 +94,9 @@ def test_the_report_says_what_to_expect_and_where_to_measure(plan, fg_calib):
     said = " ".join(
         fg_calib("design", plan(job={"model": "distance-rotation", "gauge": "none"}), "--n", 6, *FEW).out.split()
     )
-    for words in ("small-arm: where to measure at 6 stops", "after the best rigid fit", "Stops and accuracy",
-                  "80 % of random", "Which pairs", "all that can be formed", "Where to measure", "Still undetermined",
-                  "candidates: ", "joint travel along the stops"):  # fmt: skip
+    for words in ("small-arm: where to measure at 6 poses", "after the best rigid fit", "Poses and accuracy",
+                  "80 % of random", "Which pairs", "all that can be formed", "Where to measure", "not identifiable",
+                  "candidates: ", "joint travel along the poses"):  # fmt: skip
         assert words in said
 
 
@@ -120,7 +120,7 @@ def test_what_can_be_asked_for_is_done(plan, fg_calib, tmp_path):
 def test_a_target_that_is_missed_ends_with_3(plan, fg_calib, tmp_path):
     missed = fg_calib("design", plan(), "--target", "0.000001mm", *FEW, "--out", tmp_path / "out")
     assert missed.code == 3
-    assert "25 stops do not reach an expected RMS error of" in missed.out
+    assert "25 poses do not reach an expected RMS error of" in missed.out
     assert "doubtful: the target is not reached" in missed.err.splitlines()[-1]
     assert (tmp_path / "out" / "design.json").is_file()
 
@@ -212,7 +212,7 @@ def test_the_job_calibrates_when_it_is_filled_in(kind, plan, fg_calib, tmp_path)
     calibrated = fg_calib("calibrate", out / "calibration.yaml", "--out", tmp_path / "result")
     assert calibrated.code == 0, calibrated.out + calibrated.err
     result = json.loads((tmp_path / "result" / "result.json").read_text())
-    expected = result["expected_error"]["position"]["fitted" if document["fitted"] else "base"]
+    expected = result["expected_error"]["fitted" if document["fitted"] else "base"]["position"]
     # Over the stops instead of the task, and at another arm: the same size.
     assert 0.3 < expected / document["expected"]["position"] < 3.0
 

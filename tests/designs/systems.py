@@ -1,4 +1,4 @@
-"""Random systems to choose from: candidates' rows, something known, a task, and unknowns beside the core."""
+"""Random systems to choose from: candidates' rows, something known, a task, and other unknowns."""
 
 import numpy as np
 
@@ -16,11 +16,11 @@ def random_system(rng, n_candidates=12, h=2, p=4, nuisances=2, floor=0.1) -> Sys
     return System(rows, known, task, np.eye(p, n), np.eye(n), 0.0)
 
 
-def random_stops(rng, n_candidates=15, lost=True):
-    """Stops of three core columns and two nuisances; what is lost is the first core column less the second nuisance.
+def random_poses(rng, n_candidates=15, lost=True):
+    """Poses of three core columns and two nuisances; what is lost is the first core column minus the second nuisance.
 
     Returns:
-        The stops, the direction of the columns that none of them determines (None if nothing is lost), and W.
+        The poses, the direction of the columns that none of them determines (None if nothing is lost), and W.
     """
     scales = np.array([1e-3, 2e-3, 1e-3, 5e-3, 1.0])
     rows = rng.normal(size=(n_candidates, 2, 5)) / scales * 10.0
@@ -36,5 +36,5 @@ def random_stops(rng, n_candidates=15, lost=True):
 
 def system_with_less(rng) -> System:
     """A system of which one direction of the core is undetermined."""
-    stops, _, W = random_stops(rng)
-    return build_system(stops, np.zeros((0, 5)), W)
+    poses, _, W = random_poses(rng)
+    return build_system(poses, np.zeros((0, 5)), W)

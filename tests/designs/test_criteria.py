@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from systems import random_stops, random_system, system_with_less
+from systems import random_poses, random_system, system_with_less
 from tolerances import rounding
 
 from fg_calib.designs.criteria import Measure
@@ -17,7 +17,7 @@ def formula(criterion, system, M):
     """The table of `criteria`: S by a Schur complement of the information in a basis of core and rest, then its SVD."""
     P = system.core
     rest = np.linalg.svd(P)[2][len(P) :]
-    T = np.vstack([np.linalg.pinv(P).T, rest])  # columns of T^T: the functions P, then whatever is beside them
+    T = np.vstack([np.linalg.pinv(P).T, rest])  # columns of T^T: the functions P, then the rest of a basis
     B = np.linalg.inv(np.vstack([P, rest]))
     N, p = B.T @ M @ B, len(P)
     assert np.allclose(T @ np.vstack([P, rest]).T, np.eye(len(T)))
@@ -48,7 +48,7 @@ def information(system, chosen):
 
 
 def systems():
-    """Of few and many rows a stop, with and without nuisances, and of something undetermined."""
+    """Of few and many rows a pose, with and without nuisances, and of something undetermined."""
     rng = np.random.default_rng(3)
     shapes = [{}, {"h": 1, "nuisances": 0}, {"h": 6, "p": 3, "nuisances": 5}, {"h": 1, "p": 6}, {"p": 1}]
     return [random_system(rng, **shape) for shape in shapes] + [system_with_less(rng)]
@@ -129,23 +129,23 @@ def test_where_no_candidate_does_better_than_asked_there_is_none(criterion):
 @pytest.mark.parametrize("lost", [False, True])
 def test_the_task_counts_in_its_own_units_and_without_what_none_determines(lost):
     """`tr(W C)` by the pseudo-inverse in changes of ordinary size, the weak prior being 1e-8 of what is measured."""
-    stops, direction, W = random_stops(np.random.default_rng(5), lost=lost)
-    given = np.random.default_rng(6).normal(size=(1, 5)) / stops.scales
+    poses, direction, W = random_poses(np.random.default_rng(5), lost=lost)
+    given = np.random.default_rng(6).normal(size=(1, 5)) / poses.scales
     if lost:
-        u = direction / stops.scales
-        given -= (given * stops.scales @ u / (u @ u))[:, None] * (u / stops.scales)
-    system = build_system(stops, given, W)
+        u = direction / poses.scales
+        given -= (given * poses.scales @ u / (u @ u))[:, None] * (u / poses.scales)
+    system = build_system(poses, given, W)
     chosen = np.array([0, 3, 4, 9, 11])
-    A = np.vstack([stops.rows[chosen].reshape(-1, 5), stops.always, given]) * stops.scales
-    C = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)[:3, :3] * np.outer(stops.scales[:3], stops.scales[:3])
+    A = np.vstack([poses.rows[chosen].reshape(-1, 5), poses.always, given]) * poses.scales
+    C = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)[:3, :3] * np.outer(poses.scales[:3], poses.scales[:3])
     found = Measure("I", system).value(system.information(chosen))
     assert system.rows.shape == (15, 2, 4 if lost else 5)
     assert found == pytest.approx(np.trace(W @ C), rel=1e-4)
     share = 0.0
     if lost:
-        u = direction / stops.scales / np.linalg.norm(direction / stops.scales)
-        at = u[:3] * stops.scales[:3]
-        share = at @ W @ at / np.sum(np.diag(W) * stops.scales[:3] ** 2)
+        u = direction / poses.scales / np.linalg.norm(direction / poses.scales)
+        at = u[:3] * poses.scales[:3]
+        share = at @ W @ at / np.sum(np.diag(W) * poses.scales[:3] ** 2)
     assert system.unknown == pytest.approx(share, abs=1e-9)
     assert len(system.core) == (2 if lost else 3)
 

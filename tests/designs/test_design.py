@@ -1,4 +1,4 @@
-"""What a design expects is what a calibration of its stops says of itself; what it chooses is what is asked for."""
+"""What a design expects is what a calibration of its poses reports; what it chooses is what is asked for."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def planned(instrument, n=12, n_candidates=40, **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", EXPECTED)
-def test_expected_errors_are_those_of_a_calibration_of_the_stops(kind):
+def test_expected_errors_are_those_of_a_calibration_of_the_poses(kind):
     few = {"n": 6, "n_candidates": 80} if kind == "pixels" else {}  # few of them see the board
     plan = planned(EXPECTED[kind], **few, fitted=True)
     expected = error_of(plan.pool.robot, plan.tables, plan.task)
@@ -71,7 +71,7 @@ def test_expected_errors_are_those_of_a_calibration_of_the_stops(kind):
 # --- given, targets, what is undetermined -----------------------------------------------------------------------------
 
 
-def test_given_stops_count_and_are_not_to_be_measured_again():
+def test_given_poses_count_and_are_not_to_be_measured_again():
     of = scenario(INSTRUMENTS["pose"], n=20, noise=NOISE)
     rng = np.random.default_rng(5)
     given = rng.uniform(-1.0, 1.0, (6, 4))
@@ -145,7 +145,9 @@ def test_more_of_a_job_counts_with_what_was_measured(kind):
     every = job_of(MORE[kind], q)
     old = replace(every, measurements=tuple(selected(every, np.arange(15))))
     plan = design(old, n=5, candidates=GivenReadings(q[15:]))
-    same = 1e-4 if "nearly" in kind else SAME  # what is told is off, and the arm as estimated by a little of that
+    same = (
+        1e-4 if "nearly" in kind else SAME
+    )  # the known place is off by its tolerance, and the estimated arm by a little of that
     chosen = [int(np.flatnonzero((q == one).all(axis=1))[0]) for one in plan.readings]
     assert min(chosen) >= 15
     before = error_of(every.robot, selected(every, np.arange(15)), plan.task)
@@ -214,7 +216,7 @@ def test_all_pairs_that_can_be_formed_hold_the_most():
 
 
 @pytest.mark.slow
-def test_the_curve_falls_and_designed_stops_are_better_than_random_ones():
+def test_the_curve_falls_and_designed_poses_are_better_than_random_ones():
     plan = planned(INSTRUMENTS["targets"], n=20, n_candidates=60)
     designed = np.array([p.designed for p in plan.curve])
     low, middle, high = np.array([p.random for p in plan.curve]).T

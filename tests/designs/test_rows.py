@@ -1,4 +1,4 @@
-"""Rows by stop: their sum is the information of the same measurements taken as a calibration takes them."""
+"""Rows by pose: their sum is the information of the same measurements in a calibration."""
 
 from dataclasses import replace
 
@@ -53,10 +53,10 @@ KINDS = {name: (INSTRUMENTS[name],) for name in ALONE} | {
     "formed star": (STAR,),
     "formed lengths": (Tracker(model="distance", name="it", pairing=Pairing("all")),),
     "two boards": (BOARDS,),
-    "poses and lengths at the same stops": (POSES, ANCHORS),
+    "poses and lengths at the same poses": (POSES, ANCHORS),
     "a star whose reference pose others measure": (LENGTHS, POSES),
     "two stars": (LENGTHS, replace(LENGTHS, name="more", configurations=RandomReadings(8))),
-    "stops of its own": (replace(POSES, configurations=RandomReadings(8)), ANCHORS),
+    "poses of its own": (replace(POSES, configurations=RandomReadings(8)), ANCHORS),
     "some that see nothing": (BOARDS, ANCHORS),
 }
 
@@ -100,30 +100,30 @@ def apart(a, b):
     return np.abs((a - b) / np.outer(d, d)).max()
 
 
-def of_stops(rows, chosen=slice(None)):
+def of_poses(rows, chosen=slice(None)):
     return square(rows.rows[chosen].reshape(-1, rows.rows.shape[2])) + square(rows.always)
 
 
 @pytest.mark.parametrize("kind", kinds())
-def test_all_stops_together_hold_what_their_problem_holds(kind):
+def test_all_poses_together_hold_what_their_problem_holds(kind):
     """Column by column, nuisances too: to the rounding of sums, of a triangle, and of one Schur complement."""
     pool = pool_with(*KINDS[kind])
     expected = information_of(pool.problem)
-    found = without_last(of_stops(pool.rows), len(expected))
+    found = without_last(of_poses(pool.rows), len(expected))
     assert apart(expected, found) < rounding()
     assert len(pool.rows.rows) == len(pool.readings) == len(pool.group) == pool.pose_of.max() + 1
 
 
 @pytest.mark.parametrize("kind", kinds("formed lengths"))
-def test_some_stops_hold_what_a_problem_of_them_alone_holds(kind):
+def test_some_poses_hold_what_a_problem_of_them_alone_holds(kind):
     """Of the arm and its frames: landmarks, which may start at other values, are eliminated."""
     pool = pool_with(*KINDS[kind])
     n = pool.problem.variables.n_columns
     some = np.random.default_rng(1).permutation(len(pool.readings))[: max(2, 3 * len(pool.readings) // 5)]
     alone = true_problem(pool.robot, pool.select_tables(some), pool.problem.options)
     assert alone.variables.n_columns == n
-    expected, found = without_last(information_of(alone), n), without_last(of_stops(pool.rows, some), n)
-    assert apart(expected, found) < 1e-6  # eliminating unknowns that so few stops hardly hold takes half the digits
+    expected, found = without_last(information_of(alone), n), without_last(of_poses(pool.rows, some), n)
+    assert apart(expected, found) < 1e-6  # eliminating unknowns that so few poses hardly hold takes half the digits
 
 
 def test_positions_in_a_frame_of_their_own_hold_what_all_distances_between_them_do():
@@ -133,7 +133,7 @@ def test_positions_in_a_frame_of_their_own_hold_what_all_distances_between_them_
     some = np.arange(2, 14)
     formed = true_problem(pool.robot, pool.select_tables(some), pool.problem.options)
     n = formed.variables.n_columns
-    assert apart(information_of(formed), without_last(of_stops(pool.rows, some), n)) < 2e-2
+    assert apart(information_of(formed), without_last(of_poses(pool.rows, some), n)) < 2e-2
 
 
 def test_errors_of_reference_poses_are_unknowns_of_one_sigma():
@@ -144,19 +144,19 @@ def test_errors_of_reference_poses_are_unknowns_of_one_sigma():
     assert pool.rows.always[-shared:, -shared:].tolist() == np.eye(shared).tolist()
 
 
-def test_stops_without_train_rows_add_nothing():
+def test_poses_without_train_rows_add_nothing():
     arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
     data = measure(arm, 6, np.random.default_rng(0), n_test=3)
     problem = build_problem(arm, data, model="pose", frame="known")
     rows = gather_rows(problem, np.arange(9))
     assert not rows.rows[6:].any()
     assert rows.rows[:6].any(axis=(1, 2)).all()
-    assert apart(information_of(problem), of_stops(rows)) < rounding()
+    assert apart(information_of(problem), of_poses(rows)) < rounding()
 
 
 @pytest.mark.parametrize("kind", kinds(*KINDS.keys() - {"pixels", "two boards", "camera in the room"}))
 def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
-    """An image says of a stop's frame what a pose says; of two boards in sight twice that."""
+    """An image says of a tool frame what a pose says; of two boards in sight twice that."""
     pool = pool_with(*KINDS[kind])
     data = pool.problem.data
     (series,) = data.series

@@ -173,7 +173,7 @@ def test_the_half_sphere_is_covered_evenly():
 
 
 def test_a_roll_is_held_or_drawn():
-    """Held at 0 the camera's x axis at A is the board's, and elsewhere the shortest turn takes it there."""
+    """Held at 0 the camera's x axis at A is the board's; at other views the shortest rotation takes it there."""
     R, _ = view_board(BoardViews(TILTED, 30, roll=0.0), np.random.default_rng(0))
     assert R[0][:, 0] == pytest.approx(TILTED.rotation[:, 0])
     for i in range(1, 31):
