@@ -172,16 +172,10 @@ def export(
     check("tool", tool, ToolOfZeros)
     check_flag("far", far)
     check_flag("calibration_elements", calibration_elements)
-    given = {
-        "configurations": configurations is not None,
-        "tool": tool != "calibrated",
-        "far": far,
-        "calibration_elements": calibration_elements,
-        "ur_base": ur_base is not None,
-        "ur_hash": ur_hash is not None,
-    }
-    for name, is_given in given.items():
-        if is_given and to not in _FORMATS_OF[name]:
+    given: dict[str, Any] = {"configurations": configurations is not None, "tool": tool != "calibrated", "far": far}
+    given |= {"calibration_elements": calibration_elements, "ur_base": ur_base, "ur_hash": ur_hash}
+    for name, value in given.items():
+        if value not in (None, False) and to not in _FORMATS_OF[name]:
             raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
     formats: dict[str, Callable[[], Export]] = {
         "urdf": lambda: _urdf(found, calibration_elements),

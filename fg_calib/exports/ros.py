@@ -28,6 +28,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import InputError
 from fg_calib.exports.dh import in_table, row_transform, transform
@@ -96,8 +97,6 @@ def tesseract_text(robot: Robot) -> tuple[str, tuple[str, ...]]:
     Raises:
         InputError: A joint's value is more than its reading plus a constant.
     """
-    from scipy.spatial.transform import Rotation
-
     if robot.urdf is not None:
         origins = {joint.name: _frame_of(robot, joint.name) for joint in robot.joints}
     else:

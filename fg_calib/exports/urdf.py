@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import InputError
 from fg_calib.exports.dh import Links, inverse, links_of, rigid, transform
@@ -131,8 +132,6 @@ def zeros_of_origins(nominal: Robot, calibrated: Robot) -> tuple[dict[str, float
     Returns:
         Zeros by joint, [rad] or [m], and origins by joint and kind.
     """
-    from scipy.spatial.transform import Rotation
-
     zeros: dict[str, float] = {}
     origins: dict[str, dict[str, float]] = {}
     for i, joint in enumerate(calibrated.joints):

@@ -507,19 +507,6 @@ def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None
     import polars as pl
 
     given = {name: np.asarray(values) for name, values in columns.items() if values is not None}
-    frame = pl.DataFrame(given)
-    write_table(path, frame.with_columns(pl.lit(None).alias(n) for n in columns if n not in given).select(*columns))
-
-
-def write_table(path: Path | str, frame: pl.DataFrame) -> None:
-    """Write a frame as Parquet if the file's name ends so, else as CSV; whole or not at all, floats read back exactly.
-
-    Raises:
-        InputError: The folder does not exist or may not be written to.
-    """
-    require_polars(str(path))
+    frame = pl.DataFrame(given).with_columns(pl.lit(None).alias(name) for name in columns if name not in given)
     with replacing(Path(path)) as temporary:
-        if temporary.suffix == ".parquet":
-            frame.write_parquet(temporary)
-        else:
-            frame.write_csv(temporary)
+        frame.select(*columns).write_csv(temporary)

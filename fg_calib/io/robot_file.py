@@ -27,6 +27,7 @@ from fg_calib.arguments import checked
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import write_text
 from fg_calib.io.units import Units, UnitsOfFile
+from fg_calib.io.urdf import read_urdf
 from fg_calib.io.yaml import (
     Bound,
     FilePath,
@@ -143,8 +144,6 @@ def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str 
     """
     path = Path(path)
     if path.suffix.lower() == ".urdf":
-        from fg_calib.io.urdf import read_urdf
-
         return read_urdf(path, base_link=base_link, tip_link=tip_link)
     if path.suffix.lower() == ".xacro":
         hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
@@ -175,8 +174,6 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
 
 
 def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
-    from fg_calib.io.urdf import read_urdf
-
     return read_urdf(
         folder / file.urdf,
         base_link=file.base_link,

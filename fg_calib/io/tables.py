@@ -19,7 +19,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE, FrozenArrays, once
 from fg_calib.errors import InputError
 from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of
-from fg_calib.io.units import ANGLES, LENGTHS, Units
+from fg_calib.io.units import Units
 from fg_calib.io.yaml import shown
 from fg_calib.measurements.checks import ANGLE_SLACK, covariances
 from fg_calib.measurements.dataset import (
@@ -460,7 +460,7 @@ def _read_pairs(path: Path | str | Any, rows: _Rows, units: Units, noise: Noise)
         raise InputError(rows.table.place(again[0]), found, "different ids where pairs name them")
     (a, of_groups), (b, b_of_groups) = (_named_rows(table, column, rows) for column in OF_PAIRS["a"].names)
     _check_ends(table, a, b, of_groups, b_of_groups)
-    distance, angle = _measured(table, "distance", "m", units), _measured(table, "angle", "rad", units)
+    distance, angle = (_pair_numbers(table, column, units) for column in ("distance", "angle"))
     _check_ranges(table, distance, angle, units)
     if of_groups.any():
         _check_group_pairs(table, of_groups, distance, angle)
@@ -469,8 +469,8 @@ def _read_pairs(path: Path | str | Any, rows: _Rows, units: Units, noise: Noise)
         b=b,
         distance=distance,
         angle=np.minimum(angle, np.pi),
-        sigma_distance=_pair_sigma(table, "sigma_distance", noise.distance, "m", units),
-        sigma_angle=_pair_sigma(table, "sigma_angle", noise.angle, "rad", units),
+        sigma_distance=_pair_numbers(table, "sigma_distance", units, noise.distance),
+        sigma_angle=_pair_numbers(table, "sigma_angle", units, noise.angle),
         test=once(table.test_rows() | _has_test_end(a, b, of_groups, rows)),
         source=table.name,
         unused=tuple(name for name in table.columns if name not in known),
@@ -478,19 +478,15 @@ def _read_pairs(path: Path | str | Any, rows: _Rows, units: Units, noise: Noise)
     return (pairs, no_pairs(table.name)) if not of_groups.any() else (pairs.select(~of_groups), pairs.select(of_groups))
 
 
-def _measured(table: Table, column: str, unit: str, units: Units) -> Floats:
-    """Distances or angles, nan where there is none, shape (n_pairs,), [m] or [rad]."""
-    if column not in table.columns:
-        return once(np.full(table.n_rows, np.nan))
-    return table.numbers([column], optional=True)[:, 0] * units.factor(unit)
-
-
-def _pair_sigma(table: Table, column: str, default: float | None, unit: str, units: Units) -> Floats:
-    """Sigma of each pair, shape (n_pairs,); nan where nothing states it."""
+def _pair_numbers(table: Table, column: str, units: Units, default: float | None = None) -> Floats:
+    """Distances, angles or their sigmas, shape (n_pairs,), [m] or [rad]; `default` or nan where there is none."""
     default = np.nan if default is None else default
     if column not in table.columns:
         return once(np.full(table.n_rows, default))
-    return once(table.positive([column], default, units.factor(unit))[:, 0])
+    factor = units.factor("m" if OF_PAIRS[column].unit == "length" else "rad")
+    if column.startswith("sigma_"):
+        return once(table.positive([column], default, factor)[:, 0])
+    return table.numbers([column], optional=True)[:, 0] * factor
 
 
 def _check_ends(table: Table, a: Integers, b: Integers, of_groups: Booleans, b_of_groups: Booleans) -> None:
@@ -513,15 +509,9 @@ def _check_ranges(table: Table, distance: Floats, angle: Floats, units: Units) -
     if "angle" in table.columns:
         factor = units.factor("rad")
         good = ~((angle < 0.0) | (angle > np.pi + ANGLE_SLACK))
-        hint = unit_hint(angle[np.argmin(good)] / factor, "rad", units, (0.0, np.pi))
+        in_degrees = units.angle == "rad" and 0.0 <= np.deg2rad(angle[np.argmin(good)]) <= np.pi
+        hint = "is the table in deg?" if in_degrees else ""
         table.require(good, "angle", f"0 to {np.pi / factor:.6g} {units.angle}", hint)
-
-
-def unit_hint(value: float, unit: str, units: Units, limits: tuple[float, float]) -> str:
-    """A question whether a value is in the smaller unit, where it would then lie within the limits, [m] or [rad]."""
-    smaller, factor = ("mm", LENGTHS["mm"]) if unit == "m" else ("deg", ANGLES["deg"])
-    large = units.name(unit) == unit
-    return f"is the table in {smaller}?" if large and limits[0] <= value * factor <= limits[1] else ""
 
 
 def _check_group_pairs(table: Table, of_groups: Booleans, distance: Floats, angle: Floats) -> None:

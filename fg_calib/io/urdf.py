@@ -206,11 +206,11 @@ def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> Non
             element.set(name, words[name])
 
 
-def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, Element]:
+def _parse(data: bytes, place: str) -> tuple[str, Element]:
     """The text and the root element of an XML file, which may neither refer to other files nor hold entities."""
     from lxml import etree
 
-    safe = etree.XMLParser(encoding=encoding, resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False)
+    safe = etree.XMLParser(resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False)
     try:
         root = etree.fromstring(data, safe)
     except etree.XMLSyntaxError as error:
@@ -228,9 +228,7 @@ def _parse(data: bytes, place: str, encoding: str | None = None) -> tuple[str, E
         raise InputError(place, f"root element <{root.tag}>", "<robot>")
     try:
         return data.decode(document.encoding or "utf-8"), root
-    except UnicodeDecodeError as error:
-        raise InputError(place, f"not {document.encoding or 'utf-8'}: {error.reason}", "text in UTF-8") from None
-    except LookupError:  # libxml2 knows more encodings than Python
+    except (UnicodeDecodeError, LookupError):  # libxml2 knows more encodings than Python
         raise InputError(place, f"text in {document.encoding}", "text in UTF-8", "save it as UTF-8") from None
 
 
