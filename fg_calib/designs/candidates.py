@@ -22,7 +22,7 @@ from fg_calib.designs.information import PoseRows, Posterior, count_measurements
 from fg_calib.errors import InputError
 from fg_calib.graph.build import places_of, true_problem
 from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.problem import Problem, whitened_jacobian
+from fg_calib.graph.problem import Problem, square_root
 from fg_calib.graph.variables import Variables, unknown_prior_rows
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.landmarks import Landmarks
@@ -150,9 +150,9 @@ class Pool(Brief):
             places = places_of(self.problem, self.problem.start)
             problem = true_problem(self.robot, self.select_tables(poses, pairing), self.problem.options, places)
         if before is not None and (problem is None or not problem.rows):  # nothing, or one end of a pair
-            return Posterior(before, whitened_jacobian(before, before.start, with_loss=True))
+            return Posterior(before, square_root(before, before.start, with_loss=True)[:, :-1])
         assert problem is not None
-        rows = whitened_jacobian(problem, problem.start)
+        rows = square_root(problem, problem.start)[:, :-1]
         if before is None:
             return Posterior(problem, rows)
         # Priors of landmarks are in the rows of earlier measurements, and count once.
@@ -199,7 +199,7 @@ def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
     n = v.n_columns + v.n_nuisance
     if before is None:
         return np.zeros((0, n))
-    A = whitened_jacobian(before, before.start, with_loss=True)
+    A = square_root(before, before.start, with_loss=True)[:, :-1]
     columns, own = _columns_by_name(v, problem.data.unknowns), _columns_by_name(before.variables, before.data.unknowns)
     both = [name for name in own if name in columns]
     shared = np.concatenate([own[name] for name in both])

@@ -92,7 +92,7 @@ def gather_rows(
     v = problem.variables
     references = np.zeros(0, dtype=np.int64) if references is None else references
     n_columns, n_poses = v.n_columns + v.n_nuisance, int(pose_of.max(initial=-1)) + 1
-    width = max((rows.shared.width for rows in problem.rows if rows.shared is not None), default=0)
+    width = max((rows.states.width for rows in problem.rows if rows.states is not None), default=0)
     parts = [_derivatives(problem, rows, pose_of, references, width) for rows in problem.rows]
     whole, private, which = (np.concatenate(one) for one in zip(*parts, strict=True))
     n_shared = whole.shape[1] - n_columns
@@ -115,10 +115,10 @@ def _derivatives(
     J = rows.private(problem.variables.at(problem.start))[:, :-1]
     which = np.concatenate([_poses_of(problem, part.series, part.block.residual_dim, pose_of) for part in rows.parts])
     private, of_references = np.zeros((len(J), width)), np.zeros((len(J), len(references) * width))
-    if rows.shared is not None:
-        L = rows.shared.loadings.tocoo()
-        configuration = rows.configurations[L.col // rows.shared.width]
-        k = L.col % rows.shared.width
+    if rows.states is not None:
+        L = rows.states.loadings.tocoo()
+        configuration = rows.configurations[L.col // rows.states.width]
+        k = L.col % rows.states.width
         for number, reference in enumerate(references.tolist()):
             mask = configuration == reference
             of_references[L.row[mask], number * width + k[mask]] = L.data[mask]

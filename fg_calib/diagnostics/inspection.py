@@ -23,7 +23,7 @@ from fg_calib.diagnostics.setup_check import SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.diagnostics.verdict import Statement, listed
 from fg_calib.graph.build import problem_of
-from fg_calib.graph.problem import Problem, eliminated, tables_of
+from fg_calib.graph.problem import Problem, linear_system, tables_of
 from fg_calib.graph.solver import Solution, unsolved
 from fg_calib.job import Job
 from fg_calib.measurements.build import find_copies
@@ -184,7 +184,7 @@ def inspect_job(job: Job) -> Inspection:
         disagreements = find_disagreements(job.robot, tables, labels)
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
-    n_directions = spread.rank + eliminated(problem, problem.start).rank
+    n_directions = spread.rank + linear_system(problem, problem.start).left.rank
     found = Inspection(
         robot=job.robot.name,
         tables=tuple(_survey(at_nominal, number, table) for number, table in enumerate(tables)),

@@ -11,14 +11,14 @@ prior sigma of its vector is above half the way there: the vector may as well po
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.errors import SolverError
-from fg_calib.graph.problem import Problem, at_parameters, linear_system, noises_at, subsampled, with_initial
+from fg_calib.graph.problem import Problem, at_parameters, linear_system, noises_at, subsampled
 from fg_calib.graph.solver import Solution
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import Spread
@@ -57,7 +57,7 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     if not rank:
         return Nonlinearity()
     if problem.n_residuals > MAX_ROWS:
-        problem = subsampled(with_initial(problem, solution.parameters), MAX_ROWS / problem.n_residuals) or problem
+        problem = subsampled(replace(problem, start=solution.parameters), MAX_ROWS / problem.n_residuals) or problem
     scales, rng = spread.variables.prior_scales, np.random.default_rng(0)
     root = spread.root[:, :rank]
     scaled = root / scales[:, None]

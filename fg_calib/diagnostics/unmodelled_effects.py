@@ -167,7 +167,7 @@ def probability_of_noise(solution: Solution) -> float | None:
     for row_set in problem.rows:
         private = [_with_joint_errors(part.block, chains[part.table], errors[part.table]) for part in row_set.parts]
         rows = np.concatenate(private)
-        found.append(rows if row_set.shared is None else row_set.shared.whiten(rows))
+        found.append(rows if row_set.states is None else row_set.states.whiten(rows))
     rows = np.concatenate(found)
     r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
     model = np.concatenate([rows[:, :-1][:, of_stage == 0], J_prior])
@@ -190,7 +190,7 @@ def find_change(solution: Solution) -> Change | None:
     problem, state = solution.problem, solution.problem.state
     other = problem.data.unknowns.names or problem.has_more or state.weights is not None
     parts = [part.block for rows in problem.rows for part in rows.parts]
-    several = len(problem.data.tables) > 1 or any(rows.shared is not None for rows in problem.rows)
+    several = len(problem.data.tables) > 1 or any(rows.states is not None for rows in problem.rows)
     pairs = any(block.kind.ends != 1 for block in parts)
     if other or several or pairs or state.joint_errors is not None or problem.n_residuals > MAX_ROWS:
         return None

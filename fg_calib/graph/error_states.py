@@ -315,11 +315,6 @@ class WhitenedBlock(Brief):
     _triangles: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @property
-    def shared(self) -> SchurComplement | None:
-        """`states`."""
-        return self.states
-
-    @property
     def n_rows(self) -> int:
         """Number of rows that `linearise` returns."""
         return sum(part.n_rows for part in self.parts) if self.states is None else self.states.n

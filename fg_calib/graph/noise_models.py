@@ -359,22 +359,6 @@ class PairNoise(RowNoise):
         diagonal = np.maximum(variance + more, PRIVATE_SHARE * np.einsum("nii->ni", self.total[rows]))
         return diagonal, np.maximum(diagonal - bare, 0.0)
 
-    def ambiguous(self, root: Floats) -> Booleans:
-        """Rows whose sign some uncertainty leaves open, shape (n, residual_dim).
-
-        Half the way to 0, or of an angle to 180 degrees, is then less than that uncertainty, and that more than the
-        noise: the vector may point the other way, and a descent may end with the wrong one.
-
-        Args:
-            root: R with R R^T the covariance of the parameters, shape (n_columns, k).
-        """
-        along, found = residuals.squares_along(self.as_measured, self.place.chain, root), []
-        for i, k in enumerate(self._parts):
-            f, variance, noise = self.predicted[:, k], 2.0 * along[:, i], 4.0 * self._own(slice(None))[:, k]
-            nearest = f if k == 0 else np.minimum(f, np.pi - f)
-            found.append(variance > np.maximum(0.25 * nearest**2, noise))
-        return np.stack(found, axis=1)
-
     @cached_property
     def _poses(self) -> Poses:
         """Predicted tool poses of the table's configurations."""

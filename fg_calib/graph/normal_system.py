@@ -44,9 +44,6 @@ SIGNAL_FLOOR = 1e-3
 SUPPORT_TOLERANCE = 1e-6
 """A parameter takes part in a direction if its unit-free share in it is above this."""
 
-MIN_REDUNDANCY = 1e-9
-"""Eigenvalue of a residual's covariance, over that of its noise, below which the fit leaves nothing of it."""
-
 BATCH = 512
 """Measurements whose covariance is worked out at once."""
 
@@ -294,85 +291,10 @@ class NormalSystem:
         states = self.rows.states
         return np.zeros((0, self.rows.A.shape[1])) if states is None else states.posterior_mean(self.rows.A)
 
-    def z_studentised(self, min_share: float = 1e-6) -> Floats:
-        """Error states over the sigma that their estimates vary by, shape (m,).
-
-        Args:
-            min_share: Share of a state's variance that measurements must determine; nan below.
-        """
-        seen = 1.0 - self.z_variance
-        return self.z / np.sqrt(np.where(seen > min_share, seen, np.nan))
-
     def leverage(self, A: Floats) -> Floats:
         """Variance that the estimate gives linear functions A s, shape (n,)."""
         out: Floats = np.sum((A @ self.full_root) ** 2, axis=1)
         return out
-
-    @cached_property
-    def studentised(self) -> Floats:
-        """Marginal residuals over their own sigma, shape (n,); nan where the fit leaves nothing of them."""
-        noise = 1.0 + self.rows.L.power(2).sum(axis=1)
-        left = noise - self.leverage(self.rows.A)
-        return self.residual / np.sqrt(np.where(left > MIN_REDUNDANCY * noise, left, np.nan))
-
-    @cached_property
-    def private_covariances(self) -> list[Floats]:
-        """Covariance of the private errors u of each measurement's rows, (h, h) each."""
-        rows, states = self.rows, self.rows.states
-        ends = np.append(np.flatnonzero(np.diff(rows.measurement)) + 1, len(rows.r))
-        moved = self._weighed_root
-        used = np.ones(len(rows.r)) if rows.used is None else rows.used.astype(np.float64)
-        out, start = list[Floats](), 0
-        while start < len(rows.r):
-            first = int(np.searchsorted(ends, start, side="right"))
-            stops = ends[first : first + BATCH]
-            chunk = slice(start, int(stops[-1]))
-            L = rows.L[chunk]
-            common = np.zeros((L.shape[0],) * 2) if states is None else L @ states.solve(L.T.toarray())
-            for stop in stops.tolist():
-                k = slice(start - chunk.start, stop - chunk.start)
-                out.append(np.diag(used[start:stop]) - common[k, k] - moved[start:stop] @ moved[start:stop].T)
-                start = stop
-        return out
-
-    @property
-    def redundancy(self) -> Floats:
-        """Share of each measurement's private noise that its residuals show, shape (k,); adds up to at most n."""
-        return np.array([np.trace(Q) for Q in self.private_covariances])
-
-    @property
-    def deletion(self) -> tuple[Floats, Integers]:
-        """By how much chi-square falls without each measurement, and its degrees of freedom, shapes (k,)."""
-        drops, degrees, start = [], [], 0
-        for Q in self.private_covariances:
-            values, vectors = np.linalg.eigh(Q)
-            kept = values > MIN_REDUNDANCY
-            u = vectors[:, kept].T @ self.weighted_residual[start : start + len(Q)]
-            drops.append(float(np.sum(u**2 / values[kept])))
-            degrees.append(int(kept.sum()))
-            start += len(Q)
-        return np.array(drops), np.array(degrees, dtype=np.int64)
-
-    def predicted_covariance(self, A: Floats, L: Sparse, D: Floats, *, corrected: bool = False) -> Floats:
-        """Covariance of residuals of rows that were not fitted, which may share error states with fitted ones.
-
-        Args:
-            A: Derivatives in core and landmarks, shape (n, n_all).
-            L: How they follow from the error states of `rows`, shape (n, m).
-            D: Covariance of their other noise, shape (n, n).
-            corrected: Whether the estimated error states are taken off them; else their readings are taken as they are.
-        """
-        R, states = self.full_root, self.rows.states
-        moved = A @ R
-        if states is None:
-            return D + moved @ moved.T
-        followed = L @ self._follow @ R
-        if corrected:
-            out: Floats = D + L @ states.solve(L.T.toarray()) + (moved - followed) @ (moved - followed).T
-            return out
-        cross = moved @ followed.T
-        total: Floats = D + (L @ L.T).toarray() + moved @ moved.T - cross - cross.T
-        return total
 
     # Variance components.
 
@@ -393,43 +315,3 @@ class NormalSystem:
         states = self.rows.states
         total = float(E.power(2).sum()) if states is None else states.trace(E)
         return total - float(np.sum((E.T @ self._weighed_root) ** 2))
-
-    def components(self, roots: Sequence[Sparse]) -> VarianceComponents:
-        """REML of factors on variances of noise, one step by average information (Gilmour et al. 1995).
-
-        Args:
-            roots: E_i with E_i E_i^T the part of the rows' covariance C that scales with factor i, shape (n, k_i).
-        """
-        u = self.weighted_residual
-        work = np.column_stack([E @ (E.T @ u) for E in roots])
-        seen = np.array([np.sum((E.T @ u) ** 2) for E in roots])
-        expected = np.array([self.trace(E) for E in roots])
-        information = 0.5 * work.T @ self.project(work)
-        return VarianceComponents(seen, expected, information)
-
-
-@dataclass(frozen=True)
-class VarianceComponents(Brief):
-    """What residuals show of noise of several origins, each known up to a factor on its variance.
-
-    Attributes:
-        seen: u^T V_i u, shape (n,).
-        expected: Its mean, were the noise as taken, shape (n,).
-        information: Average information in the logarithms of the factors, shape (n, n).
-    """
-
-    seen: Floats
-    expected: Floats
-    information: Floats
-
-    @property
-    def step(self) -> Floats:
-        """Step of the logarithms of the factors, shape (n,)."""
-        out: Floats = np.linalg.pinv(self.information) @ (0.5 * (self.seen - self.expected))
-        return out
-
-    @property
-    def sigma(self) -> Floats:
-        """1 sigma of the logarithms of the factors, shape (n,)."""
-        out: Floats = np.sqrt(np.diag(np.linalg.pinv(self.information)))
-        return out

@@ -37,7 +37,7 @@ from fg_calib.graph.factors import (
 )
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseState, RowNoise, TableState, row_noise, same_everywhere
-from fg_calib.graph.normal_system import RANK_TOLERANCE, Eliminated, LinearRows, NormalSystem
+from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSystem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization.hand_eye import Frame
@@ -470,7 +470,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
     """
     same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.series)
     if (state is None or state is problem.state) and same:
-        return with_initial(problem, parameters)
+        return replace(problem, start=parameters)
     return with_factors(problem, parameters, state)
 
 
@@ -490,16 +490,6 @@ def subsampled(problem: Problem, share: float) -> Problem | None:
     for s in problem.data.series:
         series.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
     return with_factors(replace(problem, data=replace(problem.data, series=tuple(series))), problem.start)
-
-
-def with_initial(problem: Problem, start: Floats) -> Problem:
-    """The same problem, its rows as they are whitened, with another start: a parameter vector."""
-    return replace(problem, start=start)
-
-
-def in_variables_of(problem: Problem, variables: Variables) -> Problem:
-    """The same problem and rows by the columns of the variables of more, or the same, parameters."""
-    return replace(problem, variables=variables)
 
 
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:
@@ -603,21 +593,6 @@ def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
     return out
 
 
-def eliminated(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Eliminated:
-    """The rows with the landmarks eliminated."""
-    return linear_system(problem, parameters, with_loss=with_loss).left
-
-
-def whitened_jacobian(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
-    """A square root of what train rows, landmarks' priors and added factors say: (m, n_columns + n_nuisance)."""
-    return square_root(problem, parameters, with_loss=with_loss)[:, :-1]
-
-
-def whitened_triangle(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
-    """A square root of what the train rows and added factors say of the core, shape (m, n_columns)."""
-    return linear_system(problem, parameters, with_loss=with_loss).left.A
-
-
 def row_triangles(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> list[Floats]:
     """A square root of [J r] of each block, shape (n_columns + n_nuisance + 1,) * 2 each."""
     at, (blocks, variance) = problem.variables.at(parameters), _with_loss(problem) if with_loss else (problem.rows, 1.0)
@@ -633,7 +608,7 @@ def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
 
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     """`whitened_triangle` by named parameters, the measurement frames projected out: shape (m, n_robot_columns)."""
-    return named_rows(problem.variables, parameters, whitened_triangle(problem, parameters))
+    return named_rows(problem.variables, parameters, linear_system(problem, parameters).left.A)
 
 
 def felt(problem: Problem, parameters: Floats, errors: ErrorStates, wanted: Integers) -> Floats:

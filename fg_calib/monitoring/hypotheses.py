@@ -230,7 +230,7 @@ def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
                     at = (first + measured[:, None] * h + np.arange(h)).ravel()
                     columns.setdefault(int(k), []).append(_columns_of_errors(row_set, start, at, m))
             first += part.n_rows
-        start += first if row_set.shared is None else row_set.shared.n
+        start += first if row_set.states is None else row_set.states.n
     found = []
     for k, several in columns.items():
         wide = np.hstack(several)
@@ -250,7 +250,7 @@ def _columns_of_errors(row_set: WhitenedBlock, start: int, at: Integers, m: int)
     """
     unit = np.zeros((sum(part.n_rows for part in row_set.parts), len(at)))
     unit[at, np.arange(len(at))] = 1.0
-    whitened = unit if row_set.shared is None else row_set.shared.whiten(unit)
+    whitened = unit if row_set.states is None else row_set.states.whiten(unit)
     out = np.zeros((m, len(at)))
     out[start : start + len(whitened)] = whitened
     return out

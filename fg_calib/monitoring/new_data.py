@@ -300,7 +300,7 @@ def linearised(problem: Problem) -> tuple[Floats, Floats, Floats]:
     blocks = []
     for rows in problem.rows:
         wide = np.hstack([rows.private(at), _of_joints(rows, at)])
-        blocks.append(wide if rows.shared is None else rows.shared.whiten(wide))
+        blocks.append(wide if rows.states is None else rows.states.whiten(wide))
     every = np.vstack(blocks)
     return every[:, :n], every[:, n + 1 :], every[:, n]
 

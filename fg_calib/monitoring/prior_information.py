@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
 from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import Problem, in_variables_of, row_triangles
+from fg_calib.graph.problem import Problem, row_triangles
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.observability.observed_quantities import ObservedQuantities
@@ -31,7 +31,7 @@ def knowledge_of(solution: Solution) -> Knowledge | None:
     if problem.evaluated or problem.added or not problem.variables.n_robot_columns:
         return None
     if problem.whole is not None:  # all parameters, those left out among them
-        problem = in_variables_of(problem, problem.whole.variables)
+        problem = replace(problem, variables=problem.whole.variables)
     as_drawn, x = at_nominal(problem, solution.before)
     nominal = _known_at(as_drawn, x, with_loss=False)
     views = ObservedQuantities.of(problem).views

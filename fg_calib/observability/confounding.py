@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import Problem, whitened_jacobian
+from fg_calib.graph.problem import Problem, square_root
 from fg_calib.measurements.kinds import LANDMARKS
 
 Floats = NDArray[np.float64]
@@ -49,7 +49,7 @@ class Confounding:
         self._by: list[tuple[str, ...] | None] = [()] * directions.shape[1]
         if not variables.nuisance:
             return  # measurement frames alone hide what moves the whole arm as one body, nothing else
-        self._A = whitened_jacobian(problem, parameters)
+        self._A = square_root(problem, parameters)[:, :-1]
         named = self._A[:, : variables.n_columns] @ variables.tangent_derivative(parameters)[:, :n]
         self._rows = named @ directions
         columns, changes = np.linalg.norm(named, axis=0), np.abs(directions)

@@ -356,60 +356,6 @@ def whiten_small(covariances, used, start, stop, out):  # type: ignore[no-untype
     return True
 
 
-@compiled
-def vector_variances(poses, ends, base, carried, across, along):  # type: ignore[no-untyped-def]
-    """Variance of points' distance vectors, and of rotation vectors, between poses that something moves.
-
-    Args:
-        poses: base_R_tool, shape (n, 3, 3); tool points, shape (n, 3); turn of the tool and shift of its point along
-            each column of a square root of a covariance, shape (n, 6, k).
-        ends: Which poses the vectors lead from, and to, shape (m, 2).
-        base: Turn that is taken out of all turns, shape (3, k).
-        carried: Turn whose shifts are taken out of all shifts, shape (3, k).
-        across: Filled: in each direction across a vector, of distances and rotations, shape (m, 2).
-        along: Filled: along it, shape (m, 2).
-    """
-    rotation, position, moved = poses
-    u, axis, change = np.empty(3), np.empty(3), np.empty(3)
-    for m in range(len(ends)):
-        a, b = ends[m]
-        A, B = rotation[a], rotation[b]
-        for c in range(3):
-            d, e = (c + 1) % 3, (c + 2) % 3
-            u[c], axis[c] = position[b, c] - position[a, c], 0.0
-            for k in range(3):  # of A^T B in A
-                axis[c] += A[k, e] * B[k, d] - A[k, d] * B[k, e]
-        to_u, to_axis = _inverse_length(u, 0.0), _inverse_length(axis, 1e-14)  # below is the rounding of rotations
-        across[m] = 0.0
-        along[m] = 0.0
-        for j in range(moved.shape[2]):
-            for c in range(3):
-                d, e = (c + 1) % 3, (c + 2) % 3
-                change[c] = moved[b, 3 + c, j] - moved[a, 3 + c, j] + u[d] * carried[e, j] - u[e] * carried[d, j]
-            _add_squares(u, to_u, change, 0, across[m], along[m])
-            for c in range(3):
-                change[c] = 0.0
-                for k in range(3):
-                    change[c] += B[k, c] * (moved[b, k, j] - base[k, j]) - A[k, c] * (moved[a, k, j] - base[k, j])
-            _add_squares(axis, to_axis, change, 1, across[m], along[m])
-
-
-@inlined
-def _inverse_length(v, least):  # type: ignore[no-untyped-def]
-    """Zero for a vector that has no direction, being no longer than `least`."""
-    length = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    return 1.0 / length if length > least else 0.0
-
-
-@inlined
-def _add_squares(vector, to_unit, change, k, across, along):  # type: ignore[no-untyped-def]
-    """What one change of a vector adds to its variance, half of what is across to either direction."""
-    inner = to_unit * (vector[0] * change[0] + vector[1] * change[1] + vector[2] * change[2])
-    along[k] += inner * inner
-    left = change[0] * change[0] + change[1] * change[1] + change[2] * change[2] - inner * inner
-    across[k] += 0.5 * max(left, 0.0)
-
-
 @inlined
 def _gather_whitening(whitening, first, weight):  # type: ignore[no-untyped-def]
     """Whitening of each lane, zero where there is no measurement, once for each component of a wrench."""

@@ -298,34 +298,6 @@ def turning_of_base(w: Floats, rotation: Floats) -> Floats:
     return a
 
 
-def common_axes(rotation: Floats) -> Floats:
-    """The projection on the axes that all rotations turn about, in the base frame: zero if there is none, shape (3, 3).
-
-    Args:
-        rotation: base_R_tool at some configurations, shape (n, 3, 3).
-    """
-    R_mean = rotation.mean(axis=0)
-    values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
-    axes = R_mean @ V[:, values <= LEAST_TURNING]
-    out: Floats = axes @ axes.T
-    return out
-
-
-def turning_of_points(points: Floats, shifts: Floats) -> Floats:
-    """The turn of some points about their mean that comes nearest to their shifts, shape (3, n_columns).
-
-    Args:
-        points: Shape (n, 3), [m].
-        shifts: In each column, shape (n, 3, n_columns).
-    """
-    p = points - points.mean(axis=0)
-    inertia = np.sum(p * p) * np.eye(3) - p.T @ p
-    products = np.tensordot(p, shifts, (0, 0))  # their mean has no moment about that of the points
-    moment = np.stack([products[i, k] - products[k, i] for i, k in ((1, 2), (2, 0), (0, 1))])
-    turn: Floats = np.linalg.pinv(inertia, rcond=1e-8, hermitian=True) @ moment
-    return turn
-
-
 @checked
 def pose(robot: Robot, readings: Floats | Sequence[Sequence[float]]) -> Poses:
     """Tool poses of a robot in its base frame, and their derivatives in every parameter, then every joint.

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arrays import FrozenArrays
 from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
-from fg_calib.graph.problem import Problem, correlation, in_variables_of, whitened_triangle
+from fg_calib.graph.problem import Problem, correlation, linear_system
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import Variables, prior_rows
 from fg_calib.robot.model import Robot
@@ -140,7 +140,7 @@ def spread_of(solution: Solution) -> Spread:
     scales = variables.prior_scales
 
     def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
-        return _decomposed(variables, parameters, whitened_triangle(problem, parameters, with_loss=True))
+        return _decomposed(variables, parameters, linear_system(problem, parameters, with_loss=True).left.A)
 
     found = s, directions, rank = decomposed(solution.parameters)
     _, directions_nominal, rank_nominal = (
@@ -265,7 +265,7 @@ def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     by_name = dict(zip(whole.names, derivative.T, strict=True))
     left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
     N = np.array(left_out).reshape(-1, whole.n_columns).T
-    J = whitened_triangle(in_variables_of(problem, whole), parameters)
+    J = linear_system(replace(problem, variables=whole), parameters).left.A
     U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
     rank = determined(s)
     G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))

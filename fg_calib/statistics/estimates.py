@@ -7,13 +7,13 @@ has a sigma of 1 for a healthy reading, however little the measurements say of i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
-from fg_calib.graph.problem import Problem, at_parameters, eliminated, in_variables_of, linear_system
+from fg_calib.graph.problem import Problem, at_parameters, linear_system
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import Variables, corrections_of, pose_of
 from fg_calib.observability.indices import IdentifiabilityClass, Observability
@@ -229,7 +229,7 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
     if not unknowns.names:
         return ()
     at = at_parameters(problem, solution.parameters)
-    left = eliminated(in_variables_of(problem, whole.variables), solution.parameters)
+    left = linear_system(replace(problem, variables=whole.variables), solution.parameters).left
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
     names, found = unknowns.keys, []
     for i, (_, name) in enumerate(names):

@@ -36,7 +36,7 @@ from scipy import special
 
 from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName
-from fg_calib.graph.problem import Problem, eliminated, mahalanobis_distances, noises_at
+from fg_calib.graph.problem import Problem, linear_system, mahalanobis_distances, noises_at
 from fg_calib.graph.robust import effect, tuning, weight
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.residuals import squares_along
@@ -705,7 +705,7 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
         + problem.n_added
         + problem.n_known
         - spread.rank
-        - eliminated(problem, solution.parameters).rank
+        - linear_system(problem, solution.parameters).left.rank
     )
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
     independent = _independent_dof(problem, dof, spread.rank)

@@ -58,7 +58,7 @@ from scipy import special
 from fg_calib.arguments import checked
 from fg_calib.arrays import Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph.normal_system import RANK_TOLERANCE, eliminate
-from fg_calib.graph.problem import Problem, correlation, eliminated, relinearized_at, whitened_triangle
+from fg_calib.graph.problem import Problem, correlation, linear_system, relinearized_at
 from fg_calib.graph.solver import Solution, solve
 from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
 from fg_calib.graph.variables import Variables, prior_rows, unknown_prior_rows
@@ -292,7 +292,7 @@ def _corrections(
     u, P = prior_rows(specified, at)
     U, s, Vt = np.linalg.svd(P * by)
     back, rest = by[:, None] * (Vt[: len(s)].T / s) @ U.T, by[:, None] * Vt[len(s) :].T
-    J = whitened_triangle(problem, at)
+    J = linear_system(problem, at).left.A
     left = eliminate(np.hstack([J @ back, J @ rest]), np.zeros(len(J)), len(u))
     follow = back + rest @ left.follow
     G = left.A.T @ left.A
@@ -392,7 +392,7 @@ def _judged_rows(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], F
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
         # The places' errors follow those of the core, and what is theirs alone comes on top.
-        left, unknowns = eliminated(problem, solution.parameters, with_loss=True), problem.data.unknowns
+        left, unknowns = linear_system(problem, solution.parameters, with_loss=True).left, problem.data.unknowns
         of_core, of_places = P_places[:, : variables.n_columns], P_places[:, variables.n_columns :]
         P = np.vstack([P, of_core + of_places @ left.follow])
         own = np.vstack([np.zeros((len(z), left.rank)), of_places @ left.inverse])

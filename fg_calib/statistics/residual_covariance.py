@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu
 
 from fg_calib.graph.error_states import ErrorStates
 from fg_calib.graph.noise_models import PRIVATE_SHARE, RowNoise
-from fg_calib.graph.problem import Problem, at_parameters, eliminated, felt, says_where
+from fg_calib.graph.problem import Problem, at_parameters, felt, linear_system, says_where
 from fg_calib.measurements import residuals
 from fg_calib.robot.kinematics import Chain
 
@@ -224,7 +224,7 @@ class RowModel:
         self._common = self._columns.predicted(noises)
         self._felt = felt(problem, parameters, self._columns, self._common)
         if estimated.any():
-            left, column = eliminated(problem, parameters), self._at.columns[estimated] - self._n
+            left, column = linear_system(problem, parameters).left, self._at.columns[estimated] - self._n
             self._inverse = np.zeros((n, left.rank))
             core, others = np.split(self._felt, [self._n])
             self._felt = np.vstack([core + left.follow.T @ others, left.inverse.T @ others])

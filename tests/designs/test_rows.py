@@ -13,7 +13,7 @@ from fg_calib.designs.candidates import build_pool, draw_groups
 from fg_calib.designs.information import gather_rows
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem, true_problem
-from fg_calib.graph.problem import whitened_jacobian
+from fg_calib.graph.problem import square_root
 from fg_calib.graph.variables import prior_rows
 from fg_calib.simulation.scenario import (
     BoardCamera,
@@ -81,7 +81,7 @@ def information_of(problem):
     """What the rows of a problem say, and its tolerances: shape (n_columns + n_nuisance,) * 2."""
     v = problem.variables
     priors = np.pad(prior_rows(v, problem.start)[1], ((0, 0), (0, v.n_nuisance)))
-    return square(whitened_jacobian(problem, problem.start)) + square(priors)
+    return square(square_root(problem, problem.start)[:, :-1]) + square(priors)
 
 
 def without_last(M, n):

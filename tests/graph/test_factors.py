@@ -86,7 +86,7 @@ def test_a_reduced_block_equals_its_rows_in_cost_gradient_and_hessian(model):
 def one_by_one(rows, variables):
     """A factor for each measurement of rows that share no errors."""
     graph, (part,) = gtsam.NonlinearFactorGraph(), rows.parts
-    assert rows.shared is None
+    assert rows.states is None
     for i in range(part.block.n):
         one = replace(part, block=residuals.rows_of(part.block, slice(i, i + 1)), nuisances=part.nuisances[i : i + 1])
         graph.add(MeasurementFactor(variables, one))

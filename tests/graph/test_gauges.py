@@ -12,7 +12,7 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import in_variables_of, whitened_triangle
+from fg_calib.graph.problem import linear_system
 from fg_calib.graph.solver import solve
 from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
@@ -243,8 +243,8 @@ def test_rows_say_the_same_by_the_columns_of_parameters_that_were_left_out(loss)
     )
     problem, x = solution.problem, solution.parameters
     wide = problem.whole.variables
-    of_all = whitened_triangle(in_variables_of(problem, wide), x, with_loss=True)
-    mine = whitened_triangle(problem, x, with_loss=True)
+    of_all = linear_system(replace(problem, variables=wide), x, with_loss=True).left.A
+    mine = linear_system(problem, x, with_loss=True).left.A
     seen = of_all @ wide.columns_of(problem.variables, x)
     np.testing.assert_allclose(seen.T @ seen, mine.T @ mine, rtol=1e-9, atol=1e-9 * np.abs(mine).max() ** 2)
     assert knowledge_of(solution).n >= problem.variables.n_columns

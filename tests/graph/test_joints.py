@@ -272,7 +272,7 @@ def test_both_ways_agree_to_first_order(kind, model, options):
         robot, m = measured(kind, 12, 2, shrink * SIGMA_JOINT)
         if options.get("pair_errors") == "independent" and shrink == 1.0:
             (rows,) = build_problem(robot, m, model=model, encoder="estimated", **options).rows
-            carried = set((rows.shared.loadings.indices % rows.shared.width).tolist())
+            carried = set((rows.states.loadings.indices % rows.states.width).tolist())
             assert carried
             assert carried <= set(range(rows.joints, rows.joints + 4))  # none of the poses
         found = [solve(build_problem(robot, m, model=model, encoder=e, **options)) for e in ("propagated", "estimated")]

@@ -110,7 +110,7 @@ def test_the_optimum_is_that_of_gtsams_robust_noise_on_factors_of_one_measuremen
     plain = replace(solution.problem.state, weights=None)
     problem = relinearized_at(solution.problem, solution.parameters, plain)
     (rows,), variables = problem.rows, problem.variables
-    assert rows.shared is None
+    assert rows.states is None
     block = rows.parts[0].block
     graph = gtsam.NonlinearFactorGraph()
     for factor in (problem.graph.at(i) for i in range(1, problem.graph.size())):

@@ -14,7 +14,7 @@ from fg_calib.assessment import assess
 from fg_calib.graph import error_states
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import correlation, joint_errors, noises_at, relinearized_at, whitened_triangle
+from fg_calib.graph.problem import correlation, joint_errors, linear_system, noises_at, relinearized_at
 from fg_calib.graph.solver import solve
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Measurements, Pairs
@@ -197,7 +197,7 @@ def test_rows_are_whitened_by_the_dense_covariance_of_all_errors(eliminated, kin
         assert len(problem.data.series) == 2
     if "joint" in kind or "direct" not in kind:
         (rows,) = problem.rows
-        assert rows.shared is not None
+        assert rows.states is not None
     check_rows(problem if as_stated else learned(problem, rng))
 
 
@@ -246,7 +246,7 @@ def test_tables_whose_names_are_made_up_share_nothing():
     problem = build_problem(robot, two_tables("pairs", robot, rng, named=False))
     assert problem.data.n_configurations == 28
     poses, pairs = problem.rows
-    assert poses.shared is None
+    assert poses.states is None
     assert {part.table for part in pairs.parts} == {1}
     check_rows(problem)
 
@@ -283,7 +283,7 @@ def test_a_star_shares_the_errors_of_its_hub_alone():
     """Those of the other poses reach one pair each and are this pair's own."""
     m = measure(small_arm(), 30, np.random.default_rng(1))
     (rows,) = build_problem(small_arm(), m, model="distance-rotation", pairing=Pairing("star")).rows
-    assert rows.shared.loadings.shape == (58, 8)
+    assert rows.states.loadings.shape == (58, 8)
 
 
 def test_pairs_of_configurations_of_their_own_share_nothing():
@@ -291,7 +291,7 @@ def test_pairs_of_configurations_of_their_own_share_nothing():
     robot = small_arm()
     m = directly_measured(measure(robot, 20, rng, sigma_joint=1e-4), robot, np.arange(0, 20, 2), np.arange(1, 20, 2))
     (rows,) = build_problem(robot, m, model="distance-rotation").rows
-    assert rows.shared is None
+    assert rows.states is None
 
 
 def test_what_rows_have_to_themselves_for_safety_is_no_degree_of_freedom():
@@ -349,7 +349,7 @@ def test_rows_asked_to_count_as_independent_are_accounted_for_in_the_actual_cova
             W[np.ix_(keep, keep)] = np.linalg.inv(np.linalg.cholesky(C[np.ix_(keep, keep)]))
     J = W @ raw
     expected = J.T @ (W @ C @ W.T) @ J
-    T = whitened_triangle(problem, problem.start)
+    T = linear_system(problem, problem.start).left.A
     found = correlation(problem, problem.start) + T.T @ T
     assert np.abs(found - expected).max() <= 0.02 * np.abs(expected).max()
 
@@ -404,7 +404,7 @@ def test_directly_measured_pairs_without_joint_noise_share_nothing():
     robot = small_arm()
     m: Measurements = directly_measured(measure(robot, 30, rng), robot, np.zeros(29, dtype=int), np.arange(1, 30))
     (rows,) = build_problem(robot, m, model="distance").rows
-    assert rows.shared is None
+    assert rows.states is None
 
 
 @pytest.mark.slow
