@@ -23,7 +23,6 @@ from fg_calib.graph.problem import (
     tables_of,
     variables_of,
 )
-from fg_calib.graph.tolerances import with_first_tolerances
 from fg_calib.graph.variables import Variables, preference, prior_rows
 from fg_calib.job import Job
 from fg_calib.measurements.build import Dataset, build_dataset, warn_of_copies
@@ -55,6 +54,9 @@ Places = Mapping[tuple[str, str], Floats]
 
 QUARTER_TURN = 1e-3
 """Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
+
+FIRST_TOLERANCE = 1e-3
+"""Prior sigma that a joint's parameter starts from where scales are estimated and none is specified, [m] and [rad]."""
 
 STRUCTURAL_FLOOR = 1e-6
 """Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
@@ -346,3 +348,13 @@ def _refuse_nothing(problem: Problem) -> None:
     if pairs and not problem.pair_series:
         raise ProblemError(source, f"{found}: none has a measurement that model {table.model} uses")
     raise ProblemError(source, found, "train rows")
+
+
+def with_first_tolerances(robot: Robot) -> Robot:
+    """The robot whose joints' estimated parameters all have a tolerance: `FIRST_TOLERANCE` where none is stated."""
+    n = robot.n_joints
+    parameters = tuple(
+        replace(p, tolerance=FIRST_TOLERANCE) if p.tolerance is None and p.estimated and 1 <= p.owner <= n else p
+        for p in robot.parameters
+    )
+    return replace(robot, parameters=parameters)

@@ -45,7 +45,6 @@ from fg_calib.graph.problem import (
     with_user_factors,
 )
 from fg_calib.graph.robust import Weighting, constants, cost
-from fg_calib.graph.tolerances import ToleranceScales
 from fg_calib.graph.variables import Variables
 from fg_calib.options import Options, check_number
 from fg_calib.robot.model import Robot
@@ -111,6 +110,40 @@ class Iteration:
     damping: float
     step: float
     decrement: float
+
+
+@dataclass(frozen=True)
+class ToleranceScale:
+    """A factor on the tolerances stated of a group of parameters, estimated with them.
+
+    Attributes:
+        group: What shares the scale: `a`, `theta`, `tool`; or a joint's name.
+        parameters: The parameters.
+        scale: Tolerance estimated over tolerance stated.
+        low: Lower end of its 95 % interval.
+        high: Upper end.
+        seen: How many of the parameters' corrections the data tell of.
+    """
+
+    group: str
+    parameters: tuple[str, ...]
+    scale: float
+    low: float
+    high: float
+    seen: float
+
+
+@dataclass(frozen=True)
+class ToleranceScales(FrozenArrays):
+    """The scales of all groups.
+
+    Attributes:
+        scales: Group by group.
+        unsure: What not knowing them adds to the covariance of the estimate, shape (n_columns, n_columns).
+    """
+
+    scales: tuple[ToleranceScale, ...]
+    unsure: Floats
 
 
 @dataclass(frozen=True)

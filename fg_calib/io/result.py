@@ -26,8 +26,7 @@ from fg_calib.diagnostics.setup_check import SetupCheck
 from fg_calib.errors import InputError
 from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.graph.problem import Problem
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.tolerances import ToleranceScale
+from fg_calib.graph.solver import Solution, ToleranceScale
 from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
 from fg_calib.measurements.table import Table

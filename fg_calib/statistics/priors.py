@@ -48,7 +48,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -58,10 +58,11 @@ from scipy import special
 from fg_calib.arguments import checked
 from fg_calib.arrays import Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph.normal_system import RANK_TOLERANCE, eliminate
-from fg_calib.graph.problem import Problem, correlation, linear_system, relinearized_at
-from fg_calib.graph.solver import Solution, solve
-from fg_calib.graph.tolerances import ToleranceScale, ToleranceScales, groups_of, prior_parameters, with_scales
+from fg_calib.graph.problem import Problem, correlation, linear_system, relinearized_at, with_factors
+from fg_calib.graph.solver import Solution, ToleranceScale, ToleranceScales, solve
 from fg_calib.graph.variables import Variables, prior_rows, unknown_prior_rows
+from fg_calib.options import SharedScale
+from fg_calib.robot.model import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
 from fg_calib.threads import single_threaded
 
@@ -106,10 +107,10 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
         SolverError: GTSAM could not solve a step at all.
     """
     by, specified = problem.options.estimate_tolerance, problem.variables
-    parameters = prior_parameters(specified)
+    parameters = _prior_parameters(specified)
     if by is None or problem.evaluated or not parameters:
         return solve_with(problem)
-    groups, group = groups_of(problem.robot, parameters, by)
+    groups, group = _groups_of(problem.robot, parameters, by)
     members = tuple(tuple(p.name for p, k in zip(parameters, group, strict=True) if k == j) for j in range(len(groups)))
     scale, step, seconds, now = np.ones(len(groups)), np.zeros(len(groups)), 0.0, problem
     for _ in range(MAX_ROUNDS):
@@ -124,7 +125,7 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
             break
         scale = scale * np.exp(step)
         noise = replace(problem.state, factors=solution.problem.state.factors)
-        now = with_scales(
+        now = _with_scales(
             relinearized_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
         )
     low, high = np.exp(found.interval)
@@ -437,3 +438,48 @@ def _beyond(names: tuple[str, ...], z: Floats, A: Floats, n_parameters: int) -> 
         values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
         gain = C[:, rows] @ (V / np.maximum(values, MIN_SIGMA**2)) @ V.T
         rest, C = rest - gain @ rest[rows], C - gain @ C[rows]
+
+
+def _prior_parameters(variables: Variables) -> list[Parameter]:
+    """The parameter of each row of `prior_rows`, in their order."""
+    owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
+    return [p for p in owned if p.tolerance is not None] if variables.priors else []
+
+
+def _groups_of(robot: Robot, parameters: Sequence[Parameter], by: SharedScale) -> tuple[tuple[str, ...], Integers]:
+    """What shares a scale.
+
+    Args:
+        robot: The robot.
+        parameters: Those that have a tolerance.
+        by: What they share it by.
+
+    Returns:
+        The groups in the order in which they come first, and the number of each parameter's, shape (n,).
+    """
+    names = [_group_of(robot, p, by) for p in parameters]
+    groups = tuple(dict.fromkeys(names))
+    return groups, np.array([groups.index(name) for name in names], dtype=np.int64)
+
+
+def _group_of(robot: Robot, parameter: Parameter, by: SharedScale) -> str:
+    owner = ("base", *(joint.name for joint in robot.joints), "tool")[parameter.owner]
+    return owner if by == "joint" else tolerance_kind(parameter) or f"{owner} angles"
+
+
+def _with_scales(problem: Problem, by: SharedScale, scales: Mapping[str, float]) -> Problem:
+    """The problem from its start, with the tolerances of each group multiplied, those of fixed parameters too.
+
+    Args:
+        problem: The problem.
+        by: What shares a scale.
+        scales: Factor on the tolerances of each group.
+    """
+    parameters = tuple(
+        p
+        if p.tolerance is None
+        else replace(p, tolerance=p.tolerance * scales.get(_group_of(problem.robot, p, by), 1.0))
+        for p in problem.robot.parameters
+    )
+    robot = replace(problem.robot, parameters=parameters)
+    return with_factors(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))

@@ -11,9 +11,8 @@ from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError
-from fg_calib.graph.build import build_problem
+from fg_calib.graph.build import FIRST_TOLERANCE, build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.graph.tolerances import FIRST
 from fg_calib.options import Options
 from fg_calib.statistics.priors import (
     COMMON_SIGMA,
@@ -200,7 +199,7 @@ def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
     bare = build_problem(small_arm(estimate=TOOL), m, model="pose", estimate_tolerance="kind")
     arm = {p.name: p.tolerance for p in bare.robot.parameters if p.estimated}
     assert {arm.pop(name) for name in TOOL} == {None}
-    assert set(arm.values()) == {FIRST}
+    assert set(arm.values()) == {FIRST_TOLERANCE}
 
 
 @pytest.mark.slow
