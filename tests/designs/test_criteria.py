@@ -112,17 +112,6 @@ def test_bounds_are_never_above_what_a_candidate_makes(criterion, seed):
     assert bounds.min() > -np.inf
 
 
-@pytest.mark.parametrize("criterion", CRITERIA)
-def test_where_no_candidate_does_better_than_asked_there_is_none(criterion):
-    """What all of them make of it at best is just not better than itself."""
-    system = SYSTEMS[0]
-    M, allowed = information(system, [0, 1]), np.ones(system.n_candidates, dtype=np.bool_)
-    k, value = Measure(criterion, system).best(M, allowed)
-    assert Measure(criterion, system).best(M, allowed, value) == (-1, value)
-    just = value + 1e-9 * abs(value)
-    assert Measure(criterion, system).best(M, allowed, just) == (k, value)
-
-
 # --- the system -------------------------------------------------------------------------------------------------------
 
 

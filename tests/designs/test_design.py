@@ -246,3 +246,16 @@ def test_values_that_make_no_sense_are_refused(options, message):
     of = scenario(INSTRUMENTS["pose"], n=20)
     with pytest.raises(InputError, match=message):
         design(of, **{"n_candidates": 5} | options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("criterion", ["I", "D", "E"])
+def test_what_prior_sigmas_alone_determine_is_not_lost_at_tiny_noise(criterion):
+    """Unknown targets leave the last joint to its priors, whatever the noise; 1 um adds 1e-6 of 1 mm, in squares."""
+    expected = []
+    for sigma in (1e-8, 1e-6):
+        of = scenario(Tracker(model="position", name="it", targets=2), n=5, noise=Noise(position=sigma, joint=0.0))
+        plan = design(of, n=12, n_candidates=30, criterion=criterion)
+        assert plan.unknown == 0.0
+        expected.append(plan.expected.position)
+    assert expected[0] == pytest.approx(expected[1], rel=1e-4)

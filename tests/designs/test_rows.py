@@ -126,32 +126,12 @@ def test_some_poses_hold_what_a_problem_of_them_alone_holds(kind):
     assert apart(expected, found) < 1e-6  # eliminating unknowns that so few poses hardly hold takes half the digits
 
 
-def test_positions_in_a_frame_of_their_own_hold_what_all_distances_between_them_do():
-    """Within what pairs spare of their variance, 1e-3 of it, so that too many of them can be whitened."""
-    of = scenario(Tracker(model="distance", name="it", pairing=Pairing("all")), n=N)
-    pool = build_pool(of, draw_groups(of, N, np.random.default_rng(0)))
-    some = np.arange(2, 14)
-    formed = true_problem(pool.robot, pool.select_tables(some), pool.problem.options)
-    n = formed.variables.n_columns
-    assert apart(information_of(formed), without_last(of_poses(pool.rows, some), n)) < 2e-2
-
-
 def test_errors_of_reference_poses_are_unknowns_of_one_sigma():
     pool = pool_with(LENGTHS)
     shared = len(pool.rows.scales) - pool.problem.variables.n_columns
     assert shared >= pool.robot.n_joints
     assert pool.rows.scales[-shared:].tolist() == [1.0] * shared
     assert pool.rows.always[-shared:, -shared:].tolist() == np.eye(shared).tolist()
-
-
-def test_poses_without_train_rows_add_nothing():
-    arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
-    data = measure(arm, 6, np.random.default_rng(0), n_test=3)
-    problem = build_problem(arm, data, model="pose", frame="known")
-    rows = gather_rows(problem, np.arange(9))
-    assert not rows.rows[6:].any()
-    assert rows.rows[:6].any(axis=(1, 2)).all()
-    assert apart(information_of(problem), of_poses(rows)) < rounding()
 
 
 @pytest.mark.parametrize("kind", kinds(*KINDS.keys() - {"pixels", "two boards", "camera in the room"}))

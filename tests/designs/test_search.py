@@ -92,20 +92,6 @@ def test_exchange_never_makes_worse_and_ends_where_no_single_one_helps(criterion
         assert min(swapped) > found.value - 4 * search.MIN_GAIN * abs(found.value)
 
 
-@pytest.mark.parametrize("quickly", [False, True])
-def test_exchange_among_a_few_that_help_most_is_exchange_too(quickly, monkeypatch):
-    monkeypatch.setattr(search, "SHORTLIST", 10)
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        system = random_system(rng, 60)
-        for criterion in ("I", "E"):
-            start = rng.choice(60, 5, replace=False).astype(np.int64)
-            found = exchange(Measure(criterion, system), start, quickly=quickly)
-            assert found.value <= value(system, criterion, start)
-            assert found.value == pytest.approx(value(system, criterion, found.candidates), rel=rounding())
-            assert len(np.unique(found.candidates)) == 5
-
-
 def test_greedy_takes_the_best_in_addition_to_those_before_it():
     system = random_system(np.random.default_rng(1), 12)
     for criterion in CRITERIA:

@@ -144,16 +144,6 @@ def test_transforms_of_one_frame_are_chosen(bag):
     assert error(path, child="hand").startswith(f"{path.name}: topic /tf: no poses of these frames, expected one:")
 
 
-def test_without_stamps_times_of_receipt_are_used(tmp_path):
-    bag = BagWriter(tmp_path, "mcap")
-    for k in range(3):
-        bag.joints(0, NAMES, np.zeros(6), received=START + k * 10**7)
-    poses(bag)
-    joints, _ = read_bag(bag.close(), arm())
-    assert joints.time == pytest.approx([0, 0.01, 0.02], abs=1e-12)
-    assert joints.source.notes == ("no stamps in the headers: times of receipt are used",)
-
-
 def test_what_is_left_out_or_put_in_order_is_reported(bag):
     for k, (late, x) in enumerate(((5, 5.0), (3, 3.0), (3, 4.0), (7, np.nan))):
         bag.pose(START + late * 10**6, [x, 0, 0], [0, 0, 0, 1], received=START + 10**9 + k)

@@ -9,7 +9,6 @@ from oracle import tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 
 from fg_calib.designs.candidates import find_candidates
-from fg_calib.errors import InputError
 from fg_calib.robot.inverse import REACHED, random_readings
 from fg_calib.robot.model import Joint, RobotBuilder
 from fg_calib.simulation.obstacles import enters, link_points
@@ -209,15 +208,3 @@ def test_the_tracker_sees_the_reflector(robot, far):
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------
-
-
-def test_nothing_within_reach_is_said_with_the_reasons():
-    far = Placement(np.eye(3), np.array([9.0, 0.0, 0.0]))
-    with pytest.raises(InputError) as caught:
-        draw(ARM, replace(VIEWS, board=far, count=0))
-    message = "candidates: none in 20 drawn: 100 % out of reach, expected some that the arm can take"
-    assert str(caught.value) == message
-    with pytest.raises(InputError) as caught:
-        draw(ARM, GivenReadings(np.array([[4.0] * 7, [0.0] * 7])), keep_out=[Box([-1, -1, 0.9], [1, 1, 1])])
-    message = "candidates: none in 2 drawn: 50 % outside the joint limits, 50 % in a box"
-    assert str(caught.value) == f"{message}, expected some that the arm can take"

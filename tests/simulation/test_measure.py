@@ -16,7 +16,6 @@ from fg_calib import InputError, calibrate, read_job, simulate, write_simulation
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation.scenario import (
     BoardCamera,
-    GivenReadings,
     LengthGauge,
     Placement,
     RandomReadings,
@@ -258,16 +257,6 @@ def test_the_same_configuration_has_the_same_joint_errors_in_all_tables():
     assert first.position == pytest.approx(
         np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in s.true_readings]), abs=CLOSE
     )
-
-
-def test_an_instrument_may_have_configurations_of_its_own_and_shares_the_test_rows():
-    own = GivenReadings(np.zeros((4, 4)) + np.arange(4)[:, None])
-    a, b = Tracker(model="position", name="a"), Tracker(model="position", name="b", configurations=own)
-    s = simulate(scenario(a, b, n=5, validation=RandomReadings(3)))
-    assert s.tables[0].measurements.ids.tolist() == [f"p{i}" for i in range(8)]
-    assert s.tables[1].measurements.ids.tolist() == ["b p0", "b p1", "b p2", "b p3", "p5", "p6", "p7"]
-    assert s.tables[1].measurements.readings[:4] == pytest.approx(own.readings)
-    assert [s.n_configurations(test=test) for test in (False, True)] == [9, 3]
 
 
 def test_a_point_of_one_name_is_one_and_is_known_alike_in_all_tables():

@@ -100,18 +100,6 @@ def test_the_shipped_scenario_is_the_papers(tmp_path, monkeypatch):
     assert (s.length_unit, s.angle_unit) == ("m", "deg")
 
 
-def test_a_short_scenario_has_the_defaults(folder):
-    s = read(folder, SHORT)
-    assert s.robot.name == "robot"
-    assert s.errors == Errors("uniform", {"a1": 0.01, "a2": 0.01})
-    assert s.configurations == RandomReadings(3)
-    assert s.noise == Noise(1e-3, 2e-3, (0.0, 0.0))
-    assert (s.frame, s.validation, s.stated_noise) == ("unknown", None, None)
-    assert s.job == {"model": "distance-rotation"}
-    assert (s.name, s.source, s.length_unit, s.angle_unit) == ("scenario", "scenario.yaml", "m", "rad")
-    assert read(folder, SHORT + "name: mine\n").name == "mine"
-
-
 @pytest.mark.parametrize(
     ("errors", "expected"),
     [
@@ -333,14 +321,8 @@ def test_the_command_says_what_each_table_has_and_writes_the_truth(fg_calib, fol
     )
     truth = yaml.safe_load((folder / "job" / "truth.yaml").read_text())
     assert truth["units"] == {"length": "mm", "angle": "deg"}
-    assert truth["targets"] == {"ball": {"x": 50.0, "y": 0.0, "z": 100.0}}
     assert (truth["anchors"], truth["offsets"]) == ({"bolt": {"x": 800.0, "y": 0.0, "z": 0.0}}, {"wire": 120.0})
     assert set(truth["frames"]["tracker"]) == {"x", "y", "z", "roll", "pitch", "yaw"}
-    job = yaml.safe_load((folder / "job" / "calibration.yaml").read_text())
-    assert [entry["table"] for entry in job["measurements"]] == ["tracker.csv", "wire.csv"]
-    assert job["anchors"] == {"bolt": {"x": 800.0, "y": 0.0, "z": 0.0}}
-    ended = fg_calib("calibrate", folder / "job" / "calibration.yaml", "--out", folder / "result")
-    assert ended.code == 0
     as_json = fg_calib("simulate", folder / "scenario.yaml", "--out", folder / "job", "--json")
     assert '"table": "wire.csv"' in as_json.out
 
