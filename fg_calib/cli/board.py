@@ -89,7 +89,7 @@ def _report(tables: BoardTables) -> RenderableType:
     import numpy as np
     from rich.console import Group
 
-    from fg_calib.importers.views import FIGURES
+    from fg_calib.importers.views import INTRINSICS
     from fg_calib.report.tables import figure, indented, line, section, table_of
 
     fit, board = tables.fit, tables.fit.board
@@ -104,7 +104,7 @@ def _report(tables: BoardTables) -> RenderableType:
         pose = f"{1e3 * np.linalg.norm(view.position):.1f}", figure(shift, "m"), figure(turn, "rad")
         images.append((view.name, len(view.corners), *residuals, *pose, remark))
     for name, sigma in (fit.camera_sigma or {}).items() if fit.camera_sigma is not None else ():
-        unit, decimals = ("px", 3) if name in FIGURES[:4] else ("", 6)
+        unit, decimals = ("px", 3) if name in INTRINSICS[:4] else ("", 6)
         camera.append((name, f"{getattr(fit.camera, name):.{decimals}f}", f"{sigma:.{decimals}f}", unit))
     headings = ("Image", "corners", "RMS px", "sigma px", "distance mm", "sigma mm", "sigma deg", "")
     return Group(

@@ -392,12 +392,3 @@ def _with_true_points(simulation: Simulation) -> tuple[Table, ...]:
         replace(t, known={name: KnownPoint(places[name].xyz, known.tolerance) for name, known in t.known.items()})
         for t in simulation.tables
     )
-
-
-def rms_sigma(sigma: Floats | None, chosen: NDArray[np.bool_]) -> float | None:
-    """Root mean square of specified sigmas, of those chosen; None without any."""
-    if sigma is None or not np.isfinite(sigma[chosen]).any():
-        return None
-    sigma = sigma[chosen]
-    largest = float(np.nanmax(sigma)) or 1.0  # equal values stay what they are, to the last digit
-    return largest * float(np.sqrt(np.nanmean(np.square(sigma / largest))))

@@ -52,13 +52,13 @@ Integers = NDArray[np.int64]
 
 Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 
-_SPAN = 512
+CHUNK = 512
 """Candidates that are looked at together."""
 
-_BATCH, _FEW = 32, 16
+BATCH, EIGENVALUE_CHUNK = 32, 16
 """Candidates whose singular values are worked out before the next bound is looked at, and by one processor."""
 
-MOST_EXACT = 128
+MAX_EXACT = 128
 """Candidates of a step whose singular values are worked out at most: those of the best bounds."""
 
 _TINY = 1e-300
@@ -97,7 +97,7 @@ class Measure:
         """
         C = _covariance(information)
         bounds = np.where(allowed, self._bounds(C), np.inf)
-        most, at_once = (len(bounds), _SPAN) if self._is_cheap else (MOST_EXACT, _BATCH)
+        most, at_once = (len(bounds), CHUNK) if self._is_cheap else (MAX_EXACT, BATCH)
         order, best, least = np.argsort(bounds, kind="stable")[: int(np.sum(allowed))], -1, below
         for start in range(0, min(len(order), most), at_once):
             some = order[start : start + at_once]
@@ -139,11 +139,11 @@ class Measure:
         rows, (n, _, m) = self.system.rows, self.system.rows.shape
 
         def span(k: int) -> Floats:
-            A = rows[k * _SPAN : (k + 1) * _SPAN]
+            A = rows[k * CHUNK : (k + 1) * CHUNK]
             product = (A.reshape(-1, m) @ X).reshape(len(A), -1)
             return np.asarray(np.einsum("ij,ij->i", product, product))
 
-        return np.concatenate(list(over_processors(span, -(-n // _SPAN))))
+        return np.concatenate(list(over_processors(span, -(-n // CHUNK))))
 
     def _slope(self, C: Floats) -> Floats:
         """X of which `|A X|^2` is the derivative of a cheap criterion, shape (n, r): see the module."""
@@ -164,7 +164,7 @@ class Measure:
         L, X, m = np.linalg.cholesky(C), self._slope(C), self.system.rows.shape[2]
 
         def span(k: int) -> Floats:
-            A = self.system.rows[candidates[k * _SPAN : (k + 1) * _SPAN]]
+            A = self.system.rows[candidates[k * CHUNK : (k + 1) * CHUNK]]
             h = A.shape[1]
             U, V = (np.reshape(A.reshape(-1, m) @ B, (len(A), h, -1)) for B in (L, X))
             F, T = np.eye(h) + U @ np.swapaxes(U, 1, 2), V @ np.swapaxes(V, 1, 2)
@@ -172,7 +172,7 @@ class Measure:
                 return np.asarray(np.trace(np.linalg.solve(F, T), axis1=1, axis2=2))
             return np.asarray(np.linalg.slogdet(F)[1] - np.linalg.slogdet(F - T)[1])
 
-        return np.concatenate(list(over_processors(span, -(-len(candidates) // _SPAN))))
+        return np.concatenate(list(over_processors(span, -(-len(candidates) // CHUNK))))
 
     def _with(self, C: Floats, candidates: Integers) -> Floats:
         """The criterion with each of some candidates, shape (n,)."""
@@ -182,12 +182,12 @@ class Measure:
         S, K = P @ C @ P.T, C @ P.T
 
         def span(k: int) -> Floats:
-            A = self.system.rows[candidates[k * _FEW : (k + 1) * _FEW]]
+            A = self.system.rows[candidates[k * EIGENVALUE_CHUNK : (k + 1) * EIGENVALUE_CHUNK]]
             G, B = np.eye(A.shape[1]) + A @ C @ np.swapaxes(A, 1, 2), A @ K
             after = S - np.swapaxes(B, 1, 2) @ np.linalg.solve(G, B)
             return np.asarray(_of_values(self.criterion, _singular_values(after)))
 
-        return np.concatenate(list(over_processors(span, -(-len(candidates) // _FEW))))
+        return np.concatenate(list(over_processors(span, -(-len(candidates) // EIGENVALUE_CHUNK))))
 
 
 def _singular_values(S: Floats) -> Floats:

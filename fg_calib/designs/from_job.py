@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.assessment import solve_job
-from fg_calib.designs.candidates import NONE, REFERENCE, Pool, build_pool, draw_groups, rms_sigma
+from fg_calib.designs.candidates import NONE, REFERENCE, Pool, build_pool, draw_groups
 from fg_calib.designs.information import gather_rows
 from fg_calib.errors import InputError
 from fg_calib.graph.build import places_of
@@ -215,7 +215,9 @@ class _Reader:
         found = dict[str, Any]()
         for kind, sigma in sigmas.items():
             of_pairs = pairs is not None and kind in ("distance", "angle")
-            specified = rms_sigma(sigma, ~pairs.test if pairs is not None and of_pairs else train)
+            used = None if sigma is None else sigma[~pairs.test if pairs is not None and of_pairs else train]
+            measured = used is not None and np.isfinite(used).any()
+            specified = float(np.sqrt(np.nanmean(np.square(used)))) if used is not None and measured else None
             factor = self.problem.state.factors.get((self.number, estimated_as.get(kind, kind)), 1.0)
             found[kind] = None if specified is None else specified * factor
         return Noise(**found)

@@ -13,7 +13,7 @@ import yaml
 
 from fg_calib import __version__
 from fg_calib.errors import InputError
-from fg_calib.importers.views import FIGURES, BoardFit, View
+from fg_calib.importers.views import INTRINSICS, BoardFit, View
 from fg_calib.io.atomic import fill_folder, require_own, write_text
 from fg_calib.io.columns import KNOWN, Table, write_csv
 from fg_calib.io.units import Units
@@ -116,8 +116,8 @@ class BoardTables:
 
         { "schema": "fg-calib/board/1", "version", "board": {keys of its file, in m}, "image_size": [width, height],
           "rms_pixel", "sigma_pixel", "images": [{"id", "n_corners", "rms_pixel", "sigma_pixel", "position",
-          "rotation_vector", "covariance", "covariance_by_camera" | null, "ambiguous", "poor"}], "camera": {figures},
-          "camera_sigma": {figures} | null, "without_board": {file: reason}, "without_pose": [ids],
+          "rotation_vector", "covariance", "covariance_by_camera" | null, "ambiguous", "poor"}], "camera": {parameters},
+          "camera_sigma": {parameters} | null, "without_board": {file: reason}, "without_pose": [ids],
           "without_readings": [ids], "without_image": [ids], "findings": [text] }
 
         """
@@ -232,7 +232,7 @@ def _pose_columns(tables: BoardTables) -> dict[str, Any]:
 def _camera_text(fit: BoardFit) -> str:
     """The file of a camera that was estimated."""
     width, height = fit.size
-    figures: dict[str, Any] = {name: getattr(fit.camera, name) for name in FIGURES}
-    figures |= {"width": width, "height": height, "sigma": fit.camera_sigma}
-    words = f"# fg-calib board: estimated from {len(fit.views)} images, in px; sigma: 1 sigma of each figure\n"
-    return words + yaml.safe_dump(figures, sort_keys=False)
+    values: dict[str, Any] = {name: getattr(fit.camera, name) for name in INTRINSICS}
+    values |= {"width": width, "height": height, "sigma": fit.camera_sigma}
+    words = f"# fg-calib board: estimated from {len(fit.views)} images, in px; sigma: 1 sigma of each value\n"
+    return words + yaml.safe_dump(values, sort_keys=False)

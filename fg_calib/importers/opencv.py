@@ -272,8 +272,8 @@ def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int
         _, K, lens, _, _ = cv2.calibrateCamera(places, seen, size, None, None, criteria=criteria)
     except cv2.error:
         return None
-    figures = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]
-    return Camera(*map(float, figures)) if np.isfinite(figures).all() else None
+    values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]
+    return Camera(*map(float, values)) if np.isfinite(values).all() else None
 
 
 def _matrices(camera: Camera) -> tuple[Floats, Floats]:

@@ -167,9 +167,8 @@ def _offset(
     specified: float | None, most: float | None,
 ) -> tuple[ClockOffset | None, float]:  # fmt: skip
     """The offset of the clocks as estimated, and the one that is used: the specified one, where there is one."""
-    for name, value, least in (("offset", specified, -np.inf), ("most offset", most, 0.0)):
-        if value is not None:
-            check_number(name, value, least=least)
+    if most is not None:
+        check_number("most offset", most)
     try:
         estimate = estimate_offset(joints.tool_path(robot), poses, stops)
     except InputError:

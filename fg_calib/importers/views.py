@@ -22,8 +22,8 @@ from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.kinds.pixel import RoomPixel
 
-FIGURES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""A camera's figures, in the order of its covariance."""
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""A camera's parameters, in the order of its covariance."""
 
 UNDETERMINED = ("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
 
@@ -31,19 +31,19 @@ MIN_IMAGES = 3
 """From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
 the lens."""
 
-_PRIOR_RESIDUALS = 10
+PRIOR_RESIDUALS = 10
 """How many residuals of its own weigh as much in an image's sigma as those of all images."""
 
-_AS_GOOD = 10.8
+MAX_CHI2_DIFFERENCE = 10.8
 """Chi-square by which a second pose may fit worse and still be the true one: its 99.9 % point."""
 
-_POOR = 3.0
+MAX_RMS_RATIO = 3.0
 """RMS of an image's residuals over the median of all from which it is poor: blur, or a board that is not flat."""
 
-_FAR_OFF = 0.002
+MAX_RMS_SHARE = 0.002
 """RMS of all residuals, in diagonals of the image, that no lens unlike its model leaves: a camera of other images."""
 
-_WELL_KNOWN = 0.01
+MAX_FOCAL_SIGMA = 0.01
 """Sigma of a focal length over itself above which it is hardly determined: distances are wrong by as much."""
 
 
@@ -106,7 +106,7 @@ class BoardFit:
         board: The board.
         size: Width and height of the images, [px].
         camera: The camera.
-        camera_covariance: Of its `FIGURES`, shape (9, 9); None for a camera that was given.
+        camera_covariance: Of its `INTRINSICS`, shape (9, 9); None for a camera that was given.
         views: The board in each image.
         without_pose: Names of images that no pose explains.
         rms: Of all residuals, [px].
@@ -124,9 +124,9 @@ class BoardFit:
 
     @property
     def camera_sigma(self) -> dict[str, float] | None:
-        """1 sigma of each of the camera's figures; None for a camera that was given."""
+        """1 sigma of each of the camera's parameters; None for a camera that was given."""
         C = self.camera_covariance
-        return None if C is None else dict(zip(FIGURES, np.sqrt(np.diag(C)).tolist(), strict=True))
+        return None if C is None else dict(zip(INTRINSICS, np.sqrt(np.diag(C)).tolist(), strict=True))
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -134,10 +134,10 @@ class BoardFit:
         found = []
         for name in ("fx", "fy") if self.camera_sigma else ():
             value, sigma = getattr(self.camera, name), (self.camera_sigma or {})[name]
-            if sigma > _WELL_KNOWN * value:
+            if sigma > MAX_FOCAL_SIGMA * value:
                 hint = "tilt the board by 30 degrees or so, in several directions, and fill the image with it"
                 found.append(f"the images do not determine the camera: {name} = {value:.0f} ± {sigma:.0f} px; {hint}")
-        if self.rms > _FAR_OFF * float(np.hypot(*self.size)):
+        if self.rms > MAX_RMS_SHARE * float(np.hypot(*self.size)):
             width, height = self.size
             hint = f"is the camera that of these images of {width} x {height} px, is the board as its file says?"
             found.append(f"no poses explain the corners: residuals of {self.rms:.3g} px RMS; {hint}")
@@ -162,12 +162,12 @@ class _Fit:
 
     @property
     def shift(self) -> Floats:
-        """What an error of the camera's figures does to the pose, shape (6, 9)."""
+        """What an error of the camera's parameters does to the pose, shape (6, 9)."""
         return np.asarray(np.linalg.solve(self.information, -self.J.T @ self.K), dtype=np.float64)
 
     @property
     def camera_information(self) -> Floats:
-        """Of the camera's figures, for corners of sigma 1 px and an unknown pose, shape (9, 9)."""
+        """Of the camera's parameters, for corners of sigma 1 px and an unknown pose, shape (9, 9)."""
         rest = self.K + self.J @ self.shift
         return rest.T @ rest
 
@@ -201,7 +201,7 @@ def fit_board(
     taken = {name: 6.0 + float(np.sum(fit.camera_information * C)) for name, fit in fits.items()}
     squares = sum(fit.squares for fit in fits.values())
     variance = squares / sum(len(fit.J) - taken[name] for name, fit in fits.items())
-    own = {name: (fit.squares + _PRIOR_RESIDUALS * variance) / (len(fit.J) - taken[name] + _PRIOR_RESIDUALS)
+    own = {name: (fit.squares + PRIOR_RESIDUALS * variance) / (len(fit.J) - taken[name] + PRIOR_RESIDUALS)
            for name, fit in fits.items()}  # fmt: skip
     C = C @ sum(own[name] * fit.camera_information for name, fit in fits.items()) @ C
     typical = float(np.median([np.sqrt(fit.squares / len(fit.J)) for fit in fits.values()]))
@@ -227,8 +227,8 @@ def _view(one: Corners, fit: _Fit, variance: float, C: Floats, typical: float) -
         sigma=float(np.sqrt(variance)),
         covariance=variance * _scaled_inverse(fit.information),
         by_camera=fit.shift @ C @ fit.shift.T,
-        ambiguous=fit.second - fit.squares < _AS_GOOD * variance,
-        poor=rms > _POOR * typical,
+        ambiguous=fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance,
+        poor=rms > MAX_RMS_RATIO * typical,
     )
 
 

@@ -852,14 +852,14 @@ class Errors:
     """True minus nominal values of parameters.
 
     Attributes:
-        law: `uniform` within plus and minus the figures, `normal` with the figures as 1 sigma, or the figures
+        law: `uniform` within plus and minus the values, `normal` with the values as 1 sigma, or the values
             themselves (`values`).
-        figures: By parameter name or by kind (`a`, `alpha`, `tool`, ...; a name goes before its kind), [m] or [rad].
-            Errors that are drawn are those of estimated parameters only; what has no figure has no error.
+        values: By parameter name or by kind (`a`, `alpha`, `tool`, ...; a name goes before its kind), [m] or [rad].
+            Errors that are drawn are those of estimated parameters only; what has no value has no error.
     """
 
     law: Literal["uniform", "normal", "values"]
-    figures: Mapping[str, float]
+    values: Mapping[str, float]
 
     def __post_init__(self) -> None:
         check("errors: law", self.law, ("uniform", "normal", "values"))
@@ -1020,13 +1020,11 @@ def _job(file: _ScenarioInFile, noise: Noise, source: str, context: FileContext)
     """Keys of the job that the simulation does not write, and the noise that it specifies instead of the true one."""
     place, alone = f"{source}: job", file.instruments is None
     given = dict(file.job) if file.job is not None else {"model": "distance-rotation"} if alone else {}
-    for key in ("robot", "measurements", "pairs", "frame", "units", "truth"):
-        if key in given:
-            hint = "it follows from the scenario" if key in {"frame", "units"} else "the simulation writes it"
-            raise InputError(place, f"found key {key!r}", "none", hint)
-    for key in () if alone else ("model", "pairing", "targets", "anchors", "tolerance", "offset", "camera"):
-        if key in given:
-            raise InputError(place, f"found key {key!r}", "none", "each instrument has its own")
+    written = {"robot", "measurements", "pairs", "frame", "units", "truth"}
+    of_instruments = {"model", "pairing", "targets", "anchors", "tolerance", "offset", "camera"}
+    for key in given:
+        if key in written or (key in of_instruments and not alone):
+            raise InputError(place, f"found key {key!r}", "none", "it follows from the scenario or its instruments")
     specified = given.pop("noise", None)
     if specified is None:
         return given, None

@@ -181,7 +181,7 @@ def _draw_robot(robot: Robot, errors: Errors | None, seed: int, place: str) -> R
     """Draw the robot that moves, each parameter by its name."""
     if errors is None:
         raise InputError(place, "found none", "one of uniform, normal, values: what the arm that moves has")
-    values = values_by_name(robot, errors.figures, f"{place}: {errors.law}")
+    values = values_by_name(robot, errors.values, f"{place}: {errors.law}")
     if errors.law == "values":
         return robot.with_values(robot.nominal + np.array([values.get(p.name, 0.0) for p in robot.parameters]))
     error = np.zeros(len(robot.parameters))

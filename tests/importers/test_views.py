@@ -11,7 +11,7 @@ from tolerances import sigmas_apart
 
 from fg_calib.errors import InputError
 from fg_calib.importers.opencv import CalibrationBoard, camera_derivatives
-from fg_calib.importers.views import FIGURES, Corners, fit_board
+from fg_calib.importers.views import INTRINSICS, Corners, fit_board
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.kinds.board import BoardPose
@@ -113,7 +113,7 @@ def test_what_the_camera_adds_is_how_poses_move_with_it():
     found, _ = drawn(4, np.random.default_rng(7))
     fit = fit_board(BOARD, found, SIZE)
     G = np.empty((len(found), 6, 9))
-    for i, name in enumerate(FIGURES):
+    for i, name in enumerate(INTRINSICS):
         off = 0.1 * fit.camera_sigma[name]
         moved = [
             fit_board(BOARD, found, SIZE, replace(fit.camera, **{name: getattr(fit.camera, name) + s}))

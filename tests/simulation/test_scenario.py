@@ -88,7 +88,7 @@ def test_the_shipped_scenario_is_the_papers(tmp_path, monkeypatch):
     for p in s.robot.parameters:
         if 1 <= p.owner <= 7:
             assert p.tolerance == pytest.approx(bound[p.unit] / math.sqrt(3), rel=rounding(1, 10))
-            assert s.errors.figures[p.name] == pytest.approx(bound[p.unit])
+            assert s.errors.values[p.name] == pytest.approx(bound[p.unit])
     assert s.errors.law == "uniform"
     board = s.configurations
     assert (board.height, board.radius, board.count, board.distance) == (0.5, 0.5, 51, None)
@@ -114,9 +114,9 @@ def test_errors_are_converted_and_shared_out_by_kind(folder, errors, expected):
     """Lengths in mm and angles in degrees here; a name goes before its kind."""
     s = read(folder, SHORT.replace(ERRORS, f"errors: {errors}\n") + "units: {length: mm, angle: deg}\n")
     angles = {"alpha1", "alpha2", "theta1", "tool.yaw"}
-    figures = {name: math.radians(f) if name in angles else f for name, f in expected.figures.items()}
+    figures = {name: math.radians(f) if name in angles else f for name, f in expected.values.items()}
     assert s.errors.law == expected.law
-    assert s.errors.figures == pytest.approx(figures)
+    assert s.errors.values == pytest.approx(figures)
 
 
 def test_a_board_is_converted_to_si(folder):
@@ -268,7 +268,7 @@ MISTAKES = [
     (SHORT + "frame: room\n",
      S + "frame: found 'room', expected base, unknown, or a mapping of x, y, z, roll, pitch, yaw"),
     (SHORT + "job: {frame: known}\n",
-     S + "job: found key 'frame', expected none; it follows from the scenario"),
+     S + "job: found key 'frame', expected none; it follows from the scenario or its instruments"),
     (SHORT + "job: {noise: {position: 0}}\n", S + "job: noise: position: found 0, expected a number above 0"),
     (REST + "instruments: []\n", f"{IN}: found [], expected a list of instruments, each with its model"),
     (with_instrument("{model: anchor, anchor: 3}"), f"{IN} 1: unknown key 'anchor', expected one of model, name, "
@@ -283,7 +283,7 @@ MISTAKES = [
     (with_instrument("{model: anchor, name: a}\n  - {model: plane, name: A}"),
      f"{IN} 2: name: A is there already, expected another one"),
     (REST + "instruments: [{model: anchor}]\njob: {model: anchor}\n",
-     S + "job: found key 'model', expected none; each instrument has its own"),
+     S + "job: found key 'model', expected none; it follows from the scenario or its instruments"),
 ]  # fmt: skip
 
 

@@ -123,10 +123,10 @@ def test_drawn_errors_have_their_size_and_spare_fixed_parameters(shipped):
     """Mean and variance of uniform numbers have sigmas 1 / sqrt(3 n) and 2 / sqrt(45 n), those of normal ones a
     relative sigma of 1 / sqrt(2 n)."""
     estimated = np.array([p.estimated for p in shipped.robot.parameters])
-    bound = np.array([shipped.errors.figures.get(p.name, 0.0) for p in shipped.robot.parameters])
+    bound = np.array([shipped.errors.values.get(p.name, 0.0) for p in shipped.robot.parameters])
     for law in ("uniform", "normal"):
         small = replace(shipped, configurations=RandomReadings(1), validation=None,
-                        errors=Errors(law, shipped.errors.figures))  # fmt: skip
+                        errors=Errors(law, shipped.errors.values))  # fmt: skip
         errors = np.array([simulate(small, seed).true_robot.nominal - shipped.robot.nominal for seed in range(40)])
         assert (errors[:, ~estimated] == 0.0).all()
         scaled = errors[:, estimated] / bound[estimated]
