@@ -184,7 +184,7 @@ class Knowledge(FrozenArrays):
             else:
                 s[v.columns] = values[of_v] - before[of_v]
         D = np.zeros((len(s), variables.n_columns + variables.n_nuisance))
-        D[:n, : variables.n_columns] = turned @ columns_in(own, variables, values)
+        D[:n, : variables.n_columns] = turned @ own.columns_of(variables, values)
         for i, name in enumerate(self.unknowns):
             place = coordinates_of(variables, unknowns, name)
             if place is not None:
@@ -220,23 +220,3 @@ def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Int
     first = sum(unknowns.sizes[:i])
     place = variables.coordinates[first : first + unknowns.sizes[i]]
     return place if np.all(place >= 0) else None
-
-
-def columns_in(own: Variables, other: Variables, values: Floats) -> Floats:
-    """The columns of a problem's core in those of other variables of the same arm, shape (n_own, n_other).
-
-    Args:
-        own: Variables whose arm has everything estimated that the other's has, without measurement frames.
-        other: The problem's.
-        values: The robot's parameters, shape (n_parameters,).
-    """
-    by_name = dict(zip(own.names, own.tangent_derivative(values).T, strict=True))
-    poses = {v.symbol: np.eye(own.n_columns)[v.columns] for v in own.items if v.is_pose}
-    out = np.zeros((own.n_columns, other.n_columns))
-    for v in other.items:
-        if v.symbol in poses:
-            out[:, v.columns] = poses[v.symbol].T
-        elif not v.is_pose:
-            columns = [by_name.get(name, np.zeros(own.n_columns)) for name in other.names[v.columns]]
-            out[:, v.columns] = np.array(columns).T
-    return out

@@ -738,13 +738,6 @@ def problem_at(
     robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
 ) -> Problem:
     """A problem with its rows whitened at a start."""
-    return with_factors(without_rows(robot, data, options, variables, start, **more), start)
-
-
-def without_rows(
-    robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
-) -> Problem:
-    """A problem whose rows have not been whitened."""
     estimated = options.encoder == "estimated" and bool(np.any(data.sigma_joint > 0.0))
     state = NoiseState(joint_errors=np.zeros_like(data.readings) if estimated else None)
-    return Problem(robot, data, options, variables, start, state, (), **more)
+    return with_factors(Problem(robot, data, options, variables, start, state, (), **more), start)

@@ -322,17 +322,23 @@ class Variables(Brief):
             variables = replace(variables, nuisance=(*variables.nuisance, added))
         return replace(variables, own=start)
 
-    def columns_of(self, fewer: Variables, parameters: Floats) -> Floats:
-        """What each column of the variables of fewer of the parameters is in these, shape (n_columns, fewer.n_columns).
+    def columns_of(self, other: Variables, parameters: Floats) -> Floats:
+        """Each column of other variables of the same arm in these, shape (n_columns, other.n_columns).
 
         Args:
-            fewer: Those.
+            other: The others; columns of what these do not estimate are zero.
             parameters: The parameter vector, of either.
         """
         by_name = dict(zip(self.names, self.tangent_derivative(parameters).T, strict=True))
         poses = {v.key: np.eye(self.n_columns)[v.columns] for v in self.items if v.is_pose}
-        rows = [poses.get(v.key, np.array([by_name[name] for name in fewer.names[v.columns]])) for v in fewer.items]
-        return np.vstack([np.zeros((0, self.n_columns)), *rows]).T
+        out = np.zeros((self.n_columns, other.n_columns))
+        for v in other.items:
+            if v.key in poses:
+                out[:, v.columns] = poses[v.key].T
+            elif not v.is_pose:
+                columns = [by_name.get(name, np.zeros(self.n_columns)) for name in other.names[v.columns]]
+                out[:, v.columns] = np.array(columns).T
+        return out
 
     def named_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the named scalars in the columns, shape (n_columns, n_columns).

@@ -19,7 +19,7 @@ from fg_calib.arrays import Floats, Integers
 from fg_calib.diagnostics.unmodelled_effects import basis_of
 from fg_calib.errors import ProblemError
 from fg_calib.graph.error_states import State, WhitenedBlock
-from fg_calib.graph.knowledge import Knowledge, columns_in, coordinates_of
+from fg_calib.graph.knowledge import Knowledge, coordinates_of
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, NoiseState
 from fg_calib.graph.problem import Problem, at_parameters, problem_at, start_of, tables_of, variables_of, with_factors
 from fg_calib.graph.solver import Solution, solve
@@ -271,7 +271,7 @@ def linearise_new_data(calibrated: Calibrated, at: Placed) -> Linear:
     if calibrated.information is not None:
         knowledge = calibrated.information.about(at.pinned)
         arm = np.zeros((len(every), knowledge.variables.n_columns))
-        arm[: v.n_columns] = columns_in(v, knowledge.variables, problem.start)
+        arm[: v.n_columns] = v.columns_of(knowledge.variables, problem.start)
         known, information = np.hstack([arm, every[:, pinned]]), knowledge.rows
     frames = [np.arange(v.n_columns)[f.columns] for f in v.frames]
     free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, len(every)), pinned)])
