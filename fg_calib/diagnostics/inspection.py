@@ -246,12 +246,11 @@ def _n_leaked(m: Measurements) -> int:
 def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
     """The readings of each joint in all tables."""
     q = problem.data.readings
-    outside = outside_limits(q, robot).sum(axis=0)
+    columns = zip(robot.joints, q.min(axis=0), q.max(axis=0), robot.limits, outside_limits(q, robot).T, strict=True)
     return tuple(
-        JointRange(joint.name, joint.unit, float(q[:, j].min()), float(q[:, j].max()),
-                   (float(robot.limits[j, 0]), float(robot.limits[j, 1])), int(outside[j]))
-        for j, joint in enumerate(robot.joints)
-    )  # fmt: skip
+        JointRange(joint.name, joint.unit, float(low), float(high), (float(limits[0]), float(limits[1])), int(n.sum()))
+        for joint, low, high, limits, n in columns
+    )
 
 
 def _check_rows(found: Inspection, job: Job) -> Iterator[Statement]:

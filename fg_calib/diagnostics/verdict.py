@@ -355,12 +355,12 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
     """Check whether estimated noise is small compared with the motions it was estimated from."""
-    problem, robot = case.problem, case.problem.robot
+    robot = case.problem.robot
     for fit in case.fit.goodness.kinds:
         if (fit.table, fit.kind) not in (case.solution.estimated_noise or ()) or fit.kind not in _WITH_MOTION:
             continue
-        typical = residuals_at(problem, case.solution.parameters, robot, fit.table)
-        motion = next((r.motion for r in typical if r.kind == fit.kind), 0.0)
+        typical = residuals_at(case.problem, case.solution.parameters, robot, fit.table)
+        motion = max((r.motion for r in typical if r.kind == fit.kind), default=0.0)
         still = 1e-3 * robot.reach if fit.unit == "m" else 0.0  # about a single anchor the tool point stays
         motion = motion if motion > still else robot.reach
         ratio = fit.factor * fit.stated_sigma_rms / motion
@@ -369,10 +369,9 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
             yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
 
 
-def check_tables(case: Case) -> Iterator[Statement]:
+def check_tables(case: Case) -> list[Statement]:
     """Check whether tables lack values that their model needs."""
-    for table in case.problem.data.tables:
-        yield from (Statement("note", text) for text in missing_values(table))
+    return [Statement("note", text) for table in case.problem.data.tables for text in missing_values(table)]
 
 
 CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
@@ -443,14 +442,12 @@ def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
     robot, found = solution.problem.robot, []
     advice = "; measure positions, or pairs between which more joints move" if solution.problem.pair_series else ""
     for other in solution.others:
-        apart = {p.name: abs(other[i] - solution.parameters[i]) / p.scale for i, p in enumerate(robot.parameters)}
-        named = sorted((n for n in apart if apart[n] > 0.3 * max(apart.values())), key=lambda n: -apart[n])[:most]
+        here, there = (at[solution.problem.variables.robot_span] - robot.nominal for at in (solution.parameters, other))
+        apart = np.abs(there - here) / [p.scale for p in robot.parameters]
         words = []
-        for i in map(robot.index, named):
-            p = robot.parameters[i]
-            factor, unit = (1e3, "mm") if p.unit == "m" else (180.0 / np.pi, "deg")
-            here, there = (factor * (at[i] - p.nominal) for at in (solution.parameters, other))
-            words.append(f"{p.name} {here:+.3g} or {there:+.3g} {unit}")
+        for i in [i for i in np.argsort(-apart, kind="stable")[:most].tolist() if apart[i] > 0.3 * apart.max()]:
+            factor, unit = (1e3, "mm") if robot.parameters[i].unit == "m" else (180.0 / np.pi, "deg")
+            words.append(f"{robot.parameters[i].name} {factor * here[i]:+.3g} or {factor * there[i]:+.3g} {unit}")
         text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
         found.append(Statement("error", text + advice))
     return found

@@ -76,34 +76,12 @@ class Confounding:
         names = [OTHERS.get(letter) or LANDMARKS[letter].description for letter in letters]
         one = letters in {("O",), ("X",)}
         verb = "takes it up" if one else "take it up together" if len(letters) > 1 else "take it up"
-        return f"{' and '.join(names)} {verb}{self._remedy(letters)}"
+        kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
+        remedy = f": to see it, give places of {kind.name}s (key {kind.key})" if kind is not None and kind.key else ""
+        return f"{' and '.join(names)} {verb}{remedy}"
 
     def _left(self, directions: Sequence[int], held: Collection[str] = ()) -> Floats:
         """Length of what landmarks do not explain of directions' rows, but for kinds that are held, shape (n,)."""
         columns = [c for letter, of in self._columns.items() if letter not in held for c in of]
-        return np.asarray(np.linalg.norm(self._rest(directions, columns), axis=0))
-
-    def _rest(self, directions: Sequence[int], columns: Sequence[Integers]) -> Floats:
-        """Rows of directions that landmarks with these columns do not explain, shape (m, n)."""
         A = np.column_stack([self._rows[:, list(directions)], *(self._A[:, c] for c in columns)])
-        return eliminate(A, np.zeros(len(A)), len(directions)).A
-
-    def _remedy(self, letters: tuple[str, ...]) -> str:
-        """How many places must be given to see every direction that the same landmarks hide, as well as all would."""
-        kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
-        if kind is None or not kind.key:
-            return ""
-        mine = [k for k, by in enumerate(self._by) if by == letters]
-        others = [c for letter, of in self._columns.items() if letter != kind.letter for c in of]
-        places = self._columns[kind.letter]
-
-        def seen(n: int) -> tuple[bool, int]:
-            """With n places given: whether each direction is seen, and how many of their combinations."""
-            left = self._rest(mine, others + places[n:]) / np.linalg.norm(self._rows[:, mine], axis=0)
-            alone = bool(np.all(np.linalg.norm(left, axis=0) > NOT_SEEN))
-            return alone, int(np.sum(np.linalg.svd(left, compute_uv=False) > NOT_SEEN))
-
-        best = seen(len(places))
-        n = next(n for n in range(1, len(places) + 1) if seen(n) == best)
-        which = f"the place of one {kind.name}" if n == 1 else f"the places of {n} {kind.name}s"
-        return f": to see it, give {which} (key {kind.key})" if best[0] else ""
+        return np.asarray(np.linalg.norm(eliminate(A, np.zeros(len(A)), len(directions)).A, axis=0))
