@@ -1,7 +1,7 @@
-"""A check of what public functions are given, by their own type hints.
+"""Checks of what public functions are given, by their own type hints, and the range of ordinary numbers.
 
-Only the package's classes, sequences of them, text and paths are compared. Numbers, arrays and words of a choice are
-checked where they are used (`arrays`, `options`).
+Only the package's classes, generators, executors, sequences of them, text and paths are compared. Numbers, arrays and
+words of a choice are checked where they are used (`arrays`, `options`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,14 @@ from fg_calib.errors import InputError, shown
 P = ParamSpec("P")
 R = TypeVar("R")
 
+LEAST_SIZE, MOST_SIZE = 1e-30, 1e15
+"""The smallest sigma and the largest number that are accepted: beyond them squares overflow."""
+
+ORDINARY = f"a number no larger than {MOST_SIZE:g}; sigmas and tolerances no less than {LEAST_SIZE:g}"
+"""What is expected, for messages."""
 
 EXAMPLES = {
+    "Generator": "numpy.random.default_rng(0)",
     "Job": "read_job('job.yaml')",
     "Measurements": "Measurements.from_arrays(...)",
     "Noise": "Noise(position=1e-3)",
@@ -32,6 +38,9 @@ EXAMPLES = {
     "Units": "Units(length='mm')",
 }
 """Where an object of a class comes from, for messages."""
+
+_COMPARED = ("fg_calib.", "concurrent.", "numpy.random.", "pathlib")
+"""Modules whose classes are compared; text and None are too."""
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -73,14 +82,15 @@ def as_hinted(place: str, value: Any, hint: Any) -> Any:
     Raises:
         InputError: The value does not fit.
     """
-    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    if any(_fits(value, kind) for kind in kinds) and not (isinstance(value, str) and not value and Path in kinds):
+    kinds = _alternatives(hint)
+    if _fits(value, hint) and not (Path in kinds and value == ""):
         return value
     if Path in kinds and isinstance(value, os.PathLike):
         return Path(os.fspath(value))
-    words = [_in_words(kind) for kind in kinds if kind is not NoneType and not (kind is str and Path in kinds)]
-    examples = [EXAMPLES[name] for kind in kinds if (name := getattr(kind, "__name__", "")) in EXAMPLES]
-    example = f", such as {examples[0]}" if examples else ""
+    words = [_describe(kind) for kind in kinds if kind is not NoneType and not (kind is str and Path in kinds)]
+    example = next(
+        (f", such as {EXAMPLES[n]}" for n in (getattr(k, "__name__", "") for k in kinds) if n in EXAMPLES), ""
+    )
     listed = " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
     raise InputError(place, f"found {shown(value)}", f"{listed}{example}")
 
@@ -98,24 +108,27 @@ def _hints(of: Any) -> dict[str, Any]:
             unknown[str(missing.name)] = Any
 
 
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
 def _fits(value: Any, hint: Any) -> bool:
     origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, one) for one in parts)
     if origin is Sequence or (origin is tuple and parts[1:] == (...,)):
-        kinds = get_args(parts[0]) if get_origin(parts[0]) in (Union, UnionType) else (parts[0],)
-        if str in kinds and Path not in kinds:  # names are checked where they are known
-            return True
-        return isinstance(value, list | tuple) and all(any(_fits(one, kind) for kind in kinds) for one in value)
+        names = str in _alternatives(parts[0]) and Path not in _alternatives(parts[0])  # checked where they are known
+        return names or (isinstance(value, list | tuple) and all(_fits(one, parts[0]) for one in value))
     if origin in (Mapping, dict):
         return isinstance(value, Mapping) and all(_fits(one, parts[1]) for one in value.values())
     if origin is Callable:
         return callable(value)
-    if not isinstance(hint, type) or origin is not None:
-        return True
-    ours = hint in (str, Path, NoneType) or hint.__module__.startswith(("fg_calib.", "concurrent."))
-    return not ours or isinstance(value, hint)
+    is_compared = isinstance(hint, type) and origin is None
+    is_compared = is_compared and (hint in (str, NoneType) or hint.__module__.startswith(_COMPARED))
+    return not is_compared or isinstance(value, hint)
 
 
-def _in_words(hint: Any) -> str:
+def _describe(hint: Any) -> str:
     words = {str: "text", Path: "a path", Mapping: "a mapping", dict: "a mapping", Callable: "a function"}
     kind = get_origin(hint) or hint
     if kind in (Sequence, tuple):

@@ -22,6 +22,7 @@ from fg_calib.job import Job
 from fg_calib.monitoring.prior_information import at_nominal
 from fg_calib.observability.identifiability import Identifiability, identifiability_of
 from fg_calib.observability.indices import Observability
+from fg_calib.parallel import one_blas_thread, single_threaded
 from fg_calib.prediction.tool_pose import ExpectedError, expected_error
 from fg_calib.robot.kinematics import without_rigid_motion
 from fg_calib.robot.model import Robot
@@ -34,7 +35,6 @@ from fg_calib.statistics.outliers import judge_without_outliers
 from fg_calib.statistics.priors import estimate_tolerances, judge_priors
 from fg_calib.statistics.residual_table import HeldOut, residual_table
 from fg_calib.statistics.variance_components import estimate_noise
-from fg_calib.threads import one_blas_thread, single_threaded
 
 
 @dataclass(frozen=True)

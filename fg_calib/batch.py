@@ -11,20 +11,20 @@ import io
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
-from fg_calib.executors import Failure, map_jobs
 from fg_calib.io.atomic import fill_folder, require_writable, write_text
 from fg_calib.io.job import read_job
-from fg_calib.io.saved import ResidualFile, require_no_input
+from fg_calib.io.saved import require_no_input
 from fg_calib.job import Job
+from fg_calib.parallel import Failure, map_jobs
 
 JOBS_FILES = {"jobs.json": b'{\n "schema": "fg-calib/jobs/', "jobs.csv": b"name,job,verdict,"}
 """The files that are written about many jobs together, and how each begins."""
@@ -60,40 +60,35 @@ class Order:
         job: The job's file.
         folder: Where the result is written; nowhere if None.
         folds: Number of folds instead of the job's; None for those.
-        report: Whether `report.html` is written too.
-        figures: Whether the page's figures are written as files too.
-        residuals: How single residuals are written.
+        saved: Arguments of `Calibration.save`.
     """
 
     name: str
     job: Path
     folder: Path | None
     folds: int | None = None
-    report: bool = False
-    figures: bool = False
-    residuals: ResidualFile = "csv"
+    saved: dict[str, Any] = field(default_factory=dict)
 
-    def read(self) -> Job:
-        """The job.
+    def carry_out(self, executor: Executor | None = None) -> Calibration:
+        """Read and calibrate the job, and write its result.
+
+        Args:
+            executor: Where folds are calibrated; in this process if None.
 
         Raises:
-            InputError: It cannot be read, or its result cannot be written.
+            CalibrationError: There is no result, or it cannot be written.
         """
         if self.folder is not None:
             require_writable(self.folder)
-        given = read_job(self.job)
+        job = read_job(self.job)
         if self.folder is not None:
-            require_no_input(self.folder, given.path, given.inputs)
-        return given if self.folds is None else replace(given, options=replace(given.options, folds=self.folds))
-
-    def save(self, calibration: Calibration) -> None:
-        """Write the files to the folder, if there is one.
-
-        Raises:
-            InputError: The folder cannot be written.
-        """
+            require_no_input(self.folder, job.path, job.inputs)
+        if self.folds is not None:
+            job = replace(job, options=replace(job.options, folds=self.folds))
+        found = calibrate_job(job, executor)
         if self.folder is not None:
-            calibration.save(self.folder, residuals=self.residuals, report=self.report, figures=self.figures)
+            found.save(self.folder, **self.saved)
+        return found
 
 
 @dataclass(frozen=True)
@@ -108,11 +103,11 @@ class JobSummary:
         error: Why there is none; None where there is one.
         findings: Why it is not to be trusted, a line each.
         not_accepted: Limits that are exceeded, a line each.
-        robot: The robot's name; None where the job failed, as all below.
-        n_configurations: Number of fitted configurations.
+        robot: The robot's name; None where the job failed.
+        n_configurations: Number of fitted configurations; None where the job failed.
         rms: Root mean square of residuals after the calibration by kind, of test rows if there are any, [m], [rad] or
             [px].
-        of_test: Whether they are of test rows.
+        rows: The rows that `rms` is of: `test`, `train`, or empty.
         units: Unit of each kind.
         reduced_chi2: Chi-square over degrees of freedom.
         seconds: Duration with reading and writing, [s].
@@ -126,36 +121,31 @@ class JobSummary:
     not_accepted: tuple[str, ...] = ()
     robot: str | None = None
     n_configurations: int | None = None
-    rms: dict[str, float] | None = None
-    of_test: bool | None = None
-    units: dict[str, str] | None = None
+    rms: dict[str, float] = field(default_factory=dict)
+    rows: str = ""
+    units: dict[str, str] = field(default_factory=dict)
     reduced_chi2: float | None = None
     seconds: float | None = None
 
     @property
-    def reasons(self) -> list[tuple[str, str]]:
-        """Why the job is not good: what kind of reason, and the reason."""
-        failed = [] if self.error is None else [("error", self.error)]
-        doubtful = [("not to be trusted", finding) for finding in self.findings]
-        return [*failed, *doubtful, *(("not accepted", reason) for reason in self.not_accepted)]
-
-    @property
-    def rows(self) -> str:
-        """The rows that `rms` is of: `test`, `train`, or empty."""
-        return {None: "", True: "test", False: "train"}[self.of_test]
+    def reasons(self) -> list[str]:
+        """Why the job is not good, a line each."""
+        failed = [] if self.error is None else [f"error: {self.error}"]
+        doubtful = [f"not to be trusted: {finding}" for finding in self.findings]
+        return [*failed, *doubtful, *(f"not accepted: {reason}" for reason in self.not_accepted)]
 
 
-def carry_out(order: Order) -> JobSummary:
-    """Calibrate and save one of many jobs, on a worker that can read and write the files.
+def summarise(order: Order) -> JobSummary:
+    """Carry out an order on a worker that can read and write the files.
 
     Raises:
         CalibrationError: There is no result, or it cannot be written.
     """
     clock = time.perf_counter()
-    found = calibrate_job(order.read())
-    order.save(found)
+    found = order.carry_out()
     result, not_accepted = found.result, found.not_accepted
-    rms = result.rms_after("test") or result.rms_after("train")
+    rows = "test" if result.rms_after("test") else "train"
+    rms = result.rms_after(rows)
     return JobSummary(
         name=order.name,
         job=str(order.job),
@@ -165,7 +155,7 @@ def carry_out(order: Order) -> JobSummary:
         robot=result.robot,
         n_configurations=result.n_configurations,
         rms=rms,
-        of_test=bool(result.rms_after("test")),
+        rows=rows,
         units={kind: result.unit_of(kind) for kind in rms},
         reduced_chi2=result.reduced_chi2,
         seconds=time.perf_counter() - clock,
@@ -179,7 +169,7 @@ def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) ->
         orders: The orders.
         executor: Where they run; one after the other in this process if None.
     """
-    found = map_jobs(carry_out, list(orders), executor, names=[order.name for order in orders])
+    found = map_jobs(summarise, list(orders), executor, names=[order.name for order in orders])
     return [
         JobSummary(order.name, str(order.job), "failed", one.reason) if isinstance(one, Failure) else one
         for order, one in zip(orders, found, strict=True)
@@ -220,18 +210,18 @@ def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None
     Raises:
         InputError: The folder cannot be written.
     """
-    units = {kind: unit for job in jobs for kind, unit in (job.units or {}).items()}
-    heads = ("name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds")
-    table = io.StringIO()
-    rows = csv.writer(table, lineterminator="\n")
-    rows.writerow([*heads, *(f"rms {kind} [{unit}]" for kind, unit in units.items()), "rows", "reason"])
+    heads = ["name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds"]
+    rms = {f"rms {kind} [{unit}]": kind for job in jobs for kind, unit in job.units.items()}
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*heads, *rms, "rows", "reason"])
     for job in jobs:
-        values = [getattr(job, head) for head in heads] + [(job.rms or {}).get(kind) for kind in units]
-        rows.writerow([*values, job.rows, "; ".join(why for _, why in job.reasons)])
+        values = [getattr(job, head) for head in heads] + [job.rms.get(kind) for kind in rms.values()]
+        table.writerow([*values, job.rows, "; ".join(job.reasons)])
 
     def write(into: Path) -> None:
         write_text(into / "jobs.json", json.dumps(jobs_document(jobs, seconds), indent=1, allow_nan=False) + "\n")
-        write_text(into / "jobs.csv", table.getvalue())
+        write_text(into / "jobs.csv", text.getvalue())
 
     fill_folder(folder, write, JOBS_FILES)
 
@@ -249,17 +239,11 @@ def job_names(jobs: Sequence[Path]) -> list[str]:
         InputError: Two have the same name nevertheless.
     """
     paths = [Path(os.path.abspath(path)) for path in jobs]
-    rules: tuple[Callable[[Path], str], ...] = (
-        lambda path: path.stem,
-        lambda path: path.parent.name,
-        lambda path: f"{path.parent.name}-{path.stem}",
-    )
-    names: list[str] = []
-    for rule in rules:
-        names = [rule(path) for path in paths]
-        lower = [name.casefold() for name in names]
-        if len({*lower, "", *JOBS_FILES}) == len(lower) + 1 + len(JOBS_FILES):
-            return names
+    stems, folders = [path.stem for path in paths], [path.parent.name for path in paths]
+    names = [f"{folder}-{stem}" for folder, stem in zip(folders, stems, strict=True)]
+    for rule in (stems, folders, names):
+        if len({*(name.casefold() for name in rule), "", *JOBS_FILES}) == len(rule) + 1 + len(JOBS_FILES):
+            return rule
     same = max(names, key=names.count)
     found = [escaped(str(path)) for path, name in zip(jobs, names, strict=True) if name == same]
     raise InputError("JOB", f"{', '.join(found[:3])} would be written to the folder {shown(same)}", "different names")

@@ -9,9 +9,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -27,7 +26,6 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Floats, as_floats, shape_of
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.errors import InputError, SolverError, shown
-from fg_calib.executors import tell
 from fg_calib.graph.knowledge import SIZE, Knowledge
 from fg_calib.graph.problem import tables_of
 from fg_calib.graph.solver import Solution
@@ -55,6 +53,7 @@ from fg_calib.monitoring.fingerprints import counted_before
 from fg_calib.monitoring.new_data import Calibrated, Rows
 from fg_calib.monitoring.update import predicted_before, updated
 from fg_calib.options import Options, check, check_flag, check_names, listed
+from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction.tool_pose import predict_poses
 from fg_calib.report.figures import Drawn
 from fg_calib.report.html import build_page, draw_figures
@@ -63,8 +62,6 @@ from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
 from fg_calib.statistics.cross_validation import cross_validate
 from fg_calib.statistics.estimates import FrameEstimate, ParameterEstimate
-from fg_calib.statistics.goodness_of_fit import KindFit
-from fg_calib.threads import single_threaded
 
 if TYPE_CHECKING:
     import polars as pl
@@ -99,12 +96,12 @@ def calibrate(
         SolverError: GTSAM could not solve a step at all.
     """
     options = Options.given(options, choices)
-    tables = []
-    for table in tables_of(measurements, options):
+    tables = tables_of(measurements, options)
+    for table in tables:
         check_readings(table.measurements.readings, robot, table.measurements.source)
-        first = _with_first_sigmas(table.measurements) if options.estimate_noise else table.measurements
-        tables.append(replace(table, measurements=first))
-    return calibrate_job(Job(None, robot, tuple(tables), options), executor)
+    if options.estimate_noise:
+        tables = tuple(replace(table, measurements=_with_first_sigmas(table.measurements)) for table in tables)
+    return calibrate_job(Job(None, robot, tables, options), executor)
 
 
 @checked
@@ -121,36 +118,28 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
         SolverError: GTSAM could not solve a step at all.
     """
     given = job if isinstance(job, Job) else read_job(job)
-    tell("calibrating")
-    with _estimable(given.options):
+    options = given.options
+    try:
+        tell("calibrating")
         solution = solve_job(given)
         tell("judging the result")
-        uncertainty = assess(solution)
-        if given.options.folds is not None:
-            folds = cross_validate(given, solve_job, given.options.folds, executor=executor)
-            uncertainty = uncertainty.with_folds(folds, solution)
-        return Calibration.of(solution, uncertainty, inputs=given.inputs, job=given.document)
-
-
-@contextmanager
-def _estimable(options: Options) -> Iterator[None]:
-    """Within, noise or tolerances that rows do not tell at all may be estimated beyond what figures hold: one line."""
-    try:
-        yield
+        assessment = assess(solution)
+        if options.folds is not None:
+            folds = cross_validate(given, solve_job, options.folds, executor=executor)
+            assessment = assessment.with_folds(folds, solution)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        given = {"noise": options.estimate_noise, "tolerance": options.estimate_tolerance is not None}
-        asked = " and ".join(name for name, is_estimated in given.items() if is_estimated)
-        if not asked:
+        if not options.estimate_noise and options.estimate_tolerance is None:
             raise
-        raise SolverError(f"{asked} cannot be estimated from these rows, which leave no error: state it") from error
+        found = "noise and tolerance cannot be estimated from these rows, which leave no error: specify them"
+        raise SolverError(found) from error
+    return Calibration.of(solution, assessment, inputs=given.inputs, job=given.document)
 
 
 def _with_first_sigmas(m: Measurements) -> Measurements:
     """Sigmas for what was measured without any, as the noise to be estimated starts from."""
     shape = (m.n_configurations, 3)
     first: dict[str, Any] = {}
-    for name in ("position", "orientation"):
-        measured = m.position if name == "position" else m.rotation
+    for name, measured in (("position", m.position), ("orientation", m.rotation)):
         if measured is not None and getattr(m, f"sigma_{name}") is None:
             first[f"sigma_{name}"] = np.full(shape, getattr(UNSTATED, name))
     if m.pairs is not None:
@@ -184,17 +173,12 @@ class PredictedPoses:
     @property
     def sigma_position(self) -> Floats:
         """1 sigma of the position along the axes, shape (n, 3), [m]."""
-        return self._sigma[:, :3]
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, :3])
 
     @property
     def sigma_rotation(self) -> Floats:
         """1 sigma of a turn about the axes, shape (n, 3), [rad]."""
-        return self._sigma[:, 3:]
-
-    @property
-    def _sigma(self) -> Floats:
-        sigma: Floats = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
-        return sigma
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, 3:])
 
     def __repr__(self) -> str:
         n = len(self.position)
@@ -352,13 +336,10 @@ class Calibration:
         """
         self._require_trust()
         new, _ = self._rows(rows, pairs, like)
-        between = all(table.model not in ("pose", "position", "orientation", "board") for table in new.tables)
-        stated = dict(
-            zip(("distance", "angle") if between else ("position", "orientation"), (limit, limit_angle), strict=True)
-        )
-        stated = {name: figure for name, figure in stated.items() if figure is not None}
-        limits = replace(self.result.options.accept, **stated)
-        return check_rows(self.calibrated, new, limits)
+        of_poses = any(table.model in ("pose", "position", "orientation", "board") for table in new.tables)
+        names = ("position", "orientation") if of_poses else ("distance", "angle")
+        given = {name: most for name, most in zip(names, (limit, limit_angle), strict=True) if most is not None}
+        return check_rows(self.calibrated, new, replace(self.result.options.accept, **given))
 
     @checked
     def update(
@@ -391,9 +372,8 @@ class Calibration:
         """
         self._require_trust()
         history = self.runs
-        new, before = _date(date), history[-1]
-        growth = {} if growth is None else growth
-        days = _days(before.date, new, needed=bool(growth))
+        growth = growth or {}
+        new, days = _date_and_days(date, history[-1].date, needed=bool(growth))
         table, inputs = self._rows(rows, pairs, like)
         counted = {mark for run in history for mark in run.rows}
         for one in table.tables:
@@ -469,8 +449,6 @@ class Calibration:
         """
         return self._assessed[1]
 
-    uncertainty = assessment
-
     @property
     def _assessed(self) -> tuple[Solution, Assessment]:
         if self.assessed is None:
@@ -504,11 +482,6 @@ class Calibration:
     def frame(self) -> FrameEstimate | None:
         """The measurement frame world_T_base; None where it was not estimated."""
         return self.result.frame_estimate
-
-    @property
-    def goodness(self) -> dict[str, KindFit]:
-        """Specified and observed noise, by kind."""
-        return self.result.goodness
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -549,19 +522,14 @@ class Calibration:
         Raises:
             InputError: There is no such frame, or there are several.
         """
-        v = self.posterior.variables
-        if v.n_robot_columns == v.n_columns:
+        known = [int(frame.symbol[2:-1]) for frame in self.posterior.variables.frames]
+        if not known or self.posterior.variables.n_robot_columns == self.posterior.variables.n_columns:
             raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
-        return self._table_of(number)
-
-    def _table_of(self, number: int | None) -> int:
-        """The table whose measurement frame is meant."""
-        there = [int(v.symbol[2:-1]) for v in self.posterior.variables.frames]
-        if number is None and len(there) == 1:
-            return there[0]
-        if not isinstance(number, Integral) or number not in there:
+        if number is None and len(known) == 1:
+            return known[0]
+        if not isinstance(number, Integral) or number not in known:
             found = "several measurement frames" if number is None else f"found {shown(number)}"
-            raise InputError("table", found, f"one of {', '.join(map(str, there))}: the table whose frame is meant")
+            raise InputError("table", found, f"one of {', '.join(map(str, known))}: the table whose frame is meant")
         return int(number)
 
     def __repr__(self) -> str:
@@ -652,34 +620,23 @@ def _knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
     return found
 
 
-def _date(given: str | None) -> str:
-    """A date as it is written; now if None.
+def _date_and_days(given: str | None, before: str, *, needed: bool) -> tuple[str, float]:
+    """A date as it is written, now if None, and the days to it from the date before.
 
     Raises:
-        InputError: It is none.
+        InputError: It is no date or before the other, or the other is not known although it is needed.
     """
-    if given is None:
-        return datetime.now(UTC).isoformat(timespec="seconds")
     try:
-        return datetime.fromisoformat(given).isoformat()
+        date = datetime.now(UTC) if given is None else datetime.fromisoformat(given)
     except ValueError:
         raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
-
-
-def _days(before: str, now: str, *, needed: bool) -> float:
-    """Days from one date to another; 0 where the second has no time zone, and may be of the same day.
-
-    Raises:
-        InputError: The first is not known although it is needed, or after the other.
-    """
+    text = date.isoformat(timespec="seconds") if given is None else date.isoformat()
     if not before:
         if needed:
             raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
-        return 0.0
-    dates = [datetime.fromisoformat(date) for date in (before, now)]
-    first, second = (d if d.tzinfo else d.replace(tzinfo=UTC) for d in dates)
+        return text, 0.0
+    first, second = (d if d.tzinfo else d.replace(tzinfo=UTC) for d in (datetime.fromisoformat(before), date))
     days = (second - first).total_seconds() / 86400.0
-    same_day = dates[1].tzinfo is None and days > -1.0
-    if days < 0.0 and not same_day:
-        raise InputError("date", f"{now} is before the calibration, {before}", "a later one")
-    return max(days, 0.0)
+    if days < 0.0 and (date.tzinfo or days <= -1.0):  # a date without a time zone may be of the same day
+        raise InputError("date", f"{text} is before the calibration, {before}", "a later one")
+    return text, max(days, 0.0)

@@ -9,9 +9,8 @@ from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from fg_calib.arguments import as_hinted
+from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY, as_hinted
 from fg_calib.errors import InputError, shown
-from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 MODELS: dict[str, str] = {
     "pose": "pose",

@@ -21,6 +21,7 @@ from fg_calib.io.atomic import fill_folder, require_own, require_writable, write
 from fg_calib.io.units import Units
 from fg_calib.measurements.checks import check_readings
 from fg_calib.options import check_number
+from fg_calib.parallel import single_threaded
 from fg_calib.prediction.correction import Correction, correct_targets
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty
 from fg_calib.prediction.workspace import PredictedErrors, predict_errors
@@ -28,7 +29,6 @@ from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import error_slices
 from fg_calib.report.predict import prediction_document, write_prediction_table
 from fg_calib.robot.model import Robot
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 

@@ -1,10 +1,8 @@
-"""Sizes of figures beyond which they are mistakes, whatever their unit: they drown others, or overflow when squared."""
+"""Former name of `arguments`."""
 
-LEAST_SIZE, MOST_SIZE = 1e-30, 1e15
-"""The least that a sigma or tolerance may be, and the most that any figure may."""
+from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
 
-ORDINARY = f"a number no larger than {MOST_SIZE:g}; sigmas and tolerances no less than {LEAST_SIZE:g}"
-"""What is expected, for messages."""
+__all__ = ["LEAST_SIZE", "MOST_DRAWN", "MOST_JOINTS", "MOST_PAIRS", "MOST_SIZE", "ORDINARY"]
 
 MOST_JOINTS = 200
 """Moving joints of a robot: the work grows with their third power."""

@@ -5,7 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from fg_calib import Robot, read_urdf
+from fg_calib import Robot
+from fg_calib.io import read_urdf
 
 UR10 = [
     [0, np.pi / 2, 0.1273, 0, 0],

@@ -4,7 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
-from fg_calib import Camera, Pairing
+from fg_calib import Pairing
+from fg_calib.measurements import Camera
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.scenario import (
     BoardCamera,

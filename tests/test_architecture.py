@@ -18,13 +18,14 @@ PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
     "_lazy",
     "errors",
-    "libraries",
     "arguments",
     "sizes",
-    "threads",
-    "arrays",
     "options",
+    "parallel",
+    "libraries",
+    "threads",
     "executors",
+    "arrays",
     "robot",
     "initialization",
     "measurements",
@@ -43,7 +44,6 @@ FOLDERS = (
     "importers",
     "report",
     "calibration",
-    "predictions",
     "predictions",
     "batch",
     "exports",
@@ -159,8 +159,7 @@ def test_no_input_can_run_code_or_reach_a_network(name, path):
             for alias in node.names}  # fmt: skip
     used |= {(node.module or "").partition(".")[0] for node in nodes(path) if isinstance(node, ast.ImportFrom)}
     forbidden = {"pickle", "marshal", "shelve", "subprocess", "urllib", "http", "requests", "ctypes", "multiprocessing"}
-    allowed = {"io/parquet": {"subprocess"}, "executors": {"multiprocessing"}}
-    # the latter two start this Python alone
+    allowed = {"parallel": {"multiprocessing"}}
     assert used & forbidden == allowed.get(name, set())
 
 
@@ -230,7 +229,7 @@ def test_all_that_is_imported_is_installed_with_the_package():
                 used.setdefault(module.partition(".")[0], set()).add(name)
     extras = {"camera": ("opencv-python-headless", "cv2", "importers/opencv"),
               "ros": ("rosbags", "rosbags", "importers/bag"),
-              "distributed": ("distributed", "distributed", "executors")}  # fmt: skip
+              "distributed": ("distributed", "distributed", "parallel")}  # fmt: skip
     for extra, (distribution, module, name) in extras.items():
         assert [re.match(r"[\w-]+", line)[0] for line in project["optional-dependencies"][extra]] == [distribution]
         assert used.pop(module) == {name}

@@ -7,6 +7,7 @@ import pytest
 
 from fg_calib import InputError, Options, Robot
 from fg_calib.arguments import as_hinted, checked
+from fg_calib.robot import solve_inverse
 
 
 @checked
@@ -42,3 +43,8 @@ def test_a_wrong_call_fails_in_pythons_own_words():
 
 def test_numbers_and_words_are_checked_where_they_are_used():
     assert as_hinted("x", "text", float) == "text"
+
+
+def test_a_generator_that_is_none_is_one_line():
+    with pytest.raises(InputError, match=r"generator: found 3, expected a Generator, such as numpy.random.default_rng"):
+        solve_inverse(Robot.from_dh([[0.1, 0, 0.2, 0]]), [[0.1, 0.0, 0.2]], generator=3)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from deadly import die_once, work
 
-from fg_calib import CalibrationError, InputError, ProblemError, calibrate_jobs
+from fg_calib import InputError, ProblemError, calibrate_jobs
 from fg_calib.batch import Order, calibrate_into, exit_code, job_names
-from fg_calib.executors import DIED, Failure, dask_executor, listener, local_processes, map_jobs
+from fg_calib.parallel import DIED, Failure, dask_executor, listener, local_processes, map_jobs
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
 
@@ -23,14 +23,6 @@ def test_a_job_that_fails_does_not_affect_the_others(executor):
     assert (found[3].job, found[3].reason) == ("job 4", "KeyError: 'of\\nmine'")
     assert "deadly.py" in found[3].trace
     assert found[4] == Failure("job 5", "there is not enough memory for it")
-
-
-def test_a_failure_can_be_raised_with_its_trace():
-    refused, bug = (one.error() for one in map_jobs(work, ["refused", "a bug"], names=["arm 1", "arm 2"]))
-    assert isinstance(refused, CalibrationError)
-    assert str(refused) == "arm 1: job.yaml: found nonsense, expected sense; look at it"
-    assert isinstance(bug, RuntimeError)
-    assert "KeyError" in bug.__notes__[0]
 
 
 def test_progress_is_reported_to_the_listener():
@@ -60,7 +52,6 @@ def test_an_executor_that_refuses_a_job_fails_that_job_alone():
     ("arguments", "message"),
     [
         ({"jobs": 3}, "jobs: found 3, expected a list of them"),
-        ({"jobs": [1], "names": ["a", "b"]}, "names: found 2, expected 1, one for each job"),
         ({"jobs": [1], "executor": 4}, "executor: found 4, expected an Executor"),
     ],
 )
@@ -118,7 +109,7 @@ def test_many_jobs_are_the_same_here_on_local_processes_and_on_dask(example):
 
 
 def test_no_scheduler_is_one_line(monkeypatch):
-    monkeypatch.setattr("fg_calib.executors.SCHEDULER_TIMEOUT_S", 0.1)
+    monkeypatch.setattr("fg_calib.parallel.SCHEDULER_TIMEOUT_S", 0.1)
     with pytest.raises(InputError, match=r"scheduler nowhere: .*, expected a Dask scheduler, such as"):
         dask_executor("nowhere").__enter__()
 

@@ -10,21 +10,20 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from threading import Barrier
 
-import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from fg_calib.io.job import read_job
-from fg_calib.robot.kinematics import SPAN
-from fg_calib.threads import THREADS, one_blas_thread, single_threaded
+from fg_calib.parallel import THREADS, one_blas_thread, single_threaded
 
 EVERYTHING = """
 import os, sys
 if sys.argv[2] == "1" and hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-import dataclasses, json
-import numpy as np
+import json
 import fg_calib as fg
+from fg_calib.graph import problem_of
+from fg_calib.observability import cramer_rao
+from fg_calib.report import comparison_document, observability_document
 
 def hexadecimal(found):
     if isinstance(found, dict):
@@ -34,49 +33,20 @@ def hexadecimal(found):
     return found.hex() if isinstance(found, float) else found
 
 job = fg.read_job(sys.argv[1])
-m = job.measurements
-many = dataclasses.replace(job, measurements=dataclasses.replace(m, test=np.zeros(len(m.ids), dtype=bool)))
 found = {}
 for name, change in {
     "star": {"pairing": fg.Pairing("star")},
-    "all": {"pairing": fg.Pairing("all")},
     "random, kept": {"pairing": fg.Pairing("random", 400), "gauge": "keep"},
     "poses": {"model": "pose", "frame": "unknown", "encoder": "estimated"},
-    "readings of pairs": {"encoder": "estimated"},
     "independent": {"pair_errors": "independent", "pairing": fg.Pairing("all")},
-    "independent, of many": {"pair_errors": "independent", "pairing": fg.Pairing("all")},
-    **{loss: {"loss": loss} for loss in ("huber", "cauchy", "geman-mcclure", "gnc")},
+    **{loss: {"loss": loss} for loss in ("huber", "gnc")},
 }.items():
-    solution = fg.solve(fg.problem_of(many if "many" in name else job, **change))
+    solution = fg.solve(problem_of(job, **change))
     found[name] = fg.Calibration.of(solution, fg.assess(solution)).result.document()
-half, given = len(m.ids) // 2, {"sigma_joint": 1e-4}
-points = fg.Measurements.from_arrays(m.readings[:60], group=[f"g{i % 6}" for i in range(60)], sigma_point=1.0, **given)
-first = {"position": m.position[:half], "sigma_position": 1e-3}
-last = {"position": m.position[half:], "quaternion": np.tile([0, 0, 0, 1.0], (len(m.ids) - half, 1))}
-tables = [
-    fg.Table(fg.Measurements.from_arrays(m.readings[:half], **first, **given), "position", frame="unknown"),
-    fg.Table(
-        fg.Measurements.from_arrays(m.readings[half:], sigma_position=1e-3, sigma_orientation=9.0, **last, **given),
-        "distance-rotation",
-    ),
-]
-for name, given in {"touches": fg.Table(points, "distance"), "several tables": tables}.items():
-    found[name] = fg.calibrate(job.robot, given).result.document()
-noise = fg.estimate_noise(fg.problem_of(job, pairing=fg.Pairing("chain")))
-found["noise"] = [noise.cost, *noise.parameters.tolist()]
-all_pairs = {"model": job.options.model, "pairing": fg.Pairing("all")}
-found["compare"] = fg.comparison_document(fg.compare(job))
-bound = fg.cramer_rao(job.robot, job.measurements, **all_pairs)
-found["bound"] = [bound.covariance.tolist(), bound.position(job.measurements.readings, fitted=True)]
-plain = fg.fit_least_squares(job.robot, job.measurements, weighted=True, **all_pairs)
-found["plain"] = [plain.robot.nominal.tolist(), plain.covariance.tolist()]
-for name, seen in {
-    "structural": fg.observe_structure(job.robot, job.options.model),
-    "practical": fg.observe_configurations(job.robot, job.measurements, job.options.model, pairing=fg.Pairing("all")),
-}.items():
-    found[name] = fg.observability_document(seen)
-simulated = fg.simulate(fg.read_scenario("space-robot"), 3)
-found["simulation"] = [simulated.measurements.readings.tolist(), simulated.measurements.position.tolist()]
+bound = cramer_rao(job.robot, job.measurements, model=job.options.model, pairing=fg.Pairing("all"))
+found["bound"] = bound.covariance.tolist()
+found["compare"] = comparison_document(fg.compare(job))
+found["structural"] = observability_document(fg.observe_structure(job.robot, job.options.model))
 print(json.dumps(hexadecimal(found)))
 """
 
@@ -96,39 +66,15 @@ def everything(job, threads, processors, seed="0"):
 
 @pytest.mark.long
 def test_every_bit_is_the_same_on_one_thread_and_on_several(whole_example):
-    """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads.
-
-    All pairs of 162 poses, where they count as independent, are more than one task of the pool.
-    """
+    """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads."""
     job, table = whole_example / "calibration.yaml", whole_example / "poses.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:163]))
     job.write_text(re.sub("joint: [0-9.]+", "joint: 0.005", job.read_text()))
-    m = read_job(job).measurements
-    assert np.all(m.sigma_joint > 0.0)
-    assert (~m.test).sum() == 52
-    assert len(m.ids) * (len(m.ids) - 1) // 2 > SPAN
     one = everything(job, "1", "1")
-    assert len(one) > 15
+    assert len(one) == 9
     for other in (("2", "all", "1"), ("7", "all", "random")):  # more threads, other hashes
         found = everything(job, *other)
         assert {name for name in one if one[name] != found[name]} == set(), other
-
-
-@pytest.mark.slow
-def test_every_byte_of_the_files_is_the_same_again(example):
-    """But for the seconds that the solver took, and when it was."""
-    written = []
-    for threads, seed in (("1", "0"), ("4", "1"), ("2", "random")):
-        limits = {f"{library}_NUM_THREADS": threads for library in LIMITS}
-        limits |= {"POLARS_MAX_THREADS": threads, "PYTHONHASHSEED": seed}
-        command = [sys.executable, "-m", "fg_calib.cli", "calibrate", "calibration.yaml", "--out", f"out{len(written)}"]
-        subprocess.run(command, cwd=example, check=True, capture_output=True, env=os.environ | limits)
-        files = {file.name: file.read_bytes() for file in (example / command[-1]).iterdir()}
-        files["result.json"] = re.sub(rb'"seconds": [0-9.e-]+', b'"seconds": 0', files["result.json"])
-        files["result.json"] = re.sub(rb'"date": "[^"]*"', b'"date": ""', files["result.json"])
-        written.append(files)
-    assert len(written[0]) == 4
-    assert written[0] == written[1] == written[2]
 
 
 def blas_threads():

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from fg_calib.cli.output import BaseLink, Json, TipLink, say, show_json, show_report
+from fg_calib.cli.output import BaseLink, Json, TipLink, argument, names_in, option, say, show_result
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -15,38 +13,26 @@ if TYPE_CHECKING:
     from fg_calib.importers.recording import JointStream, PoseStream
     from fg_calib.importers.standstill import Stops
 
-_Bag = Annotated[Path, typer.Argument(metavar="BAG", help="A ROS bag: .bag, .db3, .mcap, or a folder of ROS 2.")]
-_Robot = Annotated[Path, typer.Option("--robot", metavar="ROBOT", help="The robot: robot.yaml or a URDF.")]
-_Joints = Annotated[str | None, typer.Option("--joints", metavar="TOPIC", help="Topic of joint states.")]
-_Pose = Annotated[str | None, typer.Option("--pose", metavar="TOPIC", help="Topic of the tool's measured poses.")]
-_Out = Annotated[Path | None, typer.Option("--out", metavar="CSV", help="Write the table of poses there.")]
-_Still = Annotated[float, typer.Option("--still", help="How long the arm stands still at least, in s.")]
-_Offset = Annotated[
-    float | None,
-    typer.Option("--offset", help="Stamp of a pose less that of the joints at the same moment, in s; 0: as stamped."),
-]
-_MostOffset = Annotated[
-    float | None, typer.Option("--most-offset", help="Refuse the bag where the estimated offset is larger, in s.")
-]
-_Names = Annotated[
-    str, typer.Option("--names", metavar="NAMES", help="The bag's names of the robot's joints: shoulder,elbow,wrist.")
-]
-_Parent = Annotated[str | None, typer.Option("--parent", metavar="FRAME", help="Frame in which poses are measured.")]
-_Child = Annotated[str | None, typer.Option("--child", metavar="FRAME", help="Frame on the tool that is measured.")]
-
 
 def bag(
-    recording: _Bag,
-    robot: _Robot,
-    joints: _Joints = None,
-    pose: _Pose = None,
-    out: _Out = None,
-    still: _Still = 1.0,
-    offset: _Offset = None,
-    most_offset: _MostOffset = None,
-    names: _Names = "",
-    parent: _Parent = None,
-    child: _Child = None,
+    recording: Annotated[Path, argument("BAG", "A ROS bag: .bag, .db3, .mcap, or a folder of ROS 2.")],
+    robot: Annotated[Path, option("--robot", "ROBOT", "The robot: robot.yaml or a URDF.")],
+    joints: Annotated[str | None, option("--joints", "TOPIC", "Topic of joint states.")] = None,
+    pose: Annotated[str | None, option("--pose", "TOPIC", "Topic of the tool's measured poses.")] = None,
+    out: Annotated[Path | None, option("--out", "CSV", "Write the table of poses there.")] = None,
+    still: Annotated[float, option("--still", None, "How long the arm stands still at least, in s.")] = 1.0,
+    offset: Annotated[
+        float | None,
+        option("--offset", None, "Stamp of a pose minus that of the joints at the same moment, in s; 0: as stamped."),
+    ] = None,
+    most_offset: Annotated[
+        float | None, option("--most-offset", None, "Refuse the bag where the estimated offset is larger, in s.")
+    ] = None,
+    names: Annotated[
+        str, option("--names", "NAMES", "The bag's names of the robot's joints: shoulder,elbow,wrist.")
+    ] = "",
+    parent: Annotated[str | None, option("--parent", "FRAME", "Frame in which poses are measured.")] = None,
+    child: Annotated[str | None, option("--child", "FRAME", "Frame on the tool that is measured.")] = None,
     base_link: BaseLink = None,
     tip_link: TipLink = None,
     as_json: Json = False,
@@ -60,20 +46,15 @@ def bag(
     if out is not None:
         require_own_csv(out, TABLE_BEGINNING)
     arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
-    called = [name.strip() for name in names.split(",") if name.strip()]
-    of_joints, of_pose = read_bag(recording, arm, joints=joints, pose=pose, parent=parent, child=child, names=called)
+    topics = {"joints": joints, "pose": pose, "parent": parent, "child": child}
+    of_joints, of_pose = read_bag(recording, arm, **topics, names=names_in(names))
     stops = average_stops(of_joints, of_pose, arm, still=still, offset=offset, most_offset=most_offset)
     if out is not None:
         write_stops(out, stops, arm)
-    if as_json:
-        show_json(_document(recording.name, of_joints, of_pose, stops))
-    else:
-        show_report(_report(recording.name, of_joints, of_pose, stops))
-    say(
-        "nothing is written: --out poses.csv writes the table"
-        if out is None
-        else f"wrote {len(stops.ids)} poses to {out}"
-    )
+    found = (recording.name, of_joints, of_pose, stops)
+    show_result(as_json, lambda: _document(*found), lambda: _report(*found))
+    nothing = "nothing is written: --out poses.csv writes the table"
+    say(nothing if out is None else f"wrote {len(stops.ids)} poses to {out}")
 
 
 def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> dict[str, Any]:

@@ -8,38 +8,28 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, end, say, show_json, show_report
-from fg_calib.options import AngleUnit, LengthUnit
+from fg_calib.cli.output import Angle, Json, Length, argument, end, option, say, show_result
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from fg_calib.importers.board_tables import BoardTables
 
-_Images = Annotated[
-    list[Path], typer.Argument(metavar="IMAGES...", help="Images, a folder of them, or a pattern in quotes.")
-]
-_Board = Annotated[Path, typer.Option("--board", metavar="BOARD", help="The board, such as charuco.yaml.")]
-_Out = Annotated[Path, typer.Option("--out", metavar="DIR", help="Write board.csv, pixels.csv and camera.yaml there.")]
-_Camera = Annotated[Path | None, typer.Option("--camera", metavar="CAMERA", help="The camera, such as camera.yaml.")]
-_Estimate = Annotated[bool, typer.Option("--estimate-camera", help="Estimate the camera from the same images.")]
-_Configurations = Annotated[
-    Path | None,
-    typer.Option("--configurations", metavar="TABLE", help="Joint readings; id is an image's name without its ending."),
-]
-_Length = Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in the tables, readings included.")]
-_Angle = Annotated[AngleUnit, typer.Option("--angle", help="Unit of angles in the tables, readings included.")]
-
 
 def board(
-    images: _Images,
-    board: _Board,
-    out: _Out,
-    camera: _Camera = None,
-    estimate_camera: _Estimate = False,
-    configurations: _Configurations = None,
-    length: _Length = "m",
-    angle: _Angle = "rad",
+    images: Annotated[list[Path], argument("IMAGES...", "Images, a folder of them, or a pattern in quotes.")],
+    board: Annotated[Path, option("--board", "BOARD", "The board, such as charuco.yaml.")],
+    out: Annotated[Path, option("--out", "DIR", "Write board.csv, pixels.csv and camera.yaml there.")],
+    camera: Annotated[Path | None, option("--camera", "CAMERA", "The camera, such as camera.yaml.")] = None,
+    estimate_camera: Annotated[
+        bool, option("--estimate-camera", None, "Estimate the camera from the same images.")
+    ] = False,
+    configurations: Annotated[
+        Path | None,
+        option("--configurations", "TABLE", "Joint readings; id is an image's name without its ending."),
+    ] = None,
+    length: Length = "m",
+    angle: Angle = "rad",
     as_json: Json = False,
 ) -> None:
     """Make tables of images of a board: its corners, and its poses with their covariances."""
@@ -76,10 +66,7 @@ def board(
         camera_file=None if camera is None else read_bytes(camera),
     )
     names = write_board_tables(out, tables)
-    if as_json:
-        show_json(tables.document())
-    else:
-        show_report(_report(tables))
+    show_result(as_json, tables.document, lambda: _report(tables))
     say(f"wrote {', '.join(names)} to {out}")
     end(tables.fit.findings)
 

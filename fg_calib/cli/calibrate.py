@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, Scheduler, Workers, end, executor_for, say, show_json, show_report
+from fg_calib.cli.output import Json, argument, end, option, say, show_result
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -22,72 +23,66 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    jobs: Annotated[
-        list[Path],
-        typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml; or many."),
-    ],
+    jobs: Annotated[list[Path], argument("JOB", "The job, such as calibration.yaml; or many.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            readable=False,
-            help="Write result.json, the calibrated robot and all residuals there; of many jobs to a folder each.",
-        ),
+        option("--out", "DIR", "Write result.json, the calibrated robot and tables there; of many, folders."),
     ] = None,
     folds: Annotated[
-        int | None, typer.Option("--folds", min=2, help="Hold every configuration out once, in so many folds.")
+        int | None, option("--folds", None, "Hold every configuration out once, in so many folds.", min=2)
     ] = None,
-    report: Annotated[
-        bool, typer.Option("--report", help="Write report.html there too: one page to look at and to pass on.")
-    ] = False,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Write the page's figures there too, as SVG files.")
-    ] = False,
+    report: Annotated[bool, option("--report", None, "Write report.html there too: one page to pass on.")] = False,
+    figures: Annotated[bool, option("--figures", None, "Write the page's figures there too, as SVG files.")] = False,
     residuals: Annotated[
         Literal["csv", "parquet", "none"],
-        typer.Option("--residuals", help="How single residuals are written: of millions of rows a CSV is large."),
+        option("--residuals", None, "How single residuals are written: of millions of rows a CSV is large."),
     ] = "csv",
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    workers: Annotated[int | None, option("--workers", "N", "Run jobs or folds on so many processes.", min=1)] = None,
+    scheduler: Annotated[
+        str | None, option("--scheduler", "ADDRESS", "Run them on a Dask cluster: tcp://host:8786.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
     from fg_calib.batch import Order, job_names
-    from fg_calib.calibration import calibrate_job
     from fg_calib.io.atomic import require_writable
 
     if out is None and (report or figures):
-        raise typer.BadParameter(
-            "needs --out, the folder to write to", param_hint="--report" if report else "--figures"
-        )
+        hint = "--report" if report else "--figures"
+        raise typer.BadParameter("needs --out, the folder to write to", param_hint=hint)
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
     several = len(jobs) > 1
     names = job_names(jobs) if several else [""]
     if out is not None and several:
         require_writable(out)
     if scheduler is not None:  # its workers run elsewhere
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
+    saved = {"report": report, "figures": figures, "residuals": residuals}
     orders = [
-        Order(name, job, None if out is None else out / name, folds, report, figures, residuals)
+        Order(name, job, None if out is None else out / name, folds, saved)
         for name, job in zip(names, jobs, strict=True)
     ]
-    with executor_for(workers, scheduler) as executor:
+    with _executor(workers, scheduler) as executor:
         if several:
             _calibrate_many(orders, out, executor, as_json)
         else:
-            found = calibrate_job(orders[0].read(), executor)
-            orders[0].save(found)
-            show_calibration(found, as_json)
+            show_calibration(orders[0].carry_out(executor), as_json)
+
+
+def _executor(workers: int | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
+    if workers is None and scheduler is None:
+        return nullcontext()
+    from fg_calib.parallel import dask_executor, local_processes
+
+    return dask_executor(scheduler) if scheduler else local_processes(workers or 1)
 
 
 def show_calibration(found: Calibration, as_json: bool) -> None:
     """Print a calibration, and end with 3 where it is not to be trusted or not accepted."""
     from fg_calib.report.text import build_report
 
-    if as_json:
-        show_json(found.result.document())
-    else:
-        show_report(build_report(found))
+    show_result(as_json, found.result.document, lambda: build_report(found))
     end(found.findings, not_accepted=found.not_accepted)
 
 
@@ -99,13 +94,10 @@ def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executo
     seconds = time.perf_counter() - clock
     if out is not None:
         write_jobs(out, found, seconds)
-    if as_json:
-        show_json(jobs_document(found, seconds))
-    else:
-        show_report(_jobs_table(found, seconds))
+    show_result(as_json, lambda: jobs_document(found, seconds), lambda: _jobs_table(found, seconds))
     for job in found:
-        for what, reason in job.reasons:
-            say(f"{job.name}: {what}: {reason}")
+        for reason in job.reasons:
+            say(f"{job.name}: {reason}")
     if code := exit_code(found):
         raise typer.Exit(code)
 
@@ -116,17 +108,13 @@ def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
 
     from fg_calib.report.tables import SHOWN, figure, in_order, line, table_of
 
-    units = {kind: unit for job in jobs for kind, unit in (job.units or {}).items()}
+    units = {kind: unit for job in jobs for kind, unit in job.units.items()}
     kinds, rows = in_order(units), []
     for job in jobs:
-        values = [figure((job.rms or {}).get(kind), units[kind], none="") for kind in kinds]
-        chi2 = "" if job.reduced_chi2 is None else f"{job.reduced_chi2:.3g}"
-        more = f" (and {len(job.reasons) - 1} more)" if len(job.reasons) > 1 else ""
-        reason = job.reasons[0][1] + more if job.reasons else ""
-        took = "" if job.seconds is None else f"{job.seconds:.1f}"
-        rows.append((job.name, job.verdict, job.rows, *values, chi2, took, reason))
+        values = [figure(job.rms.get(kind), units[kind], none="") for kind in kinds]
+        chi2, took = ("" if value is None else f"{value:.3g}" for value in (job.reduced_chi2, job.seconds))
+        rows.append((job.name, job.verdict, job.rows, *values, chi2, took, "; ".join(job.reasons[:1])))
     headings = ("job", "verdict", "rows", *(f"{kind} {SHOWN[units[kind]][1]}" for kind in kinds))
     table = table_of((*headings, "chi2/dof", "s", "reason"), rows, left=f"lll{'r' * (len(kinds) + 2)}l", wrap=True)
-    verdicts = Counter(job.verdict for job in jobs)
-    counts = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())
     return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))

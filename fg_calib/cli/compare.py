@@ -5,24 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from fg_calib.cli.output import Json, end, show_json, show_report
+from fg_calib.cli.output import Json, argument, end, option, show_result
 
 
 def compare(
-    job: Annotated[
-        Path,
-        typer.Argument(
-            metavar="JOB|OLD", readable=False, help="The job, such as calibration.yaml; or an older result."
-        ),
-    ],
-    new: Annotated[
-        Path | None, typer.Argument(metavar="[NEW]", readable=False, help="A newer result, to compare with the older.")
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="DIR", readable=False, help="Write comparison.json there.")
-    ] = None,
+    job: Annotated[Path, argument("JOB|OLD", "The job, such as calibration.yaml; or an older result.")],
+    new: Annotated[Path | None, argument("[NEW]", "A newer result, to compare with the older.")] = None,
+    out: Annotated[Path | None, option("--out", "DIR", "Write comparison.json there.")] = None,
     as_json: Json = False,
 ) -> None:
     """Compare the factor graph with plain least squares on the same job, or a new result with an old one."""
@@ -32,17 +21,13 @@ def compare(
     from fg_calib.report import compare as report
 
     if new is not None:
-        old_and_new = read_result(job), read_result(new)
-        if as_json:
-            show_json(report.changes_document(*old_and_new, (job, new)))
-        else:
-            show_report(report.build_changes_report(*old_and_new, (job, new)))
+        both, files = (read_result(job), read_result(new)), (job, new)
+        show_result(
+            as_json, lambda: report.changes_document(*both, files), lambda: report.build_changes_report(*both, files)
+        )
         return
     found = comparison.compare(read_job(job))
     if out is not None:
         report.write_comparison(out, found)
-    if as_json:
-        show_json(report.comparison_document(found))
-    else:
-        show_report(report.build_comparison_report(found))
+    show_result(as_json, lambda: report.comparison_document(found), lambda: report.build_comparison_report(found))
     end(found.findings)

@@ -5,32 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from fg_calib.cli.output import Json, ResultFolder, end, say, show_json, show_report
-from fg_calib.options import AngleUnit, LengthUnit
-
-_Targets = Annotated[
-    Path, typer.Argument(metavar="TARGETS", readable=False, help="Where the tool is to be: x y z, orientation, q1 ...")
-]
-_Out = Annotated[Path | None, typer.Option("--out", metavar="CSV", help="Write the table of commands there.")]
-_Length = Annotated[LengthUnit, typer.Option("--length", help="Unit of lengths in both tables.")]
-_Angle = Annotated[AngleUnit, typer.Option("--angle", help="Unit of angles in both tables, joint values included.")]
-_World = Annotated[
-    bool,
-    typer.Option("--world", help="The targets are in the measurement frame, not from the base."),
-]
-_Table = Annotated[int | None, typer.Option("--table", help="Number of the table whose frame that is, from 0.")]
+from fg_calib.cli.output import Angle, Json, Length, ResultFolder, argument, end, option, say, show_result
 
 
 def correct(
     result: ResultFolder,
-    targets: _Targets,
-    out: _Out = None,
-    length: _Length = "m",
-    angle: _Angle = "rad",
-    world: _World = False,
-    table: _Table = None,
+    targets: Annotated[Path, argument("TARGETS", "Where the tool is to be: x y z, orientation, q1 ...")],
+    out: Annotated[Path | None, option("--out", "CSV", "Write the table of commands there.")] = None,
+    length: Length = "m",
+    angle: Angle = "rad",
+    world: Annotated[
+        bool, option("--world", None, "The targets are in the measurement frame, not from the base.")
+    ] = False,
+    table: Annotated[int | None, option("--table", None, "Number of the table whose frame that is, from 0.")] = None,
     as_json: Json = False,
 ) -> None:
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
@@ -38,12 +25,7 @@ def correct(
     from fg_calib.io.tables import read_targets
     from fg_calib.io.units import Units
     from fg_calib.predictions import correct as correct_targets
-    from fg_calib.report.predict import (
-        build_correction_report,
-        correction_document,
-        require_commands,
-        write_commands,
-    )
+    from fg_calib.report.predict import build_correction_report, correction_document, require_commands, write_commands
 
     if out is not None:
         require_commands(out)
@@ -52,10 +34,11 @@ def correct(
     commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)
     if out is not None:
         write_commands(out, wanted.ids, commands, found.robot, units)
-    if as_json:
-        show_json(correction_document(found.robot.name, wanted.ids, commands))
-    else:
-        show_report(build_correction_report(wanted.ids, commands, found.robot))
+    show_result(
+        as_json,
+        lambda: correction_document(found.robot.name, wanted.ids, commands),
+        lambda: build_correction_report(wanted.ids, commands, found.robot),
+    )
     say(f"wrote {len(wanted.ids)} commands to {out}" if out else "nothing is written: --out commands.csv writes them")
     left = int((~commands.reached).sum())
     doubts = [f"the calibration was not to be trusted: {finding}" for finding in found.findings]

@@ -7,80 +7,52 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, end, say, show_json, show_report
+from fg_calib.cli.output import Json, Seed, argument, end, option, read_quantity, say, show_result
 
 if TYPE_CHECKING:
-    from fg_calib.designs.design import Design
     from fg_calib.io.units import Units
     from fg_calib.job import Job
     from fg_calib.robot.model import Robot
     from fg_calib.simulation.scenario import Scenario
 
-_Of = Annotated[
-    str,
-    typer.Argument(
-        metavar="SCENARIO|JOB",
-        help="What measures, and how well: a scenario (a file, or space-robot); or a job, whose rows count already.",
-    ),
-]
-_N = Annotated[int | None, typer.Option("--n", metavar="N", help="How many stops; 30 if neither this nor --target.")]
-_Target = Annotated[
-    str | None, typer.Option("--target", metavar="LENGTH", help="As few as reach this RMS error, such as 0.5mm.")
-]
-_Given = Annotated[
-    Path | None,
-    typer.Option("--given", metavar="TABLE", readable=False, help="Configurations that are measured in any case."),
-]
-_Candidates = Annotated[
-    str | None,
-    typer.Option(
-        "--candidates",
-        metavar="N|TABLE|SCENARIO|rows",
-        help="How many are drawn, 2000 if not given; a table; where a scenario says (.yaml); or a job's rows.",
-    ),
-]
-_Task = Annotated[
-    Path | None,
-    typer.Option(
-        "--task", metavar="TABLE", readable=False, help="Where the tool is to be right; anywhere within limits if none."
-    ),
-]
-_Criterion = Annotated[
-    Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"],
-    typer.Option("--criterion", help="What is made small: I, the error over the task, or one of the literature's."),
-]
-_Frame = Annotated[
-    Literal["base", "fitted"] | None,
-    typer.Option("--error", help="Errors in the base frame, or after the best rigid fit; by what is measured if none."),
-]
-_Lever = Annotated[
-    str | None,
-    typer.Option("--lever", metavar="LENGTH", help="Orientations count too, by what they move at this distance."),
-]
-_Out = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", readable=False, help="Write tables and a job to fill in there.")
-]
-_Seed = Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")]
-
 
 def design(
-    of: _Of,
-    n: _N = None,
-    target: _Target = None,
-    given: _Given = None,
-    candidates: _Candidates = None,
-    task: _Task = None,
-    criterion: _Criterion = "I",
-    error: _Frame = None,
-    lever: _Lever = None,
-    out: _Out = None,
-    seed: _Seed = 0,
+    of: Annotated[
+        str, argument("SCENARIO|JOB", "A scenario (a file, or space-robot); or a job, whose rows count already.")
+    ],
+    n: Annotated[int | None, option("--n", "N", "How many poses; 30 if neither this nor --target.")] = None,
+    target: Annotated[
+        str | None, option("--target", "LENGTH", "As few as reach this RMS error, such as 0.5mm.")
+    ] = None,
+    given: Annotated[Path | None, option("--given", "TABLE", "Configurations that are measured in any case.")] = None,
+    candidates: Annotated[
+        str | None,
+        option(
+            "--candidates", "N|TABLE|SCENARIO|rows", "How many are drawn (2000); a table; a scenario; a job's rows."
+        ),
+    ] = None,
+    task: Annotated[
+        Path | None, option("--task", "TABLE", "Where the tool is to be right; anywhere within limits if none.")
+    ] = None,
+    criterion: Annotated[
+        Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"],
+        option("--criterion", None, "What is made small: I, the error over the task, or one of the literature's."),
+    ] = "I",
+    error: Annotated[
+        Literal["base", "fitted"] | None,
+        option("--error", None, "Errors in the base frame, or after the best rigid fit; by what is measured if none."),
+    ] = None,
+    lever: Annotated[
+        str | None, option("--lever", "LENGTH", "Orientations count too, by what they move at this distance.")
+    ] = None,
+    out: Annotated[Path | None, option("--out", "DIR", "Write tables and a job to fill in there.")] = None,
+    seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
     from fg_calib.designs.design import design as designed
     from fg_calib.io.atomic import require_writable
-    from fg_calib.io.units import quantity
+    from fg_calib.report.design import build_design_report, design_document, write_design
 
     if n is not None and target is not None:
         say("error: --n and --target: one of the two")
@@ -90,8 +62,8 @@ def design(
         require_writable(out)
     choices: dict[str, Any] = {
         "n": n,
-        "target": None if target is None else quantity(target, "m", None, "--target"),
-        "lever": 0.0 if lever is None else quantity(lever, "m", None, "--lever"),
+        "target": read_quantity(target, "m", "--target"),
+        "lever": read_quantity(lever, "m", "--lever") or 0.0,
         "fitted": None if error is None else error == "fitted",
         "criterion": criterion,
         "seed": seed,
@@ -100,20 +72,10 @@ def design(
         **_candidates(candidates, robot, units),
     }
     found = designed(subject, **choices)
-    _show(found, units, out, as_json=as_json)
-    end([] if found.reached else ["the target is not reached"], "doubtful")
-
-
-def _show(found: Design, units: Units, out: Path | None, *, as_json: bool) -> None:
-    """Print a design, and write it."""
-    from fg_calib.report.design import build_design_report, design_document, write_design
-
     names = write_design(out, found, units) if out is not None else ()
-    if as_json:
-        show_json(design_document(found))
-    else:
-        show_report(build_design_report(found))
+    show_result(as_json, lambda: design_document(found), lambda: build_design_report(found))
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
+    end([] if found.reached else ["the target is not reached"], "doubtful")
 
 
 def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
@@ -126,7 +88,7 @@ def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
     if is_job(of):
         job = read_job(of)
         return job, units_of(job), job.robot
-    if "result.json" in (Path(of).name, *(file.name for file in Path(of).glob("*.json"))):
+    if Path(of).name == "result.json" or (Path(of) / "result.json").exists():
         raise InputError(of, "a result", "a scenario, or the job that the result came from")
     scenario = read_scenario(of)
     return scenario, Units(scenario.length_unit, scenario.angle_unit), scenario.robot

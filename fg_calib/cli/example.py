@@ -5,16 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from fg_calib.cli import EXAMPLES
-from fg_calib.cli.output import say_next
+from fg_calib.cli.output import argument, option, say_next
 from fg_calib.errors import InputError
 
 
 def example(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="The example: space-robot.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", readable=False, help="Folder to write it to.")],
+    name: Annotated[str, argument("NAME", "The example: space-robot.")],
+    out: Annotated[Path, option("--out", "DIR", "Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
     from fg_calib.io.atomic import fill_folder, require_absent

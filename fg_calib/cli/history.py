@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fg_calib.cli.output import Json, ResultFolder, show_json, show_report
+from fg_calib.cli.output import Json, ResultFolder, show_result
 
 
 def history(result: ResultFolder, as_json: Json = False) -> None:
@@ -12,7 +12,4 @@ def history(result: ResultFolder, as_json: Json = False) -> None:
 
     found = read_result(result)
     runs = (*found.history, found.run)
-    if as_json:
-        show_json(history_document(found.robot, runs))
-    else:
-        show_report(build_history(found.robot, runs))
+    show_result(as_json, lambda: history_document(found.robot, runs), lambda: build_history(found.robot, runs))

@@ -6,19 +6,12 @@ import shlex
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from fg_calib.cli.output import say
+from fg_calib.cli.output import argument, option, say
 
 
 def init(
-    files: Annotated[
-        list[Path],
-        typer.Argument(metavar="FILES...", readable=False, help="robot.yaml or a URDF, tables, perhaps camera.yaml."),
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="JOB", readable=False, help="The job to write.")] = Path(
-        "calibration.yaml"
-    ),
+    files: Annotated[list[Path], argument("FILES...", "robot.yaml or a URDF, tables, perhaps camera.yaml.")],
+    out: Annotated[Path, option("--out", "JOB", "The job to write.")] = Path("calibration.yaml"),
 ) -> None:
     """Write a commented job for a robot and its tables, recognised by their headers; nothing is overwritten."""
     from fg_calib.importers.draft import draft_job

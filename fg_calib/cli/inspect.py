@@ -5,15 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from fg_calib.cli.output import Json, end, show_json, show_report
+from fg_calib.cli.output import Json, argument, end, show_result
 
 
-def inspect(
-    job: Annotated[Path, typer.Argument(metavar="JOB", readable=False, help="The job, such as calibration.yaml.")],
-    as_json: Json = False,
-) -> None:
+def inspect(job: Annotated[Path, argument("JOB", "The job, such as calibration.yaml.")], as_json: Json = False) -> None:
     """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
     from fg_calib.diagnostics.inspection import inspect_job
     from fg_calib.io.job import read_job
@@ -21,8 +16,5 @@ def inspect(
 
     given = read_job(job)
     found = inspect_job(given)
-    if as_json:
-        show_json(inspection_document(found, given))
-    else:
-        show_report(build_inspection_report(found, given))
+    show_result(as_json, lambda: inspection_document(found, given), lambda: build_inspection_report(found, given))
     end(found.findings, "look at this first")

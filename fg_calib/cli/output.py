@@ -6,30 +6,44 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from fg_calib.errors import printable
+from fg_calib.options import AngleUnit, LengthUnit
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
     from rich.console import RenderableType
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout, and nothing else there.")]
-BaseLink = Annotated[str | None, typer.Option("--base-link", metavar="LINK", help="Where the chain of a URDF starts.")]
-TipLink = Annotated[str | None, typer.Option("--tip-link", metavar="LINK", help="Where the chain of a URDF ends.")]
-ResultFolder = Annotated[Path, typer.Argument(metavar="RESULT", readable=False, help="What `calibrate --out` wrote.")]
-Workers = Annotated[
-    int | None, typer.Option("--workers", min=1, metavar="N", help="Run jobs or folds on so many processes.")
-]
-Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Run them on a Dask cluster: tcp://host:8786.")
-]
+
+def argument(metavar: str, about: str) -> Any:
+    """A positional argument of a command; whether a file can be read is for its reader to say."""
+    return typer.Argument(metavar=metavar, readable=False, help=about)
+
+
+def option(name: str, metavar: str | None, about: str, **limits: Any) -> Any:
+    """An option of a command.
+
+    Args:
+        name: Such as `--out`.
+        metavar: What it takes, for the help; None for a switch or a choice.
+        about: The line of help.
+        limits: Of numbers: `min`.
+    """
+    return typer.Option(name, metavar=metavar, readable=False, help=about, **limits)
+
+
+Json = Annotated[bool, option("--json", None, "Print the result as JSON on stdout, and nothing else there.")]
+BaseLink = Annotated[str | None, option("--base-link", "LINK", "Where the chain of a URDF starts.")]
+TipLink = Annotated[str | None, option("--tip-link", "LINK", "Where the chain of a URDF ends.")]
+ResultFolder = Annotated[Path, argument("RESULT", "What `calibrate --out` wrote.")]
+Length = Annotated[LengthUnit, option("--length", None, "Unit of lengths in the tables.")]
+Angle = Annotated[AngleUnit, option("--angle", None, "Unit of angles in the tables, joint values included.")]
+Seed = Annotated[int, option("--seed", None, "Of all that is drawn.", min=0)]
 
 _stop_progress: list[Any] = []
 
@@ -42,7 +56,7 @@ def progress() -> Iterator[None]:
         return
     from rich.console import Console
 
-    from fg_calib.executors import listener
+    from fg_calib.parallel import listener
 
     with Console(file=sys.stderr).status("working") as status:
         listener.set(lambda what, done, of: status.update(printable(f"{what} {done} of {of}" if of else what)))
@@ -72,16 +86,41 @@ def show_json(document: dict[str, Any]) -> None:
     show(json.dumps(document, allow_nan=False))
 
 
-def show_report(report: RenderableType) -> None:
-    """Print a report as wide as the terminal, or as `COLUMNS` says; a pipe has no width of its own."""
+def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: Callable[[], RenderableType]) -> None:
+    """Print a result as JSON, or as a report as wide as the terminal or `COLUMNS`; a pipe has no width of its own.
+
+    Args:
+        as_json: Whether as JSON.
+        document: Makes the document.
+        report: Makes the report.
+    """
+    if as_json:
+        show_json(document())
+        return
     from rich.console import Console
 
     from fg_calib.report.tables import WIDTH, width_for
 
+    shown = report()
     _hide_progress()
     given = Console().is_terminal or "COLUMNS" in os.environ
-    width = width_for(report, Console().width if given else WIDTH)
-    Console(highlight=False, width=width).print(report)
+    Console(highlight=False, width=width_for(shown, Console().width if given else WIDTH)).print(shown)
+
+
+def read_quantity(text: str | None, unit: Literal["m", "rad"], option_name: str) -> float | None:
+    """A length or an angle that an option gives with its unit, [m] or [rad]; None if it is not given.
+
+    Raises:
+        InputError: It has no unit, or is no number.
+    """
+    from fg_calib.io.units import quantity
+
+    return None if text is None else quantity(text, unit, None, option_name)
+
+
+def names_in(text: str) -> list[str]:
+    """Names between commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def end(findings: Sequence[str], what: str = "not to be trusted", not_accepted: Sequence[str] = ()) -> None:
@@ -99,19 +138,3 @@ def say_next(names: Sequence[str], folder: Path) -> None:
     say(f"wrote {', '.join(names)} to {folder}")
     job, result = (shlex.quote(str(folder / name)) for name in ("calibration.yaml", "result"))
     say(f"now: fg-calib calibrate {job} --out {result}")
-
-
-@contextmanager
-def executor_for(workers: int | None, scheduler: str | None) -> Iterator[Executor | None]:
-    """The executor that `--workers` or `--scheduler` asks for; None for this process.
-
-    Raises:
-        BadParameter: Both were given.
-    """
-    from fg_calib.executors import dask_executor, local_processes
-
-    if workers is not None and scheduler is not None:
-        raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
-    asked = dask_executor(scheduler) if scheduler else local_processes(workers) if workers else nullcontext()
-    with asked as executor:
-        yield executor

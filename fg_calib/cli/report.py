@@ -5,18 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from fg_calib.cli.output import ResultFolder, say
+from fg_calib.cli.output import ResultFolder, option, say
 
 
 def report(
     result: ResultFolder,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", readable=False, help="Write there instead of beside the result."),
-    ] = None,
-    figures: Annotated[bool, typer.Option("--figures", help="Write its figures too, as SVG files.")] = False,
+    out: Annotated[Path | None, option("--out", "DIR", "Write there instead of to the result's folder.")] = None,
+    figures: Annotated[bool, option("--figures", None, "Write its figures too, as SVG files.")] = False,
 ) -> None:
     """Write report.html of a calibration: one page to look at and to pass on, which needs nothing else."""
     from fg_calib.calibration import write_report

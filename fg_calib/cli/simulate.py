@@ -5,18 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from fg_calib.cli.output import Json, say_next, show, show_json
+from fg_calib.cli.output import Json, Seed, argument, option, say_next, show, show_json
 from fg_calib.errors import printable
 
 
 def simulate(
-    scenario: Annotated[
-        str, typer.Argument(metavar="SCENARIO", help="The scenario: a YAML file, or a shipped one: space-robot.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", readable=False, help="Folder to write the job to.")],
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of all that is drawn.")] = 0,
+    scenario: Annotated[str, argument("SCENARIO", "The scenario: a YAML file, or a shipped one: space-robot.")],
+    out: Annotated[Path, option("--out", "DIR", "Folder to write the job to.")],
+    seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""

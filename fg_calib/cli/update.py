@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
-
 from fg_calib.cli.calibrate import show_calibration
 from fg_calib.cli.check import Like, NewTable, Pairs
-from fg_calib.cli.output import Json, ResultFolder
+from fg_calib.cli.output import Json, ResultFolder, option
 
 if TYPE_CHECKING:
     from fg_calib.robot.model import Robot
@@ -19,26 +17,17 @@ if TYPE_CHECKING:
 def update(
     result: ResultFolder,
     table: NewTable,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="DIR", readable=False, help="Write the new result there, with its history.")
-    ],
-    date: Annotated[
-        str | None, typer.Option("--date", metavar="DATE", help="When the rows were measured; now if left out.")
-    ] = None,
+    out: Annotated[Path, option("--out", "DIR", "Write the new result there, with its history.")],
+    date: Annotated[str | None, option("--date", "DATE", "When the rows were measured; now if left out.")] = None,
     growth: Annotated[
         list[str] | None,
-        typer.Option(
-            "--growth",
-            metavar="NAME=FIGURE",
-            help="1 sigma by which a parameter, or a kind, wanders in a day: theta=0.001deg.",
-        ),
+        option("--growth", "NAME=FIGURE", "1 sigma of drift in a day, of a parameter or a kind: theta=0.001deg."),
     ] = None,
     changed: Annotated[
-        list[str] | None,
-        typer.Option("--changed", metavar="NAME", help="What has changed since: nothing is taken over of it."),
+        list[str] | None, option("--changed", "NAME", "What has changed since: nothing is taken over of it.")
     ] = None,
     anchors_stay: Annotated[
-        bool, typer.Option("--anchors-stay", help="Anchors of the same name are where they were.")
+        bool, option("--anchors-stay", None, "Anchors of the same name are where they were.")
     ] = False,
     pairs: Pairs = None,
     like: Like = None,
@@ -50,7 +39,7 @@ def update(
     from fg_calib.io.atomic import require_writable
     from fg_calib.io.saved import require_no_input
 
-    if out.resolve() in (result.resolve(), result.parent.resolve() if result.is_file() else result.resolve()):
+    if out.resolve() == (result.parent if result.is_file() else result).resolve():
         raise InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
     require_writable(out)
     require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
@@ -75,7 +64,7 @@ def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
         InputError: One is not `NAME=FIGURE` with a unit.
     """
     from fg_calib.errors import InputError
-    from fg_calib.io.units import Units, quantity
+    from fg_calib.io.units import quantity
     from fg_calib.robot.model import tolerance_kind
 
     units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}
@@ -84,5 +73,5 @@ def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
         name, equals, figure = one.partition("=")
         if not equals:
             raise InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
-        found[name] = quantity(figure, units.get(name, "rad"), Units(), f"--growth: {name}")
+        found[name] = quantity(figure, units.get(name, "rad"), None, f"--growth: {name}")
     return found

@@ -130,7 +130,7 @@ def cross_validate(
     found = []
     for one in map_jobs(partial(_calibrated, solve=solve), jobs, executor, names=names):
         if isinstance(one, Failure):
-            raise one.error() if one.trace else ProblemError("folds", f"{one.job}: {one.reason}")
+            raise RuntimeError(one.trace) if one.trace else ProblemError("folds", f"{one.job}: {one.reason}")
         found.append(one)
     estimates, held, converged = zip(*found, strict=True)
     parts: dict[tuple[str, str], list[HeldOut]] = {}

@@ -8,7 +8,7 @@ import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Calibration, calibrate_job, read_robot
+from fg_calib import Calibration, calibrate_job
 
 JOINTS = [f"q{i + 1}" for i in range(7)]
 
@@ -53,20 +53,6 @@ def test_targets_in_their_units_become_commands_in_the_same(result, fg_calib, tm
         assert [row[k] for k in "xyz"] == pytest.approx(1e3 * pose[:3, 3], abs=1e-6)
         turned = Rotation.from_quat([row[f"q{k}"] for k in "xyzw"]).as_matrix()
         assert np.abs(turned - pose[:3, :3]).max() < 1e-9
-
-
-def test_errors_are_a_table_on_a_narrow_screen(result, fg_calib, tmp_path, monkeypatch):
-    """Figures below their headings, a line for mm and one for deg."""
-    monkeypatch.setenv("COLUMNS", "60")
-    pl.DataFrame(dict(zip(JOINTS, near(2).T, strict=True))).write_csv(tmp_path / "program.csv")
-    said = fg_calib("correct", result, tmp_path / "program.csv").out.splitlines()
-    top = next(k for k, line in enumerate(said) if line.startswith("error at the targets"))
-    assert said[top].split()[-2:] == ["RMS", "largest"]
-    assert said[top + 1].split()[-1] == "mm"
-    assert said[top + 2].split()[-1] == "deg"
-    assert [line.rindex(line.split()[-2]) + len(line.split()[-2]) for line in said[top + 1 : top + 3]] == [
-        len(said[top].rstrip())
-    ] * 2
 
 
 def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
@@ -127,11 +113,3 @@ def test_a_table_that_is_no_commands_is_not_replaced(result, fg_calib, tmp_path)
     ended = fg_calib("correct", result, tmp_path / "targets.csv", "--out", tmp_path / "targets.csv")
     assert ended.code == 1
     assert (tmp_path / "targets.csv").read_text() == "x,y,z\n1,2,3\n"
-
-
-def test_the_nominal_arm_is_that_of_the_robot_file(result):
-    from fg_calib.cli import EXAMPLES
-    from fg_calib.predictions import nominal_robot
-
-    given = read_robot(EXAMPLES / "space-robot" / "robot_nominal.yaml")
-    assert nominal_robot(Calibration.load(result)).nominal == pytest.approx(given.nominal, abs=1e-15)

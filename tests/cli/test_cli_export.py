@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exported import column, off, ur10
+from exported import off, ur10
 from simulated import measure
 from sparing import as_case
 
-from fg_calib import Calibration, calibrate, read_robot, read_urdf, write_robot
+from fg_calib import Calibration, calibrate, read_robot
 from fg_calib.exports.dh import drawn, errors
+from fg_calib.io import read_urdf, write_robot
 from fg_calib.robot.model import Robot
 
 TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 5e-4, "theta": 5e-4, "beta": 5e-4}
@@ -60,58 +61,6 @@ def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     assert found["findings"] == found["not_accepted"] == []
 
 
-@pytest.mark.slow
-def test_zeros_where_it_was_measured_are_better_there(result, fg_calib):
-    ended = [json.loads(fg_calib("export", result, "--to", "zeros", *more, "--json").out)
-             for more in ((), ("--at", "workspace"), ("--at", "measured"))]  # fmt: skip
-    assert ended[0] == ended[1]
-    anywhere, there = ended[1:]
-    assert set(anywhere["after"]) == {"workspace"}
-    assert there["after"]["measured"]["n"] == 40
-    reach = Calibration.load(result).robot.reach
-
-    def cost(error):
-        return error["position_rms"] ** 2 + (reach * error["rotation_rms"]) ** 2
-
-    assert cost(there["after"]["measured"]) < cost(there["before"]["measured"])
-    assert cost(there["after"]["workspace"]) > cost(anywhere["after"]["workspace"])
-
-
-@pytest.mark.slow
-def test_a_robot_is_exported_and_compared_with_the_one_as_drawn(fg_calib, tmp_path):
-    write_robot(tmp_path / "drawn.yaml", ur10())
-    write_robot(tmp_path / "true.yaml", off(ur10()))
-    ended = fg_calib("export", tmp_path / "true.yaml", "--to", "zeros", "--nominal", tmp_path / "drawn.yaml")
-    assert ended.code == 0
-    assert "# after, over the joint limits: position " in ended.out
-
-
-@pytest.mark.slow
-def test_a_urdf_is_written_as_it_was_but_for_origins(fg_calib, tmp_path):
-    nominal = column(tmp_path)
-    calibrated(nominal, off(nominal), tmp_path / "result")
-    before = (tmp_path / "column.urdf").read_bytes()
-    ended = fg_calib("export", tmp_path / "result", "--to", "urdf", "--out", tmp_path / "new.urdf")
-    assert (ended.code, ended.err) == (0, f"wrote {tmp_path / 'new.urdf'}\n")
-    after = (tmp_path / "new.urdf").read_bytes()
-    changed = [(a, b) for a, b in zip(before.splitlines(), after.splitlines(), strict=True) if a != b]
-    assert len(changed) == 5
-    assert all(b"<origin" in a and b"<origin" in b for a, b in changed[:-1])
-    robot = Calibration.load(tmp_path / "result").robot
-    assert (
-        read_urdf(tmp_path / "new.urdf", base_link="floor", tip_link="tip").parameters[6:-6]
-        == tuple(
-            p
-            for p in read_urdf(
-                tmp_path / "result" / "robot_calibrated.urdf", base_link="floor", tip_link="tip"
-            ).parameters
-        )[6:-6]
-    )
-    zeros = fg_calib("export", tmp_path / "result", "--to", "urdf", "--calibration-elements")
-    assert zeros.out.count("<calibration rising=") == robot.n_joints
-    assert "what reads it must add `rising`" in zeros.err
-
-
 FINDING = "reduced chi-square 7 -- far too large"
 
 
@@ -150,27 +99,11 @@ def test_names_steer_no_terminal(fg_calib, tmp_path, monkeypatch):
 MISTAKES = {
     "no such folder": (("{nowhere}", "--to", "dh"), 1, "error: nowhere: no such file\n"),
     "no result": (("{empty}", "--to", "dh"), 1, "error: {empty}: no result.json in this folder, "),
-    "no format": (("{robot}",), 2, "Missing option '--to'"),
     "another format": (("{robot}", "--to", "kuka"), 2, "'kuka' is not one of 'urdf', 'ur', 'tesseract'"),
     "a file that is there": (("{robot}", "--to", "dh", "--out", "{robot}"), 1, "error: {robot}: is there already, "),
-    "no folder": (("{robot}", "--to", "dh", "--out", "{empty}/a/b"), 1, "error: {empty}/a/b: there is no folder "),
-    "a folder": (("{robot}", "--to", "dh", "--out", "{empty}"), 1, "error: {empty}: is there already, "),
-    "five joints": (
-        ("{robot}", "--to", "ur"),
-        1,
-        "error: robot: 2 joints, 0 of which slide, expected six joints that turn",
-    ),
-    "no drawing": (("{robot}", "--to", "zeros"), 1, "error: zeros: an arm without the one as drawn, expected a RESULT"),
     "measured nowhere": (("{robot}", "--to", "zeros", "--at", "measured"), 2, "needs a RESULT"),
     "an idle place": (("{robot}", "--to", "dh", "--at", "workspace"), 2, "means nothing for dh"),
-    "an idle tool": (("{robot}", "--to", "dh", "--tool", "nominal"), 1, "error: tool: means nothing for dh, "),
-    "links of no URDF": (("{robot}", "--to", "dh", "--tip-link", "a"), 1, "error: robot.yaml: a robot without links, "),
     "links of a result": (("{empty}", "--to", "dh", "--tip-link", "a"), 2, "a RESULT knows its links"),
-    "no URDF": (
-        ("{robot}", "--to", "urdf", "--calibration-elements"),
-        1,
-        "error: calibration_elements: an arm that is no",
-    ),
 }
 
 

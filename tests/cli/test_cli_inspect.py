@@ -71,28 +71,6 @@ def test_a_mistake_in_units_ends_with_3_and_one_line(fg_calib, example):
     assert "far too large" in ended.out
 
 
-def test_rows_that_disagree_are_listed(fg_calib, job):
-    from dataclasses import replace
-
-    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, range(1, 8), 0.03))))
-    assert ended.code == 3
-    assert (
-        "look at this first: measurements that disagree with the nominal arm far more than the others do: 7 ("
-        in ended.err
-    )
-    part = ended.out[ended.out.index("Rows that disagree with the nominal arm") :]
-    assert "and 2 more" in part
-
-
-def test_notes_stand_last(fg_calib, job):
-    ended = fg_calib("inspect", job())
-    assert ended.code == 0
-    assert ended.out.splitlines()[1].rstrip() == "READY: nothing speaks against calibrating this job, see the notes"
-    assert ended.out.rstrip().endswith(
-        "no test rows: nothing would check how well the calibration predicts (column split)"
-    )
-
-
 def _refuse(constant):
     raise AssertionError(f"{constant} is no JSON")
 
@@ -146,11 +124,6 @@ def test_bad_input_ends_with_1_and_the_line_that_calibrate_gives(fg_calib, examp
     assert ended.err.startswith(says)
     assert ended.err.count("\n") == 1
     assert fg_calib("calibrate", path).err == ended.err
-
-
-def test_wrong_usage_ends_with_2(fg_calib):
-    assert fg_calib("inspect").code == 2
-    assert fg_calib("inspect", "a.yaml", "--out", "x").code == 2
 
 
 def test_names_from_files_steer_no_terminal(fg_calib, example):

@@ -79,50 +79,8 @@ def test_a_frame_may_be_unknown(fg_calib, example):
     assert json.loads(ended.out)["rank"] == 25
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation"])
-def test_the_noise_stated_is_used_where_nothing_was_measured_yet(fg_calib, example, tmp_path, model):
-    """A table of joint readings alone: twice the noise, twice every sigma."""
-    rows = [line.split(",") for line in (example / "poses.csv").read_text().splitlines()]
-    (tmp_path / "q.csv").write_text("\n".join(",".join(row[:8]) for row in rows[:53]))
-    assert rows[0][:8] == ["id", *(f"q{i + 1}" for i in range(7))]
-
-    def sigma(factor):
-        noise = ["--joint-noise", 1e-3 * factor]
-        if model not in ("orientation", "rotation"):
-            noise += ["--position-noise", 2e-4 * factor]
-        if model not in ("position", "distance"):
-            noise += ["--orientation-noise", 3e-3 * factor]
-        ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, "--angle", "deg",
-                         "--configurations", tmp_path / "q.csv", *noise, "--json")  # fmt: skip
-        assert ended.code == 0
-        return json.loads(ended.out)["sigma"]
-
-    once, twice = sigma(1), sigma(2)
-    kept = set(once) & set(twice)
-    assert len(kept) > 5
-    assert {name: twice[name] for name in kept} == pytest.approx({name: 2 * once[name] for name in kept}, rel=0.01)
-
-
-def test_a_sigma_of_each_row_is_used_where_nothing_was_measured_yet(fg_calib, example, tmp_path):
-    rows = [line.split(",")[:8] for line in (example / "poses.csv").read_text().splitlines()[:53]]
-    found = []
-    for sigma in ("0.001", "0.003"):
-        (tmp_path / "q.csv").write_text(
-            "\n".join(",".join([*row, sigma]) for row in rows).replace(f"q7,{sigma}", "q7,sigma_position")
-        )
-        ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "position", "--angle", "deg",
-                         "--configurations", tmp_path / "q.csv", "--json")  # fmt: skip
-        found.append(json.loads(ended.out)["sigma"]["a4"])
-    assert found[1] == pytest.approx(3 * found[0], rel=1e-3)
-
-
 OF_A_TABLE = (
     ("--position-noise", "0.001"),
-    ("--orientation-noise", "0.001"),
-    ("--joint-noise", "0"),
-    ("--pairing", "star"),
-    ("--length", "m"),
     ("--angle", "deg"),
 )
 
@@ -135,9 +93,6 @@ def test_what_is_said_of_a_table_needs_one(fg_calib, example, option):
 
 IDLE = (
     ("position", "--orientation-noise", "0.001"),
-    ("orientation", "--position-noise", "0.001"),
-    ("distance", "--orientation-noise", "0.001"),
-    ("rotation", "--position-noise", "0.001"),
     ("distance", "--frame", "unknown"),
     ("pose", "--pairing", "chain"),
 )
@@ -148,12 +103,6 @@ def test_what_a_model_does_not_use_is_refused(fg_calib, example, model, option, 
     table = ("--configurations", example / "poses.csv", "--angle", "deg")
     ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, *table, option, value)
     assert ended == (2, "", f"error: {option} has no effect with --model {model}\n")
-
-
-def test_a_seed_is_for_random_configurations(fg_calib, example):
-    arguments = ("--configurations", example / "poses.csv", "--seed", 1)
-    ended = fg_calib("observe", example / "robot_nominal.yaml", *arguments)
-    assert ended == (2, "", "error: --seed has no effect with --configurations\n")
 
 
 Y_SHAPED = """\
@@ -175,12 +124,6 @@ def test_links_of_a_urdf_are_named_as_the_message_asks(fg_calib, tmp_path):
     links = ("--base-link", "arm", "--tip-link", "right")
     found = json.loads(fg_calib("observe", tmp_path / "y.urdf", "--model", "pose", *links, "--json").out)
     assert {name.partition(".")[0] for name in found["names"]} == {"j3"}
-
-
-def test_a_robot_without_links_has_none_to_name(fg_calib, example):
-    ended = fg_calib("observe", example / "robot_nominal.yaml", "--tip-link", "flange")
-    assert ended.code == 1
-    assert ended.err.startswith("error: robot_nominal.yaml: a robot without links, expected a URDF")
 
 
 @pytest.mark.sampled(5)

@@ -237,7 +237,7 @@ def test_a_p_value_counts_that_noise_was_estimated_by_few_rows():
     """Chi-square over its degrees of freedom is then F; by chi-square 6 of 50 healthy arms had a p-value below 0.01."""
     calibration, true, rng = calibrated(4, n=10, estimate_noise=True)
     found = calibration.check(measured(true, 8, rng))
-    degrees = sum(kind.expected for kind in calibration.goodness.values())
+    degrees = sum(kind.expected for kind in calibration.result.goodness.values())
     assert degrees < 60 - 20  # of 60 figures all but those that the arm takes
     assert found.p_value == pytest.approx(stats.f.sf(found.chi2 / found.dof, found.dof, degrees))
 
