@@ -584,9 +584,7 @@ def _contradictions(result: Result) -> Iterator[tuple[str, str, str]]:
         with np.errstate(invalid="ignore"):
             if matrix.size != n * n or (n and matrix.shape != (n, n)):
                 yield key, f"shape {matrix.shape}", f"{n} rows of {n}, one of each name"
-            elif (np.abs(matrix - matrix.T) > 1e-9 * np.sqrt(np.outer(matrix.diagonal(), matrix.diagonal()))).any():
-                yield key, "no covariance", "a symmetric matrix with variances from 0 on"
-            elif (matrix.diagonal() < 0.0).any():
+            elif not np.array_equal(matrix, matrix.T, equal_nan=True) or (np.diag(matrix) < 0.0).any():
                 yield key, "no covariance", "a symmetric matrix with variances from 0 on"
     if len(of) < len(result.parameters) or len(set(names)) < len(names) or not of.keys() >= set(names):
         yield "covariance: names", "a name twice or of no parameter", "different names of parameters"
