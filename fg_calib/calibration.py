@@ -56,8 +56,8 @@ from fg_calib.options import Options, check, check_flag, check_names, listed
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction.tool_pose import predict_poses
 from fg_calib.report.figures import Drawn
-from fg_calib.report.html import build_page, draw_figures
-from fg_calib.report.text import format_result, judged, notes_of, parameter_table_html, summary
+from fg_calib.report.html import build_page, draw_figures, parameter_table_html
+from fg_calib.report.text import format_result, judged, notes_of, summary
 from fg_calib.robot.model import Robot, names_of
 from fg_calib.statistics.covariance import TangentCovariance
 from fg_calib.statistics.cross_validation import cross_validate

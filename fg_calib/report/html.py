@@ -4,51 +4,67 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fg_calib.errors import escaped
+from fg_calib.io.result import Result
 from fg_calib.prediction.workspace import PredictedErrors
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import Drawn, arm_scene, figures_of
-from fg_calib.report.tables import SHOWN, in_words, relations_by_reason, shortened, weak_rows
+from fg_calib.report.predict import percentages, size_table
+from fg_calib.report.tables import SHOWN, Section, in_words, indented, section, shortened
 from fg_calib.report.text import (
-    PARAMETER_HEADINGS,
-    TOLERANCE_HEADINGS,
+    NOTES,
+    PARAMETERS,
+    RESIDUALS,
+    build_sections,
     judged,
-    parameter_rows,
-    spread_in_words,
-    tolerance_rows,
+    parameter_table,
+    summary,
     verdict_word,
 )
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from rich.console import RenderableType
 
 MAX_ROWS = 40
 """Suspicious rows that the page lists; the table of residuals has all."""
 
-RESIDUALS_PER_PARAMETER = 3
-"""Below this ratio, strong correlations may come from the number of residuals alone."""
-
-LIMITS = {"position": "0.5 mm", "distance": "0.5 mm", "orientation": "0.1 deg", "angle": "0.1 deg"}
-"""Examples of limits in a job, by the kind of residual."""
-
-FIGURES = ("accuracy", "joints", "ranges", "parameters", "correlations", "residuals", "workspace")
-"""Names of the figures."""
-
-CLASSES = {
-    "independent": "Independent: identifiable alone",
-    "relative": "Relative: identifiable only in combination with others",
-    "ineffective": "Ineffective: not identifiable, no measurement depends on these",
+FIGURES = {
+    "accuracy": RESIDUALS,
+    "parameters": PARAMETERS,
+    "residuals": "Studentised residuals",
+    "joints": "Error over joint space",
+    "ranges": "Where the joints were measured",
+    "correlations": "Correlations",
+    "workspace": "Expected error over the workspace",
 }
-"""Heading of each class of parameters."""
+"""The section of each figure: one of the report, or one of the page alone after them."""
+
+EXPLANATIONS = {
+    "accuracy": "Residuals before and after the calibration contain the noise of the measurements.",
+    "parameters": "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the prior"
+    " sigma. Orange: the uncertainty is unknown.",
+    "residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1 in 370 is"
+    " beyond 3.",
+    "joints": "Each dot is a configuration. A trend shows an unmodelled effect of that joint.",
+    "ranges": "Configurations outside the measured ranges are extrapolated.",
+    "correlations": "Strong colours: errors of the two parameters go together.",
+    "workspace": "RMS error of the tool's position expected from the covariance. Unmodelled effects are not included.",
+}
+"""How to read each figure."""
 
 
-def build_page(drawn: Drawn) -> str:
-    """The page of a calibration, as HTML."""
+@cache
+def _environment() -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 
-    template = Environment(
+    environment = Environment(
         loader=PackageLoader("fg_calib.report", ""),
         autoescape=True,
         undefined=StrictUndefined,
@@ -56,34 +72,48 @@ def build_page(drawn: Drawn) -> str:
         lstrip_blocks=True,
         finalize=lambda value: escaped(value) if type(value) is str else value,
     )
-    template.filters |= {"words": in_words, "figure": lambda chart: Markup(chart.svg)}
-    charts = dict.fromkeys(FIGURES, ()) | figures_of(drawn)
-    return template.get_template("page.html").render(
-        result=drawn.result,
-        drawn=drawn,
-        charts=charts,
-        style=Markup(resource("style.css")),
-        script=Markup(resource("arm.js")),
-        arm=arm_scene(drawn),
-        ramp=RAMP,
-        verdict=verdict_word(drawn.result),
-        limits=[] if drawn.result.acceptance is None else judged(drawn.result.acceptance.judgements),
-        example=next((f"{kind}: {LIMITS[kind]}" for kind in drawn.result.rms_after(drawn.split) if kind in LIMITS), ""),
-        tiles=list(_tiles(drawn)),
-        spread=[] if drawn.result.folds is None else spread_in_words(drawn.result),
-        gaps=[] if drawn.workspace is None else list(_gaps(drawn.workspace)),
-        limits_words="" if drawn.workspace is None else _limits_in_words(drawn.workspace),
-        headings=[*PARAMETER_HEADINGS[:7], "sigma / prior"],
-        classes=[(title, _parameter_rows(drawn, kind)) for kind, title in CLASSES.items()],
-        tolerances=(TOLERANCE_HEADINGS, tolerance_rows(drawn.result)),
-        lost=relations_by_reason(drawn.result.observability.lost),
-        weak=weak_rows(drawn.result.observability.observability, 8),
-        few=drawn.result.n_residuals < RESIDUALS_PER_PARAMETER * len(drawn.result.estimated),
-        suspects=_suspects(drawn),
-        workspace=_workspace(drawn),
-        command=_command(drawn),
-        options=list(_options(drawn)),
+    environment.filters |= {"figure": lambda chart: Markup(chart.svg), "resource": lambda name: Markup(resource(name))}
+    return environment
+
+
+def build_page(drawn: Drawn) -> str:
+    """The page of a calibration, as HTML."""
+    result, charts = drawn.result, figures_of(drawn)
+    sections = sorted(build_sections(drawn, MAX_ROWS), key=lambda one: one.title != NOTES)
+    known, space = {one.title for one in sections}, drawn.workspace
+    for name, title in FIGURES.items():
+        if name in charts and title not in known:
+            content: list[RenderableType] = []
+            if name == "ranges" and space is not None:
+                content = indented(_gaps(space))
+            elif name == "workspace" and space is not None:
+                content = [size_table(space), *indented(percentages(space))]
+            sections.append(Section(title, tuple(content)))
+    files = {"configurations": drawn.configurations, "residuals": drawn.residuals}
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            result=result,
+            drawn=drawn,
+            sections=sections,
+            figures={FIGURES[name]: (EXPLANATIONS[name], of_name) for name, of_name in charts.items()},
+            missing=[name for name, table in files.items() if table is None],
+            arm=arm_scene(drawn),
+            ramp=RAMP,
+            verdict=verdict_word(result),
+            limits=[] if result.acceptance is None else judged(result.acceptance.judgements),
+            tiles=list(_tiles(drawn)),
+            command=_command(result),
+            options=list(_options(result)),
+        )
     )
+
+
+def parameter_table_html(result: Result) -> str:
+    """The summary and the parameters as HTML, for a notebook."""
+    (table,) = section(PARAMETERS, parameter_table(result))
+    return _environment().get_template("notebook.html").render(lines=summary(result), section=table)
 
 
 def draw_figures(drawn: Drawn) -> dict[str, str]:
@@ -95,34 +125,18 @@ def _tiles(drawn: Drawn) -> Iterator[tuple[str, str]]:
     """The most important values, and their meaning."""
     result = drawn.result
     rows = "of an evaluation" if result.evaluated_only else "held out" if drawn.split == "test" else "fitted"
-    if result.folds is not None and drawn.split == "train":
-        for kind, held in result.folds.kinds.items():
-            unit = result.unit_of(kind)
-            before = in_words(held.before, unit)
-            yield in_words(held.after, unit), f"{kind}, held out by cross-validation; before: {before}"
     for kind, rms in result.residual_rms[drawn.split].items():
         if rms is not None and ", table" not in kind:
             unit = result.unit_of(kind)
             yield in_words(rms.after, unit), f"{kind}, rows {rows}; before: {in_words(rms.before, unit)}"
-    expected = result.expected_error
-    if expected is not None:
+    if result.expected_error is not None:
         where = "after the best rigid fit" if result.free_of_frame else "in the base frame"
-        both = expected.fitted if result.free_of_frame else expected.base
+        both = result.expected_error.fitted if result.free_of_frame else result.expected_error.base
         for kind, unit in (("position", "m"), ("orientation", "rad")):
             yield in_words(getattr(both, kind), unit), f"tool {kind} error expected from the covariance, {where} (RMS)"
     known = sum(p.sigma is not None for p in result.estimated)
     yield f"{result.n_configurations}", "configurations" if result.evaluated_only else "configurations fitted"
     yield f"{known} of {len(result.estimated)}", "parameters estimated with a known uncertainty"
-
-
-def _limits_in_words(space: PredictedErrors) -> str:
-    """The range over which the workspace is drawn."""
-    missing = [joint for joint in space.joints if not np.isfinite(joint.limits).all()]
-    if not missing:
-        return "within the joint limits"
-    ranges = {"rad": "rotations by \u00b1180 deg", "m": "translations as far as they were read"}
-    instead = " and ".join(words for unit, words in ranges.items() if any(joint.unit == unit for joint in missing))
-    return f"within {'the' if len(missing) < len(space.joints) else 'no'} joint limits ({instead} without any)"
 
 
 def _gaps(space: PredictedErrors) -> Iterator[str]:
@@ -135,47 +149,15 @@ def _gaps(space: PredictedErrors) -> Iterator[str]:
             yield f"{joint.name}: nothing between {low:.4g} and {high:.4g} {unit}; measure there"
 
 
-def _parameter_rows(drawn: Drawn, kind: str) -> list[list[str]]:
-    chosen = [p for p in drawn.result.parameters if p.identifiability == kind]
-    ratios = ["" if p.sigma is None or not p.prior_sigma else f"{p.sigma / p.prior_sigma:.2f}" for p in chosen]
-    return [[*row[:7], ratio] for row, ratio in zip(parameter_rows(chosen), ratios, strict=True)]
-
-
-def _suspects(drawn: Drawn) -> tuple[int, list[list[str]]]:
-    """The number of suspicious rows, and cells of the worst ones."""
-    table = drawn.residuals
-    if table is None:
-        return 0, []
-    found = table.with_row_index("row_of_file").filter(table["suspect"] & table["excluded"].is_null())
-    found = found[found["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
-    rows = []
-    for row in found.head(MAX_ROWS).fill_null("").iter_rows(named=True):
-        factor, unit, decimals = SHOWN.get(row["unit"], (1.0, "", 6))
-        where = f"residuals: row {row['row_of_file'] + 1}"
-        cells = [row["kind"], f"{row['a']} {row['b']}".strip(), row.get("of", ""), row["split"]]
-        rows.append([*cells, f"{row['residual'] * factor:+.{decimals}f} {unit}", f"{row['studentised']:+.1f}", where])
-    return len(found), rows
-
-
-def _workspace(drawn: Drawn) -> dict[str, Any] | None:
-    """Quantiles of the expected error over the workspace, and the share where it is unknown."""
-    space = drawn.workspace
-    if space is None or space.unknown == 1.0:
-        return None
-    quantiles = [in_words(float(v), "m") for v in np.nanquantile(space.expected[:, 0], [0.05, 0.5, 0.95])]
-    far = 100.0 * float(np.mean(space.far))
-    return {"n": len(space.far), "quantiles": quantiles, "unknown": 100.0 * space.unknown, "far": far}
-
-
-def _command(drawn: Drawn) -> str:
+def _command(result: Result) -> str:
     """The command that repeats the calibration in the folder of its job; empty without a job."""
-    job = next(iter(drawn.result.inputs), None)
-    folds = [] if drawn.result.folds is None else ["--folds", f"{drawn.result.folds.n}"]
+    job = next(iter(result.inputs), None)
+    folds = [] if result.folds is None else ["--folds", f"{result.folds.n}"]
     return "" if job is None else shlex.join(["fg-calib", "calibrate", job, "--out", "result", *folds])
 
 
-def _options(drawn: Drawn) -> Iterator[tuple[str, str]]:
-    for key, value in vars(drawn.result.options).items():
+def _options(result: Result) -> Iterator[tuple[str, str]]:
+    for key, value in vars(result.options).items():
         if value not in (None, (), "") and key != "accept":
             shown = {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
             yield key, shortened(list(value), 20) if isinstance(value, tuple) else str(shown)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 from rich.console import Group, RenderableType
+from rich.table import Table
 
 from fg_calib import __version__
 from fg_calib.arguments import checked
@@ -35,6 +35,7 @@ from fg_calib.report.tables import (
     indented,
     line,
     lost_directions,
+    plain,
     plain_text,
     section,
     table_of,
@@ -87,55 +88,50 @@ def build_identifiability_report(found: Identifiability) -> RenderableType:
     parts += (line(f"NOT MODELLED: {m}", "bold red") for m in found.missing)
     parts += _classes(found)
     if found.with_fixed_known is not None:
-        parts += section(f"With {', '.join(found.fixed)} known, as the robot's file says")
+        parts += [line(""), line(f"With {', '.join(found.fixed)} known, as the robot's file says", "bold")]
         parts += _classes(found.with_fixed_known)
     return Group(*parts)
 
 
 def _classes(found: Identifiability) -> list[RenderableType]:
     o = found.observability
-    relations = (f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations)
-    rows = [
-        ("Independent", ", ".join(o.named("independent")) or "None"),
-        ("Relative", ", ".join(relations) or "None"),
-        ("Ineffective", ", ".join(o.named("ineffective")) or "None"),
-        ("Kept", ", ".join(o.kept) or "None"),
-    ]
-    headings = ("Identifiability", "Kinematic parameters")
-    table = table_of(headings, rows, left="ll", wrap=True)
+    relations = [f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations]
+    classes = {
+        "Independent": o.named("independent"),
+        "Relative": relations,
+        "Ineffective": o.named("ineffective"),
+        "Kept": o.kept,
+    }
+    rows = [(name, ", ".join(members) or "None") for name, members in classes.items()]
+    table = table_of(("Identifiability", "Kinematic parameters"), rows, left="ll", wrap=True)
     glossary = "independent: identifiable alone; relative: only in combination; ineffective: not identifiable"
     parts: list[RenderableType] = [line(f"rank {o.rank} of {len(o.names)} ({glossary})"), line(""), table]
-    if found.lost:
-        parts += section("Null-space directions", lost_directions(found.lost))
+    parts += section("Null-space directions", lost_directions(found.lost))
     practical = found.kind == "practical"
     parts += section("Singular values" + (" (signal-to-noise ratios)" if practical else ""), *_singular_values(o))
     if practical:
         indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
         parts += section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))
-        weak = weak_directions(o)
-        if weak is not None:
-            parts += section(f"Weak directions ({WEAK})", weak)
+        parts += section(f"Weak directions ({WEAK})", weak_directions(o))
         parts += section("Sigma of the kept parameters, the others at nominal", _sigmas(o))
-        if o.correlations:
-            correlated = (line(f"{a}, {b}: {rho:+.3f}") for a, b, rho in o.correlations)
-            parts += section(f"Correlations above {CORRELATED:g}", *correlated)
+        correlated = [(f"{a}, {b}:", f"{rho:+.3f}") for a, b, rho in o.correlations]
+        parts += section(f"Correlations above {CORRELATED:g}", table_of(("", ""), correlated))
     return parts
 
 
-def _singular_values(o: Observability) -> list[RenderableType]:
+def _singular_values(o: Observability) -> Iterator[RenderableType]:
     kept, dropped = o.singular_values[: o.rank], o.singular_values[o.rank :]
-    lines = [" ".join(f"{v:.3g}" for v in kept) or "none"]
+    yield line(" ".join(f"{v:.3g}" for v in kept) or "none")
     if len(dropped):
-        lines.append(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")
-    return [line(text) for text in lines]
+        yield line(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")
 
 
-def _sigmas(o: Observability) -> RenderableType:
-    rows = []
-    for name, sigma in o.sigma.items():
-        unit = unit_of(name)
-        groups = [g for g in o.relative if name in g.keep]
-        rows.append((name, figure(sigma, unit), SHOWN[unit][1], " ".join(groups[0].parameters) if groups else ""))
+def _sigmas(o: Observability) -> Table:
+    combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
+    rows = [
+        (name, figure(sigma, unit_of(name)), SHOWN[unit_of(name)][1], combined.get(name, ""))
+        for name, sigma in o.sigma.items()
+    ]
     return table_of(("", "sigma", "", "stands for"), rows, left="lrll")
 
 
@@ -157,34 +153,42 @@ def build_inspection_report(found: Inspection, job: Job) -> RenderableType:
         parts.append(line(f"READY: {what}", "bold green"))
     if found.evaluated:
         parts.append(line("all rows are test rows: the arm is evaluated as it is, nothing would be calibrated"))
-    parts += section("Tables", _tables(found), *indented(_excluded_pairs(found)))
-    parts += section("Joint readings", _joints(found))
-    parts += _residuals(found)
-    parts += _disagreements(found.disagreements)
-    parts += _determined(found)
-    weak = weak_directions(found.identifiability.observability)
-    if weak is not None:
-        parts += section(f"Weakly determined ({WEAK})", weak)
-    parts += expected_tool_error(found.expected_error)
-    return Group(*parts, *(section("Notes", *indented(found.cautions)) if found.cautions else []))
+    o = found.identifiability.observability
+    counts = f"{found.n_residuals} residuals and {found.n_priors} priors on {found.n_unknowns} unknowns"
+    residuals = (
+        f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
+    )
+    determined = f"What these rows can determine: {o.rank} of {len(o.names)} parameters"
+    return Group(
+        *parts,
+        *section("Tables", _tables(found), *indented(_excluded_pairs(found))),
+        *section("Joint readings", _joints(found)),
+        *section(residuals, _residuals(found)),
+        *section("Rows that disagree with the nominal arm", *_disagreements(found.disagreements)),
+        *section(determined, line(f"{counts}: {found.dof} degrees of freedom"), _determined(o)),
+        *section("Not identifiable from these rows", lost_directions(found.identifiability.lost)),
+        *section(f"Weakly determined ({WEAK})", weak_directions(o)),
+        *expected_tool_error(found.expected_error),
+        *section("Notes", *indented(found.cautions)),
+    )
 
 
-def _tables(found: Inspection) -> RenderableType:
+def _tables(found: Inspection) -> Table:
     """Counts of each table, without empty columns."""
-    columns = {
-        "rows": [f"{t.n_rows}" for t in found.tables],
-        "configurations": [f"{t.n_configurations}" for t in found.tables],
-        "test rows": [f"{t.n_test or ''}" for t in found.tables],
-        "train pairs": [f"{t.n_pairs or ''}" for t in found.tables],
-        "test pairs": [f"{t.n_test_pairs or ''}" for t in found.tables],
-        "repeats": [f"{t.n_repeats or ''}" for t in found.tables],
-        "of": [", ".join(f"{n} {what}{'s' * (n > 1)}" for what, n in t.labels.items()) for t in found.tables],
+    columns: dict[str, list[Any]] = {
+        "": [t.name for t in found.tables],
+        "rows": [t.n_rows for t in found.tables],
+        "configurations": [t.n_configurations for t in found.tables],
+        "test rows": [t.n_test or "" for t in found.tables],
+        "train pairs": [t.n_pairs or "" for t in found.tables],
+        "test pairs": [t.n_test_pairs or "" for t in found.tables],
+        "repeats": [t.n_repeats or "" for t in found.tables],
+        "of": [", ".join(f"{n} {what}" for what, n in t.labels.items()) for t in found.tables],
         "residuals to fit": [", ".join(f"{n} {kind}" for kind, n in t.n_residuals.items()) for t in found.tables],
     }
     there = {heading: cells for heading, cells in columns.items() if any(cells)}
-    left = "l" + "".join("l" if heading in ("of", "residuals to fit") else "r" for heading in there)
-    rows = zip((t.name for t in found.tables), *there.values(), strict=True)
-    return table_of(("", *there), rows, left=left, wrap=True)
+    left = "".join("l" if heading in ("", "of", "residuals to fit") else "r" for heading in there)
+    return table_of(there, zip(*there.values(), strict=True), left=left, wrap=True)
 
 
 def _excluded_pairs(found: Inspection) -> Iterator[str]:
@@ -198,20 +202,19 @@ def _excluded_pairs(found: Inspection) -> Iterator[str]:
         yield f"{n} train pairs are excluded: {reason.replace('_', ' ')}"
 
 
-def _joints(found: Inspection) -> RenderableType:
+def _joints(found: Inspection) -> Table:
     rows = []
     for joint in found.joints:
         factor, unit, _ = SHOWN[joint.unit]
         low, high = (f"{v * factor:.1f}" if math.isfinite(v) else "-" for v in joint.limits)
         used = "" if joint.share is None else f"{100.0 * joint.share:.0f} %"
         outside = f"outside in {joint.n_outside} configurations" if joint.n_outside else ""
-        words = outside or ("hardly moves" if joint.still else "")
         ends = (f"{v * factor:z.1f}" for v in (joint.least, joint.most))
-        rows.append((joint.name, *ends, unit, low, high, used, words))
+        rows.append((joint.name, *ends, unit, low, high, used, outside or "hardly moves" * joint.still))
     return table_of(("", "from", "to", "", "limits", "", "used", ""), rows, left="lrrlrrrl")
 
 
-def _residuals(found: Inspection) -> list[RenderableType]:
+def _residuals(found: Inspection) -> Table:
     """Typical residuals before the calibration compared with the ones that noise and priors predict."""
     rows = []
     for check in found.setups:
@@ -219,9 +222,7 @@ def _residuals(found: Inspection) -> list[RenderableType]:
             values = (f"{v * SHOWN[one.unit][0]:.3g}" for v in (one.size, one.expected))
             name = f"{one.kind} of {check.table}" if check.table else one.kind
             rows.append((name, SHOWN[one.unit][1], *values, f"{one.excess:.3g}", _judged(check, one.excess)))
-    table = table_of(("", "", "observed", "predicted", "ratio", ""), rows, left="llrrrl")
-    title = f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
-    return section(title, table) if rows else []
+    return table_of(("", "", "observed", "predicted", "ratio", ""), rows, left="llrrrl")
 
 
 def _judged(check: SetupCheck, excess: float) -> str:
@@ -230,35 +231,27 @@ def _judged(check: SetupCheck, excess: float) -> str:
     return "as noise and priors allow" if excess <= 2.0 else "larger than predicted, but not by far"
 
 
-def _disagreements(found: Disagreements, limit: int = 5) -> list[RenderableType]:
+def _disagreements(found: Disagreements, most: int = 5) -> Iterator[RenderableType]:
     """Rows that disagree with the nominal arm, the farthest first."""
     rows = []
-    for one in found.found[:limit]:
+    for one in found.found[:most]:
         values = (f"{v * SHOWN[one.unit][0]:.3g}" for v in (one.size, one.expected))
         names = "-".join(one.ends), one.table, one.of, one.kind
         rows.append((*names, *values, SHOWN[one.unit][1], "test" * one.test))
-    if len(found.found) > limit:
-        rows.append((f"and {len(found.found) - limit} more", *[""] * 7))
-    looked = "" if found.n >= found.of else f" ({found.n} of {found.of} were looked at)"
-    table = table_of(("", "table", "of", "", "off by", "expected", "", ""), rows, left="llllrrll")
-    return section(f"Rows that disagree with the nominal arm{looked}", table) if rows else []
+    if rows:
+        yield table_of(("", "table", "of", "", "off by", "expected", "", ""), rows, left="llllrrll")
+        more = [f"and {len(found.found) - most} more"] if len(found.found) > most else []
+        yield from indented([*more, *([f"{found.n} of {found.of} were compared"] if found.n < found.of else [])])
 
 
-def _determined(found: Inspection) -> list[RenderableType]:
-    """Expected rank and classes, and why the rest is not identifiable."""
-    o = found.identifiability.observability
-    classes = [
-        ("independent", ", ".join(o.named("independent")) or "none"),
-        ("only in combination", ", ".join(f"[{' '.join(group.parameters)}]" for group in o.relative)),
-        ("not identifiable", ", ".join(o.named("ineffective"))),
-    ]
-    rows = f"{found.n_residuals} residuals and {found.n_priors} priors on {found.n_unknowns} unknowns"
-    table = table_of(("", ""), [row for row in classes if row[1]], left="ll", wrap=True)
-    title = f"What these rows can determine: {o.rank} of {len(o.names)} parameters"
-    parts = section(title, line(f"{rows}: {found.dof} degrees of freedom"), table)
-    if found.identifiability.lost:
-        parts += section("Not identifiable from these rows", lost_directions(found.identifiability.lost))
-    return parts
+def _determined(o: Observability) -> Table:
+    """Classes of the parameters."""
+    classes = {
+        "independent": ", ".join(o.named("independent")) or "none",
+        "only in combination": ", ".join(f"[{' '.join(group.parameters)}]" for group in o.relative),
+        "not identifiable": ", ".join(o.named("ineffective")),
+    }
+    return table_of(("", ""), [row for row in classes.items() if row[1]], left="ll", wrap=True)
 
 
 @checked
@@ -266,9 +259,7 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
     """The content of `fg-calib inspect --json`: SI, null for what is unknown or infinite.
 
     { "schema": "fg-calib/inspection/1", "version", "robot", "ready", "findings", "cautions", "evaluated",
-      "tables": [the fields of `TableSurvey`],
-      "joints": [{"name", "unit", "least", "most", "limits": [lower | null, upper | null], "share", "still",
-                  "n_outside"}],
+      "tables": [the fields of `TableSurvey`], "joints": [the fields of `JointSurvey`],
       "residuals": [{"table", "kind", "unit", "size", "expected", "excess", "n"}],
       "explanations": [{"table", "mistakes"}],
       "disagreements": {"found": [the fields of `Disagreement`], "n", "of"},
@@ -277,32 +268,20 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
       "inputs": {path: sha256} }
     """
-    plain = ("robot", "ready", "evaluated", "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
-    residuals = [(check.table, one) for check in found.setups for one in check.residuals]
-    explanations = [(check.table, one) for check in found.setups for one in check.explanations]
-    return {
-        "schema": "fg-calib/inspection/1",
-        "version": __version__,
-        **{key: getattr(found, key) for key in plain},
-        "findings": list(found.findings),
-        "cautions": list(found.cautions),
-        "tables": [asdict(table) for table in found.tables],
-        "joints": [
-            {key: getattr(joint, key) for key in ("name", "unit", "least", "most", "share", "still", "n_outside")}
-            | {"limits": [v if math.isfinite(v) else None for v in joint.limits]}
-            for joint in found.joints
-        ],
-        "residuals": [
-            {"table": table, **{key: getattr(r, key) for key in ("kind", "unit", "size", "expected", "excess", "n")}}
-            for table, r in residuals
-        ],
-        "explanations": [{"table": table, "mistakes": list(one.mistakes)} for table, one in explanations],
-        "disagreements": {
-            "found": [asdict(one) for one in found.disagreements.found],
-            "n": found.disagreements.n,
-            "of": found.disagreements.of,
-        },
-        "observability": observability_document(found.identifiability),
-        "expected_error": None if found.expected_error is None else asdict(found.expected_error),
-        "inputs": job.inputs,
-    }
+    counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
+    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "joints", "expected_error", *counts)
+    document: dict[str, Any] = plain(
+        {
+            "schema": "fg-calib/inspection/1",
+            "version": __version__,
+            **{key: getattr(found, key) for key in keys},
+            "residuals": [{"table": check.table} | plain(one) for check in found.setups for one in check.residuals],
+            "explanations": [
+                {"table": check.table, "mistakes": one.mistakes} for check in found.setups for one in check.explanations
+            ],
+            "disagreements": found.disagreements,
+            "observability": observability_document(found.identifiability),
+            "inputs": job.inputs,
+        }
+    )
+    return document

@@ -164,7 +164,7 @@ def build_prediction_report(
     parts += [line(f"the calibration was {verdict_word(result)}", style)]
     parts += indented([*result.findings, *result.reservations])
     title = "Expected error, by the covariance of the calibration"
-    parts += section(title, _size_table(found), *indented(_percentages(found)))
+    parts += section(title, size_table(found), *indented(percentages(found)))
     if found.worst is not None:
         title = "Where it is largest" + ", as far as it is known" * bool(found.unknown)
         parts += section(title, *indented(_worst_in_words(found.worst, robot, _names(found, ids), length)))
@@ -177,7 +177,7 @@ def build_prediction_report(
     return Group(*parts, *section("Notes", *indented(_prediction_notes(found))))
 
 
-def _size_table(found: PredictedErrors) -> RenderableType:
+def size_table(found: PredictedErrors) -> RenderableType:
     """RMS and quantiles, in both frames, with joint noise and without."""
     order = ("fitted", "base") if found.fitted else ("base", "fitted")
     errors = {FRAMES[name]: found.errors.of(name == "fitted") for name in order}
@@ -192,7 +192,8 @@ def _size_table(found: PredictedErrors) -> RenderableType:
     return table_of(("", "", *SIZES.values()), rows, left="ll", wrap=True)
 
 
-def _percentages(found: PredictedErrors) -> Iterator[str]:
+def percentages(found: PredictedErrors) -> Iterator[str]:
+    """The shares of configurations within the limit, where the error is unknown, and where nothing was measured."""
     if found.within is not None and found.limit is not None:
         yield f"within {found.limit * 1e3:.6g} mm at {_percent(found.within)} of them"
     if found.unknown > 0.0:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydantic_core import to_json
-from rich.console import Console, RenderableType
+from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -60,9 +61,42 @@ def line(text: str, style: str = "") -> Text:
     return Text(escaped(text), style=style)
 
 
-def section(title: str, *content: RenderableType) -> list[RenderableType]:
-    """A heading after a blank line, and its content."""
-    return [line(""), line(title, "bold"), *content]
+@dataclass(frozen=True)
+class Section:
+    """A part of a report, which the terminal and the page show alike.
+
+    Attributes:
+        title: Its heading.
+        content: Tables and sentences.
+    """
+
+    title: str
+    content: tuple[RenderableType, ...]
+
+    def __rich__(self) -> Group:
+        """The section for the terminal: a heading after a blank line, and its content."""
+        return Group(line(""), line(self.title, "bold"), *self.content)
+
+    @property
+    def tables(self) -> Iterator[tuple[list[str], list[tuple[str, ...]], list[str]]]:
+        """Headings, rows, and justification of the columns (`left`, `right`) of its tables."""
+        for table in (part for part in self.content if isinstance(part, Table)):
+            cells = ([str(cell) for cell in column.cells] for column in table.columns)
+            headings = [str(column.header) for column in table.columns]
+            yield headings, list(zip(*cells, strict=True)), [column.justify for column in table.columns]
+
+    @property
+    def sentences(self) -> Iterator[str]:
+        """Its sentences."""
+        for part in self.content:
+            if isinstance(part, Text | Padding):
+                yield str(part.renderable if isinstance(part, Padding) else part)
+
+
+def section(title: str, *content: RenderableType) -> list[Section]:
+    """A section of its content without empty tables; none where nothing is left."""
+    there = tuple(part for part in content if not isinstance(part, Table) or part.row_count)
+    return [Section(title, there)] if there else []
 
 
 def indented(lines: Iterable[str]) -> list[RenderableType]:
@@ -71,7 +105,7 @@ def indented(lines: Iterable[str]) -> list[RenderableType]:
 
 
 def table_of(headings: Iterable[str], rows: Iterable[Iterable[object]], *, left: str = "", wrap: bool = False) -> Table:
-    """A table without a frame.
+    """A table without a frame, for the terminal and the page.
 
     Args:
         headings: Of the columns; without any text there is no heading row.
@@ -114,17 +148,13 @@ def shortened(names: list[str], most: int) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def lost_directions(lost: Sequence[LostDirection]) -> RenderableType:
-    """One line a reason, with the directions that have it."""
-    return table_of(("", "because"), relations_by_reason(lost), left="ll", wrap=True)
-
-
-def relations_by_reason(lost: Sequence[LostDirection]) -> list[tuple[str, str]]:
+def lost_directions(lost: Sequence[LostDirection]) -> Table:
     """Each reason once, after the directions that have it."""
     by_reason: dict[str, list[str]] = {}
     for direction in lost:
         by_reason.setdefault(direction.reason, []).append(format_relation(direction.relation))
-    return [(", ".join(relations), reason) for reason, relations in by_reason.items()]
+    rows = [(", ".join(relations), reason) for reason, relations in by_reason.items()]
+    return table_of(("", "because"), rows, left="ll", wrap=True)
 
 
 def format_relation(relation: Mapping[str, float]) -> str:
@@ -144,20 +174,15 @@ def unit_of(name: str) -> str:
     return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
 
 
-def weak_rows(observability: Observability, most: int) -> list[tuple[str, str]]:
-    """Each weak direction: its sigma over the prior sigma, and its largest members."""
+def weak_directions(observability: Observability, most: int = 5) -> Table:
+    """Weak directions: their sigma over the prior sigma, and their largest members."""
     rows = []
     for weak in observability.weak[:most]:
         members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
         rows.append((f"{1.0 / weak.signal_to_noise:.3g}" if weak.signal_to_noise > 0.0 else "unknown", members))
-    return rows
-
-
-def weak_directions(observability: Observability, most: int = 5) -> RenderableType | None:
-    """Weak directions by their largest members; None where no direction is weak."""
     more = len(observability.weak) - most
-    rows = weak_rows(observability, most) + ([("", f"and {more} more")] if more > 0 else [])
-    return table_of(("sigma / prior", "largest members"), rows, left="ll", wrap=True) if rows else None
+    rows += [("", f"and {more} more")] if more > 0 else []
+    return table_of(("sigma / prior", "largest members"), rows, left="ll", wrap=True)
 
 
 def plain(document: Any) -> Any:

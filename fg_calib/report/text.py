@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from rich.console import Group, RenderableType
+from rich.table import Table
 
+from fg_calib.arrays import Floats
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph.solver import Solution
@@ -23,6 +25,7 @@ from fg_calib.report.tables import (
     SHOWN,
     WEAK,
     WIDTH,
+    Section,
     figure,
     in_order,
     in_words,
@@ -30,15 +33,14 @@ from fg_calib.report.tables import (
     line,
     lost_directions,
     plain_text,
-    rounded,
     section,
     shortened,
     table_of,
     weak_directions,
 )
-from fg_calib.robot.model import Robot, names_of
+from fg_calib.robot.model import Robot
 from fg_calib.statistics.acceptance import Judgement
-from fg_calib.statistics.estimates import FrameEstimate, JointErrors, LandmarkEstimate, ParameterEstimate
+from fg_calib.statistics.estimates import LandmarkEstimate, ParameterEstimate
 from fg_calib.statistics.goodness_of_fit import OUTLIER_WEIGHT, PREDICTION_VERDICTS, VERDICTS, KindFit
 
 if TYPE_CHECKING:
@@ -76,38 +78,43 @@ def format_result(found: Calibrated, width: int = WIDTH) -> str:
 
 def build_report(found: Calibrated) -> RenderableType:
     """The report, to be printed by rich."""
+    return Group(*_verdict(found.result), *build_sections(found))
+
+
+def build_sections(found: Calibrated, most: int = 5) -> list[Section]:
+    """The sections of the report, for the terminal and the page.
+
+    Args:
+        found: The calibration.
+        most: Suspicious rows that are listed, and weak directions.
+    """
     result = found.result
     joint_noise = ", with joint noise" if np.any(result.sigma_joint > 0.0) else ""
-    parts: list[RenderableType] = [
-        *_verdict(result),
+    scales = "Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)"
+    notes = [*(text for text in result.cautions if result.findings or text not in result.reservations), *result.notes]
+    return [
         *section("Fit statistics", _statistics(result)),
-        *section(f"Goodness of fit (1 sigma of a row{joint_noise})", _goodness(result, found.robot)),
+        *section(f"Goodness of fit (1 sigma of a row{joint_noise})", *_goodness(result, found.robot)),
         *_prediction(result),
         *_cross_validation(result),
         *expected_tool_error(result.expected_error),
-        *section("Residuals (RMS)", _residuals(result)),
+        *section(RESIDUALS, _residuals(result)),
+        *(section(PARAMETERS, parameter_table(result)) if result.estimated or not result.evaluated_only else []),
+        *section(scales, _tolerances(result)),
+        *section("Combinations that the kept parameters stand for", _combinations(result)),
+        *_suspicious_rows(found.residuals, result, most),
+        *_suspicious_configurations(result),
+        *_joint_values(found),
+        *_frames(result),
+        *_landmarks(result.groups),
+        *section("Not identifiable from these data", lost_directions(result.observability.lost)),
+        *section(f"Weakly determined ({WEAK})", weak_directions(result.observability.observability, most)),
+        *section(NOTES, *indented(notes)),
     ]
-    if result.estimated or not result.evaluated_only:
-        parts += section("Parameters", _parameters(result))
-    if result.tolerance_scales:
-        title = "Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)"
-        parts += section(title, table_of(TOLERANCE_HEADINGS, tolerance_rows(result), left="rrrl"))
-    if any(p.stands_for for p in result.parameters):
-        parts += section("Combinations that the kept parameters stand for", _combinations(result))
-    parts += _suspicious_rows(found.residuals, result)
-    parts += _suspicious_configurations(result)
-    parts += _joint_values(found)
-    for symbol, frame in result.frames.items():
-        which = "" if len(result.tables) == 1 else f" of {result.tables[int(symbol[2:-1])][0]}"
-        parts += section(f"Measurement frame (world_T_base{which})", _frame(frame))
-    parts += _landmarks(result.groups)
-    if result.observability.lost:
-        parts += section("Not identifiable from these data", lost_directions(result.observability.lost))
-    weak = weak_directions(result.observability.observability)
-    if weak is not None:
-        parts += section(f"Weakly determined ({WEAK})", weak)
-    notes = [*(text for text in result.cautions if result.findings or text not in result.reservations), *result.notes]
-    return Group(*parts, *(section("Notes", *indented(notes)) if notes else []))
+
+
+RESIDUALS, PARAMETERS, NOTES = "Residuals (RMS)", "Parameters", "Notes"
+"""Titles of sections to which the page adds charts, or which it shows first."""
 
 
 def verdict_word(result: Result) -> str:
@@ -135,20 +142,20 @@ def _verdict(result: Result) -> Iterator[RenderableType]:
     yield line(f"{result.robot}: {tables}{joints}{loss}")
     if result.evaluated_only:
         yield line("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated")
-    if result.acceptance is not None:
-        colour = {"pass": "bold green", "fail": "bold red"}.get(result.acceptance.verdict, "bold yellow")
-        yield from (line(text, colour) for text in judged(result.acceptance.judgements))
     yield from (line(f"DOUBTFUL: {finding}", "bold red") for finding in result.findings)
     if not result.findings:
         yield line(f"{verdict_word(result)}: {result.solver.message}", "bold green")
         yield from indented(result.reservations)
+    if result.acceptance is not None:
+        colour = {"pass": "bold green", "fail": "bold red"}.get(result.acceptance.verdict, "bold yellow")
+        yield from (line(text, colour) for text in judged(result.acceptance.judgements))
     if result.evaluated_only and result.chi2_p_value is not None:
         yield line(f"test rows: {chi2_in_words(result.chi2, result.chi2_expected, result.chi2_p_value)}")
     elif result.test is not None and result.test.n:
         yield line(predicted_in_words(result.test))
 
 
-def _statistics(result: Result) -> RenderableType:
+def _statistics(result: Result) -> Table:
     low, high = result.chi2_bounds
     p = "" if result.chi2_p_value is None else f", p-value {probability(result.chi2_p_value)}"
     reduced = "unknown" if result.reduced_chi2 is None else f"{result.reduced_chi2:.4g}"
@@ -174,7 +181,7 @@ def _named(result: Result, fit: KindFit) -> str:
     return fit.kind if len(result.tables) == 1 else f"{fit.kind} of {result.tables[fit.table][0]}"
 
 
-def _goodness(result: Result, robot: Robot) -> RenderableType:
+def _goodness(result: Result, robot: Robot) -> list[RenderableType]:
     """Specified and estimated noise by kind, and what their ratio means."""
     factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[str, ...]]()
     for fit in fits:
@@ -199,7 +206,7 @@ def _goodness(result: Result, robot: Robot) -> RenderableType:
     table = table_of(headings, rows, left="llrrrrl", wrap=True)
     suspicious = bool(result.suspect_configurations) or any(fit.n_beyond for fit in fits)
     level = f"no row (|studentised residual| above {result.suspect_level:.2f}) and no configuration is suspicious"
-    return Group(table, *indented([] if suspicious or not np.isfinite(result.suspect_level) else [level]))
+    return [table, *indented([] if suspicious or not np.isfinite(result.suspect_level) else [level])]
 
 
 def _joint_noise(result: Result, robot: Robot) -> Iterator[tuple[str, ...]]:
@@ -219,7 +226,7 @@ def _estimated_noise(result: Result, key: str) -> str:
     return "estimated" if result.solver.converged else "not settled: the estimate has not converged"
 
 
-def _prediction(result: Result) -> list[RenderableType]:
+def _prediction(result: Result) -> list[Section]:
     """How well the test rows are predicted, by kind."""
     fit = result.test
     if fit is None:
@@ -240,7 +247,7 @@ def _prediction(result: Result) -> list[RenderableType]:
     return section("Prediction of the test rows", table, *indented(notes))
 
 
-def _cross_validation(result: Result) -> list[RenderableType]:
+def _cross_validation(result: Result) -> list[Section]:
     """How well configurations are predicted by calibrations without them, and how parameters spread."""
     found = result.folds
     if found is None:
@@ -277,7 +284,7 @@ def spread_in_words(result: Result) -> list[str]:
     return lines
 
 
-def expected_tool_error(expected: ExpectedError | None) -> list[RenderableType]:
+def expected_tool_error(expected: ExpectedError | None) -> list[Section]:
     """The section on the expected error of the tool, by the covariance; none for an evaluation."""
     if expected is None:
         return []
@@ -291,66 +298,51 @@ def expected_tool_error(expected: ExpectedError | None) -> list[RenderableType]:
     return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)", table)
 
 
-def _residuals(result: Result) -> RenderableType:
-    kinds = [kind for kind in result.residual_rms["train"] if ", table" not in kind]
-    rows = []
-    for kind in in_order(kinds):
-        by_table = [name for name in result.residual_rms["train"] if name.startswith(f"{kind}, table ")]
-        for name in by_table or [kind]:
+def _residuals(result: Result) -> Table:
+    """By kind; by table where several tables have it."""
+    names, rows = list(result.residual_rms["train"]), []
+    for kind in in_order(name for name in names if ", table" not in name):
+        for name in [name for name in names if name.startswith(f"{kind}, table ")] or [kind]:
             both = [result.residual_rms[split].get(name) for split in ("train", "test")]
-            if any(rms is not None for rms in both):
+            if any(both):
                 factor, unit, _ = SHOWN[result.unit_of(kind)]
-                values = (None if rms is None else getattr(rms, when) for rms in both for when in ("before", "after"))
+                values = (getattr(rms, when, None) for rms in both for when in ("before", "after"))
                 rows.append((name, unit, *("-" if v is None else f"{v * factor:.4f}" for v in values)))
     return table_of(("", "", "train before", "after", "test before", "after"), rows, left="ll")
 
 
-PARAMETER_HEADINGS = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
-
-
-def parameter_rows(parameters: Iterable[ParameterEstimate], *, fixed: bool = True) -> list[tuple[str, ...]]:
-    """A row of cells for each parameter; base and tool fixed at zero are left out.
-
-    Args:
-        parameters: The parameters.
-        fixed: Whether those that are fixed are shown.
-    """
+def parameter_table(result: Result) -> Table:
+    """Every parameter; base and tool fixed at zero are left out, and all fixed ones of an evaluation."""
     rows: list[tuple[str, ...]] = []
-    for p in parameters:
+    for p in result.parameters:
         unit = SHOWN[p.unit][1]
         if p.identifiability != "fixed":
             cells = figure(p.estimate, p.unit), figure(p.sigma, p.unit), unit, figure(p.correction, p.unit, "+")
             prior = figure(p.prior_sigma, p.unit, none="")
             rows.append((p.name, *cells, figure(p.nominal, p.unit), prior, p.identifiability))
-        elif fixed and (p.nominal != 0.0 or not p.name.startswith(("base.", "tool."))):
+        elif not result.evaluated_only and (p.nominal != 0.0 or not p.name.startswith(("base.", "tool."))):
             rows.append((p.name, figure(p.estimate, p.unit), "", unit, "", "", "", "fixed"))
-    return rows
+    headings = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
+    return table_of(headings, rows, left="lrrlrrrl")
 
 
-def _parameters(result: Result) -> RenderableType:
-    rows = parameter_rows(result.parameters, fixed=not result.evaluated_only)
-    return table_of(PARAMETER_HEADINGS, rows, left="lrrlrrrl")
-
-
-TOLERANCE_HEADINGS = ("", "specified", "estimated", "", "ratio", "from", "to", "corrections that count")
-
-
-def tolerance_rows(result: Result) -> list[tuple[str, ...]]:
-    """A row of cells for each scale; prior sigmas themselves only where those of a scale are all the same."""
+def _tolerances(result: Result) -> Table:
+    """Each scale of prior sigmas; these themselves only where those of a scale are all the same."""
     by_name = {p.name: p for p in result.parameters}
     rows: list[tuple[str, ...]] = []
     for one in result.tolerance_scales or ():
         members = [by_name[name] for name in one.parameters]
         first = members[0].prior_sigma
-        same = len({(p.unit, f"{p.prior_sigma or 0.0:.6g}") for p in members}) == 1 and first is not None
+        same = len({(p.unit, f"{p.prior_sigma or 0.0:.6g}") for p in members}) == 1
         factor, unit, _ = SHOWN[members[0].unit]
         sigmas = (f"{first / one.scale * factor:.3g}", f"{first * factor:.3g}", unit) if same and first else ("",) * 3
         ratios = f"{one.scale:.3g}", f"{one.low:.2g}", f"{one.high:.2g}", f"{one.seen:.1f} of {len(one.parameters)}"
         rows.append((one.group, *sigmas, *ratios))
-    return rows
+    headings = ("", "specified", "estimated", "", "ratio", "from", "to", "corrections that count")
+    return table_of(headings, rows, left="rrrl")
 
 
-def _combinations(result: Result) -> RenderableType:
+def _combinations(result: Result) -> Table:
     rows = [
         (p.name, figure(p.sigma_of_combination, p.unit), SHOWN[p.unit][1], format_combination(p.stands_for))
         for p in result.parameters
@@ -366,30 +358,29 @@ def format_combination(factors: Mapping[str, float]) -> str:
     return " ".join(terms).removeprefix("+ ")
 
 
-def _suspicious_rows(residuals: pl.DataFrame | None, result: Result) -> list[RenderableType]:
+def _suspicious_rows(residuals: pl.DataFrame | None, result: Result, most: int) -> list[Section]:
     """The fitted rows that are larger than noise, then the test rows, the worst first; none if they were not saved."""
+    sections: list[Section] = []
     if residuals is None:
-        return []
-    parts: list[RenderableType] = []
+        return sections
     for split, word in (("train", ""), ("test", "test ")):
         judged = residuals.filter((residuals["split"] == split) & residuals["excluded"].is_null())
         suspects = judged.filter(judged["suspect"])
-        if len(suspects):
-            suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
-            lines = [*_poses_in_common(judged, suspects, result), *_labels_in_common(judged, suspects)]
-            parts += section(f"Suspicious {word}rows", *indented(lines), _suspects(suspects))
-    return parts
+        suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
+        lines = [*_poses_in_common(judged, suspects, result), *_labels_in_common(judged, suspects)]
+        sections += section(f"Suspicious {word}rows", *indented(lines), _suspects(suspects, most))
+    return sections
 
 
-def _suspects(suspects: pl.DataFrame, limit: int = 5) -> RenderableType:
+def _suspects(suspects: pl.DataFrame, most: int) -> Table:
     more = [name for name in ("table", "of") if name in suspects.columns]
     rows: list[tuple[Any, ...]] = []
-    for row in suspects.head(limit).fill_null("").iter_rows(named=True):
+    for row in suspects.head(most).fill_null("").iter_rows(named=True):
         residual = figure(row["residual"], row["unit"], "+"), SHOWN[row["unit"]][1]
         names = row["a"], row["b"], row["kind"], *(row[name] for name in more)
         rows.append((*names, *residual, f"{row['studentised']:+.1f}", row["flag"]))
-    if len(suspects) > limit:
-        rows.append(("", "", f"and {len(suspects) - limit} more", *[""] * (4 + len(more))))
+    if len(suspects) > most:
+        rows.append(("", "", f"and {len(suspects) - most} more", *[""] * (4 + len(more))))
     headings = ("a", "b", "", *more, "residual", "", "in its sigma", "")
     return table_of(headings, rows, left=f"lll{'l' * len(more)}rlrl")
 
@@ -434,73 +425,72 @@ def _labels_in_common(judged: pl.DataFrame, suspects: pl.DataFrame) -> Iterator[
             yield f"{count} suspicious rows are of {name}, as are {of_all} of all {len(judged)} rows"
 
 
-def _suspicious_configurations(result: Result, limit: int = 8) -> list[RenderableType]:
+def _suspicious_configurations(result: Result, most: int = 8) -> list[Section]:
     """The configurations whose residuals together are larger than noise."""
     found = result.suspect_configurations
-    rows = [(c.id, f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}") for c in found[:limit]]
+    rows = [(c.id, f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}") for c in found[:most]]
     table = table_of(("", "rows", "chi-square", "expected"), rows)
-    more = indented([f"and {shortened([c.id for c in found[limit:]], 8)}"] if len(found) > limit else [])
-    return section("Suspicious configurations", table, *more) if found else []
+    more = [f"and {shortened([c.id for c in found[most:]], 8)}"] if len(found) > most else []
+    return section("Suspicious configurations", table, *indented(more))
 
 
-def _joint_values(found: Calibrated, limit: int = 5) -> list[RenderableType]:
+def _joint_values(found: Calibrated, most: int = 5) -> list[Section]:
     """Estimated joint positions compared with the readings, joint by joint, and the suspicious readings."""
     values, configurations = found.result.joint_values, found.configurations
     if values is None:
         return []
     units = [found.robot.joints[j].unit for j in values.joints]
     sigma = "specified" if (found.result.noise_factors or {}).get("joint", 1.0) == 1.0 else "estimated"
-    rows = [
-        (name, figure(values.sigma[k], units[k]), SHOWN[units[k]][1], f"{values.mean[k]:+z.3f}", _scatter(values, k))
-        for k, name in enumerate(values.names)
-    ]
-    table = table_of(("", sigma, "", f"mean error / {sigma}", "scatter"), rows, left="lrl")
-    parts = section(f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})", table)
-    wrong = []
-    for i, k in values.suspects[:limit]:
-        at = int(values.configurations[i])
+    rows, wrong = [], []
+    for k, (name, unit) in enumerate(zip(values.names, units, strict=True)):
+        scatter = "-" if np.isnan(values.scatter[k]) else f"{values.scatter[k]:.3f}"
+        rows.append((name, figure(values.sigma[k], unit), SHOWN[unit][1], f"{values.mean[k]:+z.3f}", scatter))
+    for i, k in values.suspects[:most]:
+        at, unit = int(values.configurations[i]), units[k]
         name = str(at) if configurations is None else configurations["id"][at]
-        error = figure(values.error[i, k], units[k], "+")
-        wrong.append((name, values.names[k], error, SHOWN[units[k]][1], f"{values.studentised[i, k]:+.1f}"))
-    if len(values.suspects) > limit:
-        wrong.append(("", f"and {len(values.suspects) - limit} more", "", "", ""))
-    more = table_of(("", "", "error", "", "in its sigma"), wrong, left="llrl")
-    return parts + (section("Suspicious joint readings", more) if wrong else [])
-
-
-def _scatter(values: JointErrors, k: int) -> str:
-    scatter = values.scatter[k]
-    return "-" if np.isnan(scatter) else f"{scatter:.3f}"
-
-
-_LANDMARKS = {kind.name: kind.heading for kind in LANDMARKS.values() if kind.heading}
-"""Heading of each kind of landmark."""
-
-
-def _landmarks(landmarks: Sequence[LandmarkEstimate], limit: int = 8) -> list[RenderableType]:
-    """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
-    parts: list[RenderableType] = []
-    for kind, title in _LANDMARKS.items():
-        chosen, rows = [p for p in landmarks if p.kind == kind], []
-        for p in chosen[:limit]:
-            units = ["" if kind == "unknown" else unit for unit in p.units]
-            xyz = "  ".join(figure(v, unit) for v, unit in zip(p.xyz.tolist(), units, strict=True))
-            sigma = "  ".join(figure(v, unit) for v, unit in zip(p.sigma.tolist(), units, strict=True))
-            rows.append((p.name, f"{p.n}", xyz, "±", "known" if not p.sigma.any() else sigma))
-        if len(chosen) > limit:
-            rows.append((f"and {len(chosen) - limit} more", "", "", "", ""))
-        parts += section(title, table_of(("", "rows", "estimate", "", "sigma"), rows, left="lrrlr")) if chosen else []
-    return parts
-
-
-def _frame(frame: FrameEstimate) -> RenderableType:
-    rows = [
-        ("xyz", "  ".join(figure(v, "m") for v in frame.xyz.tolist()), "mm"),
-        ("± along its axes", "  ".join(figure(v, "m") for v in frame.sigma[3:].tolist()), "mm"),
-        ("quaternion xyzw", "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist()), ""),
-        ("± about its axes", "  ".join(figure(v, "rad") for v in frame.sigma[:3].tolist()), "deg"),
+        error = figure(values.error[i, k], unit, "+"), SHOWN[unit][1]
+        wrong.append((name, values.names[k], *error, f"{values.studentised[i, k]:+.1f}"))
+    if len(values.suspects) > most:
+        wrong.append(("", f"and {len(values.suspects) - most} more", "", "", ""))
+    title = f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})"
+    return [
+        *section(title, table_of(("", sigma, "", f"mean error / {sigma}", "scatter"), rows, left="lrl")),
+        *section("Suspicious joint readings", table_of(("", "", "error", "", "in its sigma"), wrong, left="llrl")),
     ]
-    return table_of(("", "", ""), rows, left="lrl")
+
+
+def _landmarks(landmarks: Sequence[LandmarkEstimate], most: int = 8) -> list[Section]:
+    """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
+    sections: list[Section] = []
+    for kind, title in ((kind.name, kind.heading) for kind in LANDMARKS.values() if kind.heading):
+        chosen, rows = [p for p in landmarks if p.kind == kind], []
+        for p in chosen[:most]:
+            units = ["" if kind == "unknown" else unit for unit in p.units]
+            xyz, sigma = _vector(p.xyz, *units), _vector(p.sigma, *units)
+            rows.append((p.name, f"{p.n}", xyz, "±", sigma if p.sigma.any() else "known"))
+        if len(chosen) > most:
+            rows.append((f"and {len(chosen) - most} more", "", "", "", ""))
+        sections += section(title, table_of(("", "rows", "estimate", "", "sigma"), rows, left="lrrlr"))
+    return sections
+
+
+def _frames(result: Result) -> list[Section]:
+    """The estimated measurement frames."""
+    sections: list[Section] = []
+    for symbol, frame in result.frames.items():
+        which = "" if len(result.tables) == 1 else f" of {result.tables[int(symbol[2:-1])][0]}"
+        rows = [
+            ("xyz", _vector(frame.xyz, *"mmm"), "mm"),
+            ("± along its axes", _vector(frame.sigma[3:], *"mmm"), "mm"),
+            ("quaternion xyzw", "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist()), ""),
+            ("± about its axes", _vector(frame.sigma[:3], *["rad"] * 3), "deg"),
+        ]
+        sections += section(f"Measurement frame (world_T_base{which})", table_of(("", "", ""), rows, left="lrl"))
+    return sections
+
+
+def _vector(values: Floats, *units: str) -> str:
+    return "  ".join(figure(v, unit) for v, unit in zip(values.tolist(), units, strict=True))
 
 
 def summary(result: Result, most: int = 3) -> list[str]:
@@ -536,19 +526,6 @@ def _rms_lines(result: Result) -> Iterator[str]:
         ]
         if found:
             yield f"{split} residuals, RMS: {', '.join(found)}"
-
-
-_NOTEBOOK = """<p>{% for text in lines %}{{ text }}<br>{% endfor %}</p>
-<table><thead><tr>{% for cell in headings %}<th>{{ cell }}</th>{% endfor %}</tr></thead><tbody>
-{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</tbody></table>"""
-
-
-def parameter_table_html(result: Result) -> str:
-    """The summary and the parameters as HTML, for a notebook."""
-    from jinja2 import Environment
-
-    values = {"headings": PARAMETER_HEADINGS, "rows": parameter_rows(result.parameters), "lines": summary(result)}
-    return Environment(autoescape=True).from_string(_NOTEBOOK).render(values)
 
 
 def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
@@ -616,30 +593,20 @@ def _is_rotation(p: ParameterEstimate) -> bool:
 
 def _undetermined(solution: Solution, assessed: Assessment) -> Iterator[str]:
     """What fixes the parameters that the data alone do not determine."""
-    estimated, before = set(assessed.names), solution.before[solution.problem.variables.robot_span]
-    at_start = dict(zip(names_of(solution.problem.robot.parameters), before, strict=True))
-
-    def what_fixes(p: ParameterEstimate) -> str:
-        if p.name in estimated and p.prior_sigma is not None:
-            return "{} are not identifiable from these data; their priors fix them"
-        if abs(p.correction) <= UNMOVED:
-            return "{} are not identifiable from these data; they stay at nominal"
-        if solution.problem.options.gauge == "keep":
-            return "{} stand for their combinations with parameters that stay at nominal"
-        if p.sigma is not None:
-            return "{} are not identifiable from these data; priors of parameters in combination with them fix them"
-        if abs(p.estimate - at_start[p.name]) <= UNMOVED:
-            return "nothing fixes {}: they are where the first fit, of frame, base and tool alone, left them"
-        return "nothing fixes {} completely: they are where steps of minimum norm left them, which is not nominal"
-
+    estimated, keep = set(assessed.names), solution.problem.options.gauge == "keep"
     fixed: dict[str, list[ParameterEstimate]] = {}
     for p in assessed.estimates.parameters:
         if p.identifiability in ("relative", "ineffective"):
-            fixed.setdefault(what_fixes(p), []).append(p)
-    for sentence, parameters in fixed.items():
-        names = [p.name for p in parameters]
-        if sentence.startswith("nothing"):
-            shown = ((p, *SHOWN[p.unit]) for p in parameters)
-            names = [f"{p.name} ({rounded(p.correction * f, digits, '+')} {unit})" for p, f, unit, digits in shown]
-        text = sentence.format(shortened(names, 6 if sentence.startswith("nothing") else 12))
-        yield text if len(parameters) > 1 else text.replace(" are ", " is ").replace("they stay", "it stays")
+            if p.name in estimated and p.prior_sigma is not None:
+                what = "not identifiable from these data, fixed by their priors: {}"
+            elif abs(p.correction) <= UNMOVED:
+                what = "not identifiable from these data, kept at nominal: {}"
+            elif keep:
+                what = "standing for combinations with parameters that stay at nominal: {}"
+            elif p.sigma is not None:
+                what = "not identifiable from these data, fixed by priors of parameters in combination with them: {}"
+            else:
+                what = "fixed by nothing, moved from nominal by steps of minimum norm: {}"
+            fixed.setdefault(what, []).append(p)
+    for what, parameters in fixed.items():
+        yield what.format(shortened([p.name for p in parameters], 12))

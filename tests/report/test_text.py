@@ -144,7 +144,7 @@ def test_the_report_names_the_frame_and_what_is_not_identifiable():
     assert found["Measurement frame (world_T_base)"].splitlines()[0].split()[:3] == ["xyz", "-0.5077", "0.0507"]
     assert "unknown  mm" in found["Measurement frame (world_T_base)"]
     assert found["Not identifiable from these data"].splitlines()[1].startswith("d2  the measurement is blind to the")
-    assert "  d2 is not identifiable from these data; it stays at nominal\n" in found["Notes"]
+    assert "  not identifiable from these data, kept at nominal: d2\n" in found["Notes"]
     assert found["Notes"].endswith("no test rows: the prediction of new configurations was not checked")
 
 
