@@ -27,7 +27,7 @@ from fg_calib.prediction.tool_pose import ExpectedError, expected_error
 from fg_calib.robot.kinematics import without_rigid_motion
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.acceptance import Acceptance, accept
-from fg_calib.statistics.covariance import Spread, spread_of, with_left_out, with_unsure_tolerances
+from fg_calib.statistics.covariance import Spread, spread_of, with_left_out
 from fg_calib.statistics.cross_validation import CrossValidation
 from fg_calib.statistics.estimates import Estimates, estimates_at
 from fg_calib.statistics.goodness_of_fit import Fit, chi_square, judge_fit
@@ -284,7 +284,7 @@ def assess(solution: Solution) -> Assessment:
 def _assess(solution: Solution) -> Assessment:
     problem = solution.problem
     spread = spread_of(solution)
-    whole = with_unsure_tolerances(solution, with_left_out(solution, spread))
+    whole = with_left_out(solution, spread)
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     table = residual_table(solution)
     goodness = judge_without_outliers(solution, spread, table, judge_fit(solution, spread, table))

@@ -139,11 +139,11 @@ class ToleranceScales(FrozenArrays):
 
     Attributes:
         scales: Group by group.
-        unsure: What not knowing them adds to the covariance of the estimate, shape (n_columns, n_columns).
+        added: What not knowing them adds to the covariance of the estimate, shape (n_columns, n_columns).
     """
 
     scales: tuple[ToleranceScale, ...]
-    unsure: Floats
+    added: Floats
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ _N_HALVINGS = 8
 """How often such a step is halved."""
 
 _N_NEAR = 20
-"""Starts near where the arm is to stay: for a pose, and again for one that was reached far from there."""
+"""Starts near where the arm is to stay."""
 
 _AT_ONCE = 5000
 """Targets at once: so many fit caches and memory, and progress is reported between them."""
@@ -231,19 +231,6 @@ def _reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats
         others = solve(rows, None, N_STARTS)
         q[rows[others.reached]] = others.readings[others.reached]
         reached[rows] = others.reached
-    changed = np.abs(q - near).max(axis=1)
-    rows = np.flatnonzero(reached & (changed > LARGE_CHANGE))
-    if len(rows) and not anywhere:  # near a singularity the steps may have ended on another branch
-        spread = changed[rows, None, None] * np.linspace(0.0, 1.0, _N_NEAR)[:, None]
-        about = np.random.default_rng(0).normal(size=(len(rows), _N_NEAR, robot.n_joints))
-        starts = np.clip(near[rows, None] + spread * about, *robot.limits.T)
-        others = solve(np.repeat(rows, _N_NEAR), starts.reshape(-1, robot.n_joints), 1)
-        candidates = others.readings.reshape(starts.shape)
-        change = np.abs(candidates - near[rows, None]).max(axis=2)
-        change[~others.reached.reshape(change.shape)] = np.inf
-        best = change.argmin(axis=1)
-        better = change[np.arange(len(rows)), best] < changed[rows]
-        q[rows[better]] = candidates[better, best[better]]
     rows = np.flatnonzero(~reached)
     if rotation is not None and len(rows):
         points = solve_inverse(robot, position[rows], near=near[rows], n_starts=_N_NEAR)

@@ -22,9 +22,6 @@ Verdict = Literal["pass", "fail", "not evaluated"]
 LEAST = 5
 """Measurements that must have been held out for a limit to be judged by them."""
 
-_NAMED = 3
-"""Measurements that a reason names."""
-
 
 @dataclass(frozen=True)
 class Judgement:
@@ -37,8 +34,7 @@ class Judgement:
         noise: RMS of the specified noise of these rows.
         n: Number of measurements held out.
         verdict: Whether the arm keeps to it.
-        reason: Why that was not evaluated, which few measurements alone are why it failed, or which arm it was that
-            passed, where it was not the calibrated one; empty otherwise.
+        reason: Why that was not evaluated, or which arm it was that passed, where it was not the calibrated one.
         table: Name of the table; empty where there is one alone.
     """
 
@@ -111,17 +107,9 @@ def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str
         "the error is not known": not np.isfinite(held.after),
     }
     verdict: Verdict = "fail" if exceeds else "pass"
-    reason = (_blame(held.far) if held.rest <= limit else "") if exceeds else f"new rows, by {held.by}" * bool(held.by)
+    reason = f"new rows, by {held.by}" * (bool(held.by) and not exceeds)
     for doubt, applies in reasons.items():
         if applies:
             verdict, reason = "not evaluated", doubt
             break
     return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason, held.table)
-
-
-def _blame(far: Sequence[str]) -> str:
-    """The reason where outliers alone exceed a limit."""
-    more = len(far) - _NAMED
-    names = ", ".join(far[:_NAMED]) + (f" and {more} more" if more > 0 else "")
-    which, them = ("which are outliers", "them") if len(far) > 1 else ("which is an outlier", "it")
-    return f"within the limit without {names}, {which}: look at {them}"

@@ -208,13 +208,16 @@ def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot
 def with_left_out(solution: Solution, spread: Spread) -> Spread:
     """The covariance of all parameters, those among them that were left out to fix the gauge: see the module's head.
 
+    Where prior sigmas were estimated, what is not known of these is added.
+
     Args:
         solution: The solution.
         spread: That of what was estimated.
     """
     problem = solution.problem
     if problem.whole is None:
-        return spread
+        added = 0.0 if solution.estimated_tolerances is None else solution.estimated_tolerances.added
+        return replace(spread, tangent=spread.tangent + added, actual=spread.actual + added)
     variables, own_scales = problem.whole.variables, spread.variables.scales
     tolerances = [p.tolerance for p in problem.whole.estimated if p.name not in spread.variables.names]
     known = np.array([t is not None for t in tolerances], dtype=np.bool_)
@@ -233,19 +236,6 @@ def with_left_out(solution: Solution, spread: Spread) -> Spread:
         loose=loose(spread.loose, M, errors),
         loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),
     )
-
-
-def with_unsure_tolerances(solution: Solution, spread: Spread) -> Spread:
-    """The covariance with what it adds that tolerances were estimated, and are not known; the same where they are.
-
-    Args:
-        solution: The solution.
-        spread: That with the tolerances taken as known.
-    """
-    scales = solution.estimated_tolerances
-    if scales is None:
-        return spread
-    return replace(spread, tangent=spread.tangent + scales.unsure, actual=spread.actual + scales.unsure)
 
 
 def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:

@@ -26,7 +26,8 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -35,8 +36,8 @@ from pydantic import computed_field
 from scipy import special
 
 from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName
-from fg_calib.graph.problem import Problem, linear_system, mahalanobis_distances, noises_at
+from fg_calib.graph.noise_models import JOINT_NOISE
+from fg_calib.graph.problem import Problem, linear_system, mahalanobis_distances
 from fg_calib.graph.robust import effect, tuning, weight
 from fg_calib.graph.solver import Solution
 from fg_calib.measurements.residuals import squares_along
@@ -530,8 +531,7 @@ class RowStatistics:
 
     def _fit_kinds(self, part: JudgedRows, excess: Floats, known: bool) -> tuple[KindFit, ...]:
         """The fit of each of the table's groups, whose chi-square has a mean lower by `excess`."""
-        specified, private = self._specified_sigmas()
-        found = []
+        factors, found = self.problem.state.factors, list[KindFit]()
         for code, (number, family) in enumerate(self.table.groups):
             chosen = part.of_kind(code)
             if not len(chosen):
@@ -540,9 +540,11 @@ class RowStatistics:
             total, mean = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen]))
             expected, degrees, size = mean - excess[code], part.degrees(chosen), np.abs(self.studentised[rows])
             enough = expected >= 1.0
-            factor = own_factor = self.problem.state.factors.get((number, family), 1.0)
-            if (number, family) in self._with_joint_noise():
-                factor = float(np.sqrt(np.mean(self.table.sigma[rows] ** 2) / np.mean(specified[rows] ** 2)))
+            own_factor, total_variance = factors.get((number, family), 1.0), float(np.mean(self.table.sigma[rows] ** 2))
+            joint_variance = float(np.mean(self._joint_variance[rows]))
+            own_variance = max(total_variance - joint_variance, 0.0) / own_factor**2
+            specified = own_variance + joint_variance / factors.get(JOINT_NOISE, 1.0) ** 2
+            factor = float(np.sqrt(total_variance / specified)) if joint_variance else own_factor
             p_value = (
                 upper_probability(total / mean, degrees, part.degrees_of_noise(chosen)) if enough and known else None
             )
@@ -551,7 +553,7 @@ class RowStatistics:
                     kind=family,
                     unit=self.table.unit(family),
                     n=len(rows),
-                    stated_sigma_rms=float(np.sqrt(np.mean(self.table.sigma[rows] ** 2))) / factor,
+                    stated_sigma_rms=float(np.sqrt(total_variance)) / factor,
                     factor=factor,
                     seen_over_stated=factor * float(np.sqrt(total / expected)) if enough else np.nan,
                     chi2=total,
@@ -562,37 +564,21 @@ class RowStatistics:
                     degrees=degrees,
                     table=number,
                     n_beyond=int(np.sum(size > suspect_level(len(rows)))),
-                    own_sigma_rms=float(np.sqrt(np.mean(private[rows] ** 2))),
+                    own_sigma_rms=float(np.sqrt(own_variance)),
                     own_factor=own_factor,
                 )
             )
         return tuple(found)
 
-    def _with_joint_noise(self) -> set[NoiseName]:
-        """Groups of rows that have noise of the joint readings."""
-        return {
-            (noise.series.table, name.partition(".")[0])
-            for noise in self._noises
-            if any(source.name == "joints" and source.loading.any() for source in noise.sources)
-            for name in noise.series.kind.names
-        }
-
-    def _specified_sigmas(self) -> tuple[Floats, Floats]:
-        """1 sigma of each row with all noise as specified, and that without the joints', shapes (n,)."""
-        problem, noises, total = self.problem, self._noises, self.table.sigma
-        if problem.state.factors:
-            as_specified = replace(problem, state=replace(problem.state, factors={}))
-            noises = noises_at(as_specified, self.solution.parameters, at_readings=True)
-            total = np.concatenate([noise.sigma[noise.series.measured] for noise in noises])
-        if not any(source.name == "joints" for noise in noises for source in noise.sources):
-            return total, total
-        private = total**2
-        for number, noise in enumerate(noises):
-            for source in noise.sources:
-                if source.name == "joints":
-                    variance = np.einsum("nii->ni", source.variance)[noise.series.measured]
-                    private[self.table.rows_of(number)] -= variance
-        return total, np.sqrt(np.maximum(private, 0.0))
+    @cached_property
+    def _joint_variance(self) -> Floats:
+        """Variance of each row by the noise of the joint readings, shape (n,)."""
+        variance = np.zeros(self.table.n)
+        for number, noise in enumerate(self._noises):
+            for source in (source for source in noise.sources if source.name == "joints"):
+                of_rows = np.einsum("nii->ni", source.variance)
+                variance[self.table.rows_of(number)] += of_rows[noise.series.measured]
+        return variance
 
     def _predict(self, test: Integers, squares: Floats, kept: Integers, of_kept: RowErrors) -> JudgedRows:
         """The predicted rows that can be judged: those known, and no outliers.
@@ -614,11 +600,14 @@ class RowStatistics:
             covariance = covariance.over(np.sqrt(means))
             with np.errstate(invalid="ignore"):
                 self.studentised[rows] = table.after[rows] / (table.sigma[rows] * np.sqrt(means))
-        estimated, joint = set(self.solution.estimated_noise or ()), self._with_joint_noise()
+        estimated, joint = (
+            set(self.solution.estimated_noise or ()),
+            set(table.group[self._joint_variance > 0.0].tolist()),
+        )
         degrees = {
             code: max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
             for code, group in enumerate(table.groups)
-            if group in estimated or (JOINT_NOISE in estimated and group in joint)
+            if group in estimated or (JOINT_NOISE in estimated and code in joint)
         }
         return JudgedRows(table, rows, squares[judged] / means, np.ones(len(rows)), covariance, self._shared, degrees)
 

@@ -365,10 +365,7 @@ def judge_priors(solution: Solution, spread: Spread) -> PriorFit | None:
         solution: The solution.
         spread: Its covariance.
     """
-    return _judged(*_judged_rows(solution, spread))
-
-
-def _judged(names: tuple[str, ...], z: Floats, A: Floats, n_places: int) -> PriorFit | None:
+    names, z, A = _judged_rows(solution, spread)
     if not len(z):
         return None
     chi2, expected, square = float(z @ z), float(np.trace(A)), float(np.sum(A * A))
@@ -380,15 +377,15 @@ def _judged(names: tuple[str, ...], z: Floats, A: Floats, n_places: int) -> Prio
         chi2=chi2,
         expected=max(expected, 0.0),
         p_value=float(special.gammaincc(nu / 2.0, nu / 2.0 * chi2 / expected)) if nu else None,
-        beyond=tuple(_beyond(names, z, A, len(z) - n_places)),
+        beyond=tuple(_beyond(names, z, A, len(_prior_parameters(solution.problem.variables)))),
     )
 
 
-def _judged_rows(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats, int]:
-    """What prior rows are of, z, its covariance A, and how many rows at their end are of places."""
+def _judged_rows(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats]:
+    """What prior rows are of, those of landmarks last; z, and its covariance A."""
     problem, variables = solution.problem, solution.problem.variables
-    of_parameters, z, P = _of_parameters(variables, solution.parameters)
-    names = list(of_parameters)
+    z, P = prior_rows(variables, solution.parameters)
+    names = [p.name for p in _prior_parameters(variables)]
     z_places, P_places = unknown_prior_rows(variables, solution.parameters)
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
@@ -402,14 +399,7 @@ def _judged_rows(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], F
                 item = unknowns.items[v.number]
                 names += [f"{item.kind.name} {item.name}"] * len(v.prior[0])
     A = np.eye(len(own)) - P @ (2.0 * spread.tangent - spread.actual) @ P.T - own @ own.T
-    return tuple(names), np.concatenate([z, z_places]), A, len(z_places)
-
-
-def _of_parameters(variables: Variables, parameters: Floats) -> tuple[tuple[str, ...], Floats, Floats]:
-    """What the robot's prior rows are of, z, and its derivatives, shape (n, n_columns)."""
-    z, P = prior_rows(variables, parameters)
-    owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
-    return tuple(p.name for p in owned if p.tolerance is not None) if len(z) else (), z, P
+    return tuple(names), np.concatenate([z, z_places]), A
 
 
 MAX_CORRECTION = 1e50

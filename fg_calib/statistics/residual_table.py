@@ -75,8 +75,6 @@ class HeldOut:
         after: With the calibrated arm.
         noise: Of the noise as specified.
         few: Whether they are few for the frame, base or tool that were fitted to them.
-        far: Names of the outliers among them, the farthest first; empty if there is none.
-        rest: With the calibrated arm, without the outliers.
         by: Which arm predicted them if not the calibrated one, whose errors are at most as large.
     """
 
@@ -87,17 +85,14 @@ class HeldOut:
     after: Figure
     noise: Figure
     few: bool = False
-    far: tuple[str, ...] = ()
-    rest: Figure = np.nan
     by: str = ""
 
 
 def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
     """Several groups of measurements of one kind together, under the name of one table."""
     n = np.array([part.n for part in parts])
-    near = n - [len(part.far) for part in parts]
 
-    def rms(of: str, n: Integers = n) -> float:
+    def rms(of: str) -> float:
         return float(np.sqrt(n @ np.array([getattr(part, of) for part in parts]) ** 2 / n.sum()))
 
     return replace(
@@ -108,8 +103,6 @@ def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
         after=rms("after"),
         noise=rms("noise"),
         few=any(part.few for part in parts),
-        far=tuple(dict.fromkeys(name for part in parts for name in part.far)),
-        rest=rms("rest", near),
     )
 
 
@@ -302,28 +295,9 @@ class ResidualTable(FrozenArrays):
                     float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma)
                 )
                 few = bool(len(rows) < ROWS_PER_FITTED * self.n_fitted)
-                far, rest = self._outliers(rows, np.flatnonzero(first[rows]))
                 table = labels[number] if len(labels) > 1 else ""
-                found.append(HeldOut(table, family, n, before, after, noise, few, far, rest))
+                found.append(HeldOut(table, family, n, before, after, noise, few))
         return tuple(found)
-
-    def _outliers(self, rows: Integers, begins: Integers) -> tuple[tuple[str, ...], float]:
-        """Names of the few measurements that no chance puts as far beyond the median, and RMS of the others.
-
-        Args:
-            rows: Of the measurements, all of one kind.
-            begins: Which of them begin a measurement's.
-        """
-        squares, in_sigma = (np.add.reduceat(v[rows] ** 2, begins) for v in (self.after, self.after / self.sigma))
-        n, (degrees, of) = len(begins), np.unique(np.diff(begins, append=len(rows)), return_inverse=True)
-        typical = max(float(np.median(in_sigma / special.chdtri(degrees, 0.5)[of])), 1.0)
-        far = in_sigma > typical * special.chdtri(degrees, CHANCE / n)[of]
-        if not far.any() or np.sum(far) > MAX_OUTLIER_SHARE * n:
-            return (), float(np.sqrt(squares.sum() / n))
-        worst = np.flatnonzero(far)[np.argsort(-in_sigma[far], kind="stable")]
-        ends = [(self.a[i], self.b[i]) for i in rows[begins[worst]].tolist()]
-        names = tuple("-".join(self.names[end] for end in pair if end >= 0) for pair in ends)
-        return names, float(np.sqrt(squares[~far].sum() / (n - np.sum(far))))
 
     def rows_of(self, number: int) -> slice:
         """The rows of a series: those that were measured, one measurement's after the other."""
