@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.robot.model import Axis, Robot
-from fg_calib.simulation.scenario import Box
+
+if TYPE_CHECKING:  # pages draw arms without reading scenarios
+    from fg_calib.simulation.scenario import Box
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
