@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 from paper import paper_scenario
 from validation import scenario_of, without_rigid_motion
 
-from fg_calib import Scenario, build_problem, design, pose, simulate, solve
+from fg_calib import Scenario, build_problem, design, simulate, solve
+from fg_calib.robot import pose
 from fg_calib.simulation import GivenReadings
 
 Floats = NDArray[np.float64]

@@ -41,22 +41,11 @@ from common import COLOURS, MM, Question, Row, Task, by_cell, clean, rms, run, s
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fg_calib import (
-    Measurements,
-    Pairing,
-    Robot,
-    Scenario,
-    Simulation,
-    build_problem,
-    observe_structure,
-    pose,
-    read_scenario,
-    simulate,
-    solve,
-)
+from fg_calib import Measurements, Pairing, Robot, Scenario, build_problem, observe_structure, simulate, solve
 from fg_calib.baseline import fit_least_squares, real_errors
 from fg_calib.observability.cramer_rao import Bound, cramer_rao
-from fg_calib.simulation import Placement
+from fg_calib.robot import pose
+from fg_calib.simulation import Placement, Simulation, read_scenario
 
 Floats = NDArray[np.float64]
 

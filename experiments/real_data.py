@@ -39,7 +39,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Calibration, Robot, build_problem, calibrate_job, pose, read_job, solve
+from fg_calib import Calibration, Robot, build_problem, calibrate_job, read_job, solve
+from fg_calib.robot import pose
 
 Floats = NDArray[np.float64]
 
@@ -88,7 +89,7 @@ def ur10_poses(task: Task) -> Row:
     if data is None:
         return {}
     found = calibrate_ur10(data, every, model="pose", frame="unknown")
-    table = found.assessment.residuals
+    table = found.assessment.fit.residuals
     row = fit_result(found)
     for kind in ("position", "orientation"):
         chosen = table.test & np.char.startswith(table.kind, kind)

@@ -33,9 +33,10 @@ from common import HERE, Question, Row, Task, run
 from scipy.spatial.transform import Rotation
 
 import fg_calib
-from fg_calib import Measurements, Robot, assess, build_problem, calibrate_job, pose, read_job, read_robot, solve
+from fg_calib import Measurements, Robot, assess, build_problem, calibrate_job, read_job, read_robot, solve
 from fg_calib.report.figures import Drawn
 from fg_calib.report.html import build_page
+from fg_calib.robot import pose
 
 ROOT = HERE.parent
 EXAMPLE = Path(fg_calib.__file__).parent / "examples" / "space-robot"

@@ -54,12 +54,12 @@ from fg_calib import (
     assess,
     build_problem,
     calibrate,
-    pose,
-    read_scenario,
     simulate,
     solve,
 )
 from fg_calib.observability.cramer_rao import cramer_rao
+from fg_calib.robot import pose
+from fg_calib.simulation import read_scenario
 from fg_calib.statistics import estimate_tolerances
 
 Floats = NDArray[np.float64]

@@ -11,6 +11,7 @@ Names are imported when they are first used, so that `fg-calib --help` need not 
 from __future__ import annotations
 
 import logging
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from fg_calib._lazy import attach
@@ -45,9 +46,10 @@ __version__ = "0.1.0"
 _import, __dir__ = attach(
     __name__,
     {
-        "fg_calib.assessment": "Assessment assess solve_job",
+        "fg_calib.assessment": "Assessment assess",
         "fg_calib.baseline.comparison": "compare",
         "fg_calib.batch": "calibrate_jobs",
+        "fg_calib.calibration": "Calibration calibrate calibrate_job",
         "fg_calib.designs.design": "Design design",
         "fg_calib.errors": "CalibrationError InputError ProblemError SolverError",
         "fg_calib.exports.export": "export",
@@ -63,30 +65,10 @@ _import, __dir__ = attach(
         "fg_calib.measurements.table": "KnownPoint CustomMeasurements Table",
         "fg_calib.observability.identifiability": "observe_configurations observe_structure",
         "fg_calib.options": "Limits Options Pairing",
-        "fg_calib.predictions": "correct predict write_prediction",
+        "fg_calib.predictions": "correct predict",
         "fg_calib.robot.model": "Robot",
         "fg_calib.simulation.scenario": "Scenario",
         "fg_calib.simulation.simulator": "simulate",
-        # former names at the top, until all callers import them from the folders
-        "fg_calib.baseline": "Comparison LeastSquares fit_least_squares",
-        "fg_calib.calibration": "Calibration calibrate calibrate_job write_report",
-        "fg_calib.diagnostics": "Inspection SetupCheck check_setup inspect_job",
-        "fg_calib.diagnostics.multistart": "multistart",
-        "fg_calib.executors": "Failure dask_executor local_processes map_jobs",
-        "fg_calib.exports": "Export",
-        "fg_calib.graph": "levenberg_marquardt_params problem_of",
-        "fg_calib.io": "Column Targets Units read_measurements read_result read_targets read_urdf write_robot",
-        "fg_calib.measurements": "Camera",
-        "fg_calib.monitoring": "Check Explanation",
-        "fg_calib.observability": "Identifiability",
-        "fg_calib.observability.cramer_rao": "Bound cramer_rao",
-        "fg_calib.prediction": "PredictedErrors Correction",
-        "fg_calib.report": "comparison_document format_comparison format_identifiability format_inspection "
-        "inspection_document observability_document write_comparison write_observability",
-        "fg_calib.robot": "Inverse pose solve_inverse",
-        "fg_calib.simulation": "BoardViews GivenReadings RandomReadings Simulation TargetViews read_scenario "
-        "write_simulation",
-        "fg_calib.statistics": "estimate_noise estimate_tolerances",
     },
 )
 
@@ -134,7 +116,7 @@ __all__ = [
 ]
 """The names of most users: 40. Others are public in the folders: `fg_calib.io`, `fg_calib.statistics`, ..."""
 
-_READERS = {"Robot": ("from_urdf", "read_urdf"), "Measurements": ("from_frame", "read_measurements")}
+_READERS = {"Robot": ("from_urdf", "urdf", "read_urdf"), "Measurements": ("from_frame", "tables", "read_measurements")}
 """Constructors that read files, which the folders of these classes do not import: they are attached here."""
 
 
@@ -142,8 +124,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name from the module that has it."""
     found = _import(name)
     if name in _READERS:
-        constructor, reader = _READERS[name]
-        setattr(found, constructor, staticmethod(_import(reader)))
+        constructor, module, reader = _READERS[name]
+        setattr(found, constructor, staticmethod(getattr(import_module(f"fg_calib.io.{module}"), reader)))
     return found
 
 

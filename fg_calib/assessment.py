@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -171,41 +170,6 @@ class Assessment(FrozenArrays):
     def trustworthy(self) -> bool:
         """Whether nothing speaks against the result."""
         return not self.verdict.errors
-
-    def __getattr__(self, name: str) -> Any:
-        path = _FORMER.get(name)
-        if path is None:
-            raise AttributeError(name)
-        found: Any = self
-        for part in path.split("."):
-            found = getattr(found, part)
-        return found
-
-
-_FORMER = {
-    "parameters": "estimates.parameters",
-    "frame": "estimates.frame",
-    "frames": "estimates.frames",
-    "points": "estimates.landmarks",
-    "joint_values": "estimates.joint_errors",
-    "chi2": "fit.chi_square.value",
-    "dof": "fit.chi_square.dof",
-    "expected_chi2": "fit.chi_square.expected",
-    "chi2_bounds": "fit.chi_square.bounds",
-    "p_value": "fit.chi_square.p_value",
-    "reduced_chi2": "fit.chi_square.reduced",
-    "residuals": "fit.residuals",
-    "goodness": "fit.goodness",
-    "priors": "fit.priors",
-    "findings": "verdict.errors",
-    "cautions": "verdict.cautions",
-    "reservations": "verdict.warnings",
-    "setup": "verdict.setup",
-    "noise_like": "verdict.noise_like",
-    "change": "verdict.change",
-    "folds": "cross_validation",
-}
-"""Attributes of the assessment before it had parts."""
 
 
 class _CheckedFunction:

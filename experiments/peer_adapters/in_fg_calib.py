@@ -6,6 +6,7 @@ import numpy as np
 import protocol
 
 import fg_calib
+from fg_calib.robot import pose
 
 FRAME = ("x", "y", "z", "yaw", "pitch", "roll")
 JOINT = ("a", "alpha", "d", "theta", "beta")
@@ -81,7 +82,7 @@ class Solve(Prepared):
         """By the robot's values."""
         import chain
 
-        there, world = fg_calib.pose(self.arm, q), chain.frame_matrix(self.frame)
+        there, world = pose(self.arm, q), chain.frame_matrix(self.frame)
         return world[:3, 3] + there.position @ world[:3, :3].T, world[:3, :3] @ there.rotation
 
 

@@ -40,12 +40,12 @@ from fg_calib.graph.problem import Problem
 from fg_calib.graph.solver import Solution
 from fg_calib.graph.variables import corrections_of
 from fg_calib.job import Job
+from fg_calib.parallel import single_threaded
 from fg_calib.prediction.tool_pose import PoseRms, errors_at, judged_configurations, pose_rms
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.rotations import rotation_vector
 from fg_calib.statistics.residual_table import residual_table
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 
@@ -191,8 +191,8 @@ def compare(job: Job) -> Comparison:
         errors_before=judge.errors(before),
         judged_on=judged_on,
         n_judged=len(readings),
-        findings=assessed.findings,
-        units={family: assessed.residuals.unit(family) for family in assessed.residuals.families},
+        findings=assessed.verdict.errors,
+        units={family: assessed.fit.residuals.unit(family) for family in assessed.fit.residuals.families},
     )
 
 

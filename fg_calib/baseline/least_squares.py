@@ -54,10 +54,10 @@ from fg_calib.options import (
     check_names,
     check_number,
 )
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
 from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

@@ -25,17 +25,15 @@ from fg_calib.designs.from_job import pool_for_more_rows, pool_of_rows, solve_fo
 from fg_calib.designs.information import N_TASK, Posterior, Task, build_system, needs_fit
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.executors import tell
 from fg_calib.job import Job
 from fg_calib.measurements.table import Table
 from fg_calib.observability.indices import Observability
 from fg_calib.options import Pairing, check, check_flag, check_number
+from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction.tool_pose import PoseRms
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import Configurations, Scenario
-from fg_calib.sizes import MOST_DRAWN
-from fg_calib.threads import single_threaded
+from fg_calib.simulation.scenario import MOST_DRAWN, Configurations, Scenario
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -32,10 +32,10 @@ from fg_calib.measurements.limits import outside_limits
 from fg_calib.measurements.table import Table
 from fg_calib.observability.identifiability import Identifiability, identifiability_of
 from fg_calib.observability.reasons import NOT_EXCITED
+from fg_calib.parallel import single_threaded
 from fg_calib.prediction.tool_pose import ExpectedError, expected_error
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.covariance import spread_of, with_left_out
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

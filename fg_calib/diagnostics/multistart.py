@@ -24,9 +24,9 @@ from fg_calib.graph.normal_system import SIGNAL_FLOOR
 from fg_calib.graph.problem import Problem, at_parameters, directions, with_factors
 from fg_calib.graph.solver import Solution, SolverOptions, solve
 from fg_calib.measurements.kind import Kind
+from fg_calib.parallel import one_blas_thread
 from fg_calib.robot.kinematics import forward
 from fg_calib.statistics.covariance import spread_of
-from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 

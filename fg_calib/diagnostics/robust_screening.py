@@ -27,9 +27,9 @@ from fg_calib.graph.problem import Problem, relinearized_at
 from fg_calib.measurements.kinds import INSTRUMENTS
 from fg_calib.measurements.table import Table
 from fg_calib.options import Options
+from fg_calib.parallel import one_blas_thread
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.residual_table import MAX_OUTLIER_SHARE
-from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 

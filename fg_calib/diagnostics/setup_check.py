@@ -27,8 +27,8 @@ from fg_calib.graph.problem import Problem
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model
+from fg_calib.parallel import one_blas_thread
 from fg_calib.robot.model import Robot
-from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 

@@ -41,10 +41,10 @@ from fg_calib.options import (
     as_pairing,
     check_names,
 )
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import forward
 from fg_calib.robot.model import Robot, names_of
-from fg_calib.threads import single_threaded
 
 _log = logging.getLogger(__name__)
 

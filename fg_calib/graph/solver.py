@@ -47,8 +47,8 @@ from fg_calib.graph.problem import (
 from fg_calib.graph.robust import Weighting, constants, cost
 from fg_calib.graph.variables import Variables
 from fg_calib.options import Options, check_number
+from fg_calib.parallel import one_blas_thread
 from fg_calib.robot.model import Robot
-from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 

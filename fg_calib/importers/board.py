@@ -19,7 +19,6 @@ from typing import Annotated, Literal
 from pydantic import Field, StrictBool
 
 from fg_calib.errors import InputError
-from fg_calib.executors import tell
 from fg_calib.importers.opencv import (
     CalibrationBoard,
     charuco_board,
@@ -33,6 +32,7 @@ from fg_calib.io.units import Units, UnitsOfFile
 from fg_calib.io.yaml import Count, Positive, Schema, read_yaml, shown, validate
 from fg_calib.measurements.dataset import Floats
 from fg_calib.options import did_you_mean
+from fg_calib.parallel import tell
 
 MAX_COUNT = 1000
 """Columns or rows."""

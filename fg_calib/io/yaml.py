@@ -13,10 +13,10 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from fg_calib import errors
+from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import read_text
 from fg_calib.options import did_you_mean
-from fg_calib.sizes import LEAST_SIZE, MOST_SIZE, ORDINARY
 
 
 def _refuse_bool(value: object) -> object:

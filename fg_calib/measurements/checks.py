@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fg_calib.arguments import LEAST_SIZE, ORDINARY
 from fg_calib.arrays import (
     NORM_TOLERANCE,
     Floats,
@@ -27,7 +28,6 @@ from fg_calib.errors import InputError
 from fg_calib.measurements.limits import limit_hint, outside_limits
 from fg_calib.options import check_names
 from fg_calib.robot.model import Robot
-from fg_calib.sizes import LEAST_SIZE, ORDINARY
 
 _log = logging.getLogger(__name__)
 

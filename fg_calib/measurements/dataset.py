@@ -28,7 +28,9 @@ from fg_calib.measurements.checks import (
 from fg_calib.options import Pairing, check_number, listed
 from fg_calib.robot.kinematics import over_spans
 from fg_calib.robot.rotations import rotation_angle
-from fg_calib.sizes import MOST_PAIRS
+
+MOST_PAIRS = 10_000_000
+"""The largest number of pairs that are formed from poses."""
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

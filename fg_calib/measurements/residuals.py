@@ -25,9 +25,9 @@ from scipy.linalg import lapack
 
 from fg_calib.arrays import Brief
 from fg_calib.measurements.kind import Frames, Kind, checked_rows
+from fg_calib.parallel import one_blas_thread
 from fg_calib.robot.kernels import LANES, fill
 from fg_calib.robot.kinematics import Chain, forward, over_spans, turning_of_base
-from fg_calib.threads import one_blas_thread
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

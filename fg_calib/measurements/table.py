@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arguments import check_fields
+from fg_calib.arguments import LEAST_SIZE, ORDINARY, check_fields
 from fg_calib.arrays import Brief, FrozenArrays, as_figures, as_floats, check_sizes, require
 from fg_calib.errors import InputError, ProblemError, shown
 from fg_calib.initialization.camera import Camera
@@ -26,7 +26,6 @@ from fg_calib.options import (
     listed,
     set_checked,
 )
-from fg_calib.sizes import LEAST_SIZE, ORDINARY
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

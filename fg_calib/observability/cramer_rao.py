@@ -39,9 +39,9 @@ from fg_calib.graph.problem import correlation, named_triangle
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.kinematics import build_chain, forward, without_rigid_motion
 from fg_calib.robot.model import Robot
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

@@ -24,8 +24,8 @@ from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
 from fg_calib.observability.reasons import LostDirection, explain
 from fg_calib.options import FrameKnowledge, Model, Pairing, check_names, check_number
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.model import Robot, names_of
-from fg_calib.threads import single_threaded
 
 
 def observability_of(

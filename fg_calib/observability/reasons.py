@@ -20,9 +20,9 @@ from fg_calib.observability.confounding import Confounding
 from fg_calib.observability.indices import Observability
 from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.observability.random_configurations import at_random_configurations
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.inverse import random_readings
 from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arrays import Floats, FrozenArrays, as_floats, as_rotations
 from fg_calib.errors import InputError
-from fg_calib.executors import tell
 from fg_calib.measurements.checks import check_readings
+from fg_calib.parallel import tell
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
 from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, solve_inverse
 from fg_calib.robot.kinematics import build_chain, forward

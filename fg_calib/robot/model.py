@@ -24,7 +24,9 @@ from fg_calib.arrays import as_figures, as_floats, check_sizes, require, shape_o
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
 from fg_calib.robot.rotations import yaw_pitch_roll
-from fg_calib.sizes import MOST_JOINTS
+
+MOST_JOINTS = 200
+"""The largest number of moving joints: the work grows with its third power."""
 
 _log = logging.getLogger(__name__)
 

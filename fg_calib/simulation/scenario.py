@@ -131,7 +131,9 @@ from fg_calib.options import (
     known_names,
 )
 from fg_calib.robot.model import Robot, names_of, tolerance_kind
-from fg_calib.sizes import MOST_DRAWN
+
+MOST_DRAWN = 1_000_000
+"""The largest number of configurations that are drawn."""
 
 Floats = NDArray[np.float64]
 Class = TypeVar("Class")

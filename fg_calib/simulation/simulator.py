@@ -20,6 +20,7 @@ from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Measurements, Noise
 from fg_calib.measurements.table import Table
 from fg_calib.options import check_number
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.measure import Scene, Visits, draw_frame, generator_of, measure, merge_truths
 from fg_calib.simulation.scenario import (
@@ -33,7 +34,6 @@ from fg_calib.simulation.scenario import (
     values_by_name,
 )
 from fg_calib.simulation.views import find_readings
-from fg_calib.threads import single_threaded
 
 Floats = NDArray[np.float64]
 

@@ -62,9 +62,9 @@ from fg_calib.graph.problem import Problem, correlation, linear_system, relinear
 from fg_calib.graph.solver import Solution, ToleranceScale, ToleranceScales, solve
 from fg_calib.graph.variables import Variables, prior_rows, unknown_prior_rows
 from fg_calib.options import SharedScale
+from fg_calib.parallel import single_threaded
 from fg_calib.robot.model import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
-from fg_calib.threads import single_threaded
 
 SETTLED = 1e-3
 """Relative change of a scale below which it has settled: a hundredth of what it is known to at best."""

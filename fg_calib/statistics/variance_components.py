@@ -43,7 +43,7 @@ from fg_calib.graph.error_states import ErrorStates, WhitenedSeries, block_diago
 from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, RowNoise
 from fg_calib.graph.problem import Problem, linear_system, relinearized_at
 from fg_calib.graph.solver import Solution, SolverOptions, solve
-from fg_calib.threads import single_threaded
+from fg_calib.parallel import single_threaded
 
 Floats = NDArray[np.float64]
 Sparse = scipy.sparse.csr_array

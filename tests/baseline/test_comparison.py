@@ -106,9 +106,9 @@ def test_the_graph_is_the_one_that_calibrate_shows(simulated_job):
     uncertainty = assess(solution)
     graph = found.estimates[0]
     assert np.array_equal(graph.robot.nominal, uncertainty.robot.nominal)
-    assert graph.residual_rms == uncertainty.residuals.rms()
-    assert graph.sigma == {p.name: p.sigma for p in uncertainty.parameters if p.name in uncertainty.names}
-    for name, correction in ((p.name, p.correction) for p in uncertainty.parameters):
+    assert graph.residual_rms == uncertainty.fit.residuals.rms()
+    assert graph.sigma == {p.name: p.sigma for p in uncertainty.estimates.parameters if p.name in uncertainty.names}
+    for name, correction in ((p.name, p.correction) for p in uncertainty.estimates.parameters):
         assert found.correction(graph.robot, name) == correction
 
 

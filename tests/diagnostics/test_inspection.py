@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 from touches import reach
 
-from fg_calib import Job, Measurements, Options, Robot, inspect_job, simulate
+from fg_calib import Job, Measurements, Options, Robot, simulate
+from fg_calib.diagnostics import inspect_job
 from fg_calib.diagnostics import robust_screening as disagreement
 from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import pose

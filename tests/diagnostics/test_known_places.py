@@ -16,7 +16,7 @@ def test_sigmas_of_corrections_are_those_of_the_whole_graph(instrument):
     """Variance of the prior residual is 1 less that of the estimate over the tolerance squared, by a dense inverse."""
     robot, _, table = measured_by(instrument, np.random.default_rng(1), n=15)
     solution = solve(build_problem(robot, table))
-    fit, variables = assess(solution).priors, solution.problem.variables
+    fit, variables = assess(solution).fit.priors, solution.problem.variables
     order = gtsam.Ordering()
     for key in variables.keys:
         order.push_back(key)

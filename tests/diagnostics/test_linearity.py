@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
-from fg_calib import Measurements, Robot, calibrate, pose
+from fg_calib import Measurements, Robot, calibrate
 from fg_calib.assessment import assess
 from fg_calib.diagnostics import linearity
 from fg_calib.diagnostics.linearity import AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
@@ -15,6 +15,7 @@ from fg_calib.diagnostics.verdict import check_linear
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve, unsolved
 from fg_calib.options import Pairing
+from fg_calib.robot import pose
 
 WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}
 SIGMA = 1e-5

@@ -81,7 +81,7 @@ def test_a_start_between_two_optima_is_left(tmp_path):
     assert abs(solution.parameters[i]) == pytest.approx(0.02, abs=1e-4)
     assert len(solution.others) == 1
     second = "a second optimum that the data cannot distinguish from this one: d2"
-    assert any(finding.startswith(second) for finding in assess(solution).findings)
+    assert any(finding.startswith(second) for finding in assess(solution).verdict.errors)
 
 
 def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypatch):
@@ -172,7 +172,7 @@ def test_planes_with_readings_below_what_the_arm_is_off_by_get_their_normals_rig
         found = calibrate(robot, table)
         assert not found.findings
         assert sides(found.solution.problem, found.solution.parameters, normals) == [1.0] * 3
-        assert chi2.cdf(found.uncertainty.chi2, found.uncertainty.dof) < 0.999
+        assert chi2.cdf(found.assessment.fit.chi_square.value, found.assessment.fit.chi_square.dof) < 0.999
         assert error_of(found, true) < 0.999
     assert wrong > 0
 

@@ -97,6 +97,6 @@ def test_what_could_not_be_checked_is_said(monkeypatch):
     m = table.measurements
     wrong = build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])
     found = assess(solve(wrong, SolverOptions(max_iterations=5)))
-    assert any("was not checked for common mistakes (units, signs, columns)" in said for said in found.cautions)
+    assert any("was not checked for common mistakes (units, signs, columns)" in said for said in found.verdict.cautions)
     good = assess(solve(build_problem(robot, [table])))
-    assert not any("was not checked" in said for said in good.cautions)
+    assert not any("was not checked" in said for said in good.verdict.cautions)

@@ -123,8 +123,8 @@ def test_tolerances_stated_too_small_for_all_are_a_finding():
     robot, loose = (small_arm(tolerance={k: f * v for k, v in TOLERANCE.items()}) for f in (1.0, 2.5))
     m = measure(true_robot(loose, rng), 30, rng, sigma=(1e-4, 1e-4))
     found = assess(solve(build_problem(robot, m, model="pose")))
-    assert found.priors.chi2 > 2 * found.priors.expected
-    assert any("specified too small" in finding for finding in found.findings)
+    assert found.fit.priors.chi2 > 2 * found.fit.priors.expected
+    assert any("specified too small" in finding for finding in found.verdict.errors)
 
 
 # --- tables with test rows alone ------------------------------------------------------------------------------------

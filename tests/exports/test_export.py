@@ -10,8 +10,9 @@ from oracle import dh_joint, frame, tool_pose
 from scipy.spatial.transform import Rotation
 from sparing import as_case
 
-from fg_calib import InputError, Robot, export, read_robot, read_urdf
+from fg_calib import InputError, Robot, export, read_robot
 from fg_calib.exports.dh import drawn, in_table, poses
+from fg_calib.io import read_urdf
 
 EXACT = 1e-9  # [m] and [rad], as the issue states
 

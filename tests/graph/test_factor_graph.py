@@ -99,7 +99,7 @@ def test_factors_on_our_variables_are_solved_and_assessed():
         problem.graph.add(factor)
     plain, solution = solve(problem_of()), solve(problem)
     before, after = assess(plain), assess(solution)
-    a3 = next(p for p in after.parameters if p.name == "a3")
+    a3 = next(p for p in after.estimates.parameters if p.name == "a3")
     assert solution.converged
     assert a3.correction == pytest.approx(1e-4, abs=5e-6)  # five of the prior's sigma
     assert a3.sigma < 1e-6
@@ -107,8 +107,10 @@ def test_factors_on_our_variables_are_solved_and_assessed():
     assert own[1].error(plain.values) > 1e3
     assert solution.problem.graph.size() == problem_of().graph.size() + 2
     # One row of the distance and as many of the prior as joint 3 has parameters; no direction more.
-    assert after.dof == before.dof + 1 + len(problem.initial.atVector(gtsam.symbol("K", 3)))
-    assert after.chi2 == pytest.approx(2.0 * solution.problem.graph.error(solution.values), rel=1e-9)
+    assert after.fit.chi_square.dof == before.fit.chi_square.dof + 1 + len(
+        problem.initial.atVector(gtsam.symbol("K", 3))
+    )
+    assert after.fit.chi_square.value == pytest.approx(2.0 * solution.problem.graph.error(solution.values), rel=1e-9)
     C = dense_covariance(solution, problem.variables.n_columns)
     sigma = np.sqrt(np.diag(after.spread.tangent))
     assert sigma == pytest.approx(np.sqrt(np.diag(C)), rel=1e-6)  # conditioning of 1e4 squared times rounding
@@ -128,7 +130,7 @@ def test_a_variable_of_ones_own_is_solved_and_found_again(gauge):
     assert solution.converged
     assert np.linalg.norm(solution.values.atPoint3(ANCHOR) - point) < 0.02  # the arm is off by millimetres
     gained = uncertainty.spread.rank - plain.spread.rank
-    assert uncertainty.dof == plain.dof + 8 - 3 - gained
+    assert uncertainty.fit.chi_square.dof == plain.fit.chi_square.dof + 8 - 3 - gained
     if gauge == "prior":
         C = dense_covariance(solution, problem.variables.n_columns)
         sigma = np.sqrt(np.diag(uncertainty.spread.tangent))
@@ -147,7 +149,7 @@ def test_a_pose_of_ones_own_is_solved():
     problem.initial.insert(key, gtsam.Pose3())
     solution = solve(problem)
     assert solution.values.atPose3(key).equals(mean, 1e-9)
-    assert assess(solution).dof == assess(solve(problem_of())).dof
+    assert assess(solution).fit.chi_square.dof == assess(solve(problem_of())).fit.chi_square.dof
 
 
 @pytest.mark.slow
@@ -158,10 +160,10 @@ def test_what_is_added_determines_what_was_not():
     prior = gtsam.PriorFactorVector(key, problem.initial.atVector(key), gtsam.noiseModel.Isotropic.Sigma(5, 1e-3))
     problem.graph.add(prior)
     found = assess(solve(problem))
-    assert {p.identifiability for p in plain.parameters[6:11]} == {"ineffective", "relative"}
-    assert {p.identifiability for p in found.parameters[6:11]} == {"independent"}
+    assert {p.identifiability for p in plain.estimates.parameters[6:11]} == {"ineffective", "relative"}
+    assert {p.identifiability for p in found.estimates.parameters[6:11]} == {"independent"}
     assert found.identifiability.observability.rank == plain.identifiability.observability.rank + 5
-    assert [p.sigma for p in found.parameters[6:11]] == pytest.approx([1e-3] * 5, rel=1e-9)
+    assert [p.sigma for p in found.estimates.parameters[6:11]] == pytest.approx([1e-3] * 5, rel=1e-9)
 
 
 @pytest.mark.parametrize("change", ["removed", "replaced"])
@@ -203,7 +205,7 @@ def test_factors_added_to_what_was_solved_are_to_be_solved_again():
     solution.problem.graph.add(prior_on_k3(problem))
     with pytest.raises(ProblemError, match=r"^solution\.problem\.graph: 1 factors added since it was solved"):
         assess(solution)
-    assert assess(solve(solution.problem)).dof == assess(solve(problem)).dof + 5
+    assert assess(solve(solution.problem)).fit.chi_square.dof == assess(solve(problem)).fit.chi_square.dof + 5
 
 
 def test_a_start_of_ones_own_is_where_the_solver_begins():
@@ -344,7 +346,7 @@ def test_what_was_solved_with_pairs_and_a_tool_can_be_solved_again():
     m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-3, 1e-3))
     first = solve(build_problem(robot, m, model="distance"))
     again = solve(first.problem)
-    sigma = np.array([p.sigma or np.inf for p in assess(first).parameters])
+    sigma = np.array([p.sigma or np.inf for p in assess(first).estimates.parameters])
     assert np.abs((again.parameters - first.parameters)[: len(sigma)] / sigma).max() < 1e-6
 
 

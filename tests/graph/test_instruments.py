@@ -46,8 +46,8 @@ def test_it_arrives_from_nominal_wherever_things_are(instrument, seed):
     uncertainty = assess(solution)
     assert solution.message == "converged: less than 3e-07 sigma from the optimum"
     assert solution.iterations <= 6
-    assert not uncertainty.findings
-    assert chi2.cdf(uncertainty.chi2, uncertainty.dof) < 0.999
+    assert not uncertainty.verdict.errors
+    assert chi2.cdf(uncertainty.fit.chi_square.value, uncertainty.fit.chi_square.dof) < 0.999
     error, n = errors_of(uncertainty, true)
     assert chi2.cdf(error, n) < 0.999
 
@@ -64,13 +64,13 @@ def test_corners_that_are_far_off_do_not_lead_a_robust_loss_astray():
         clean = measured_by("room", np.random.default_rng(seed))[2].measurements.image
         wrong = np.any(table.measurements.image != clean, axis=1)
         uncertainty = assess(solve(build_problem(robot, table, loss="gnc")))
-        assert not uncertainty.findings
+        assert not uncertainty.verdict.errors
         error, n = errors_of(uncertainty, true)
         assert chi2.cdf(error, n) < 0.999
         told = replace(table, measurements=replace(table.measurements, test=wrong))
         far.append(error)
         oracle.append(errors_of(assess(solve(build_problem(robot, told))), true)[0])
-        assert "reduced chi-square" in assess(solve(build_problem(robot, table))).findings[0]
+        assert "reduced chi-square" in assess(solve(build_problem(robot, table))).verdict.errors[0]
     assert np.sqrt(np.sum(far) / np.sum(oracle)) < 1.15
 
 
@@ -87,14 +87,14 @@ def test_sigmas_are_what_they_are_said_to_be(instrument, sigma_joint):
         uncertainty = assess(solve(build_problem(robot, table)))
         error, n = errors_of(uncertainty, true)
         nees.append(error / n)
-        p.append(uncertainty.p_value)
+        p.append(uncertainty.fit.chi_square.p_value)
     assert abs(np.mean(nees) - 1.0) < 4.0 * np.sqrt(2.0 / n / len(nees))
     assert kstest(p, "uniform").pvalue > 1e-3
 
 
 def test_targets_that_are_known_hold_the_others_and_those_with_a_tolerance_move():
     robot, _, table = measured_by("targets known", np.random.default_rng(2))
-    points = {p.name: p for p in assess(solve(build_problem(robot, table))).points}
+    points = {p.name: p for p in assess(solve(build_problem(robot, table))).estimates.landmarks}
     assert [points[f"t{i}"].kind for i in range(3)] == ["target"] * 3
     assert points["t0"].xyz == pytest.approx(TARGETS[0], abs=0.0)
     assert not points["t0"].sigma.any()
@@ -119,7 +119,9 @@ def test_several_rows_of_a_configuration_share_its_joint_noise():
     )
     apart = assess(solve(build_problem(robot, Table(alone, "position", frame="unknown"))))
     ratio = np.sqrt(np.diag(together.covariance) / np.diag(apart.covariance))
-    known = np.array([p.identifiability == "independent" for p in together.parameters if p.name in together.names])
+    known = np.array(
+        [p.identifiability == "independent" for p in together.estimates.parameters if p.name in together.names]
+    )
     assert np.median(ratio[known]) < 0.5
 
 
@@ -175,7 +177,7 @@ CHOICES = [{"loss": "huber"}, {"encoder": "estimated"}, {"estimate_noise": True}
 def test_losses_joint_values_and_noise_work_with_it(instrument, choices):
     robot, true, table = measured_by(instrument, np.random.default_rng(6), sigma_joint=2e-4)
     result = calibrate(robot, [table], **choices)
-    error, n = errors_of(result.uncertainty, true)
+    error, n = errors_of(result.assessment, true)
     assert result.solution.converged
     assert error / n < 3.0
 
@@ -244,9 +246,9 @@ def test_what_has_one_name_in_two_tables_is_one_thing(instrument, second):
     assert two.converged
     assert two.cost == pytest.approx(one.cost, rel=1e-9)
     n = len(robot.parameters)
-    sigma = np.array([p.sigma for p in assess(one).parameters])
+    sigma = np.array([p.sigma for p in assess(one).estimates.parameters])
     assert np.all(np.abs(two.parameters - one.parameters)[:n] <= 1e-5 * np.nan_to_num(sigma))
-    names = [f"{p.kind} {p.name}" for p in assess(two).points if p.kind != "offset"]
+    names = [f"{p.kind} {p.name}" for p in assess(two).estimates.landmarks if p.kind != "offset"]
     assert len(names) == len(set(names))
 
 
@@ -263,7 +265,7 @@ def test_what_one_table_says_of_an_anchor_holds_for_all_and_two_may_not_differ()
     for said in (0, 1):
         tables = in_two(table, np.arange(10))
         tables[1 - said] = replace(tables[1 - said], known={})
-        points = {p.name: p for p in assess(solve(build_problem(robot, tables))).points}
+        points = {p.name: p for p in assess(solve(build_problem(robot, tables))).estimates.landmarks}
         assert points["a0"].xyz == pytest.approx(place, abs=0.0)
         assert not points["a0"].sigma.any()
     tables[0] = replace(tables[0], known={"a0": other})

@@ -92,7 +92,7 @@ def test_estimated_joint_values_give_the_optimum_over_everything(optimum):
     robot, m, model, values, chi2 = optimum
     solution = solve(build_problem(robot, m, model=model, encoder="estimated"))
     assert solution.converged
-    sigma = np.array([p.sigma or 1.0 for p in assess(solution).parameters])
+    sigma = np.array([p.sigma or 1.0 for p in assess(solution).estimates.parameters])
     away = (solution.parameters[: len(values)] - values) / sigma
     assert np.max(np.abs(away)) < 1e-4
     assert 2.0 * solution.cost == pytest.approx(chi2, rel=1e-6)
@@ -190,13 +190,16 @@ def test_eliminated_joint_values_have_the_optimum_over_everything(kind, model, o
     assert solution.converged
     values, chi2, covariance, dof = everything_given_the_noise(solution)
     of_solution = assess(solution)
-    sigma = np.array([p.sigma or 1.0 for p in of_solution.parameters])
+    sigma = np.array([p.sigma or 1.0 for p in of_solution.estimates.parameters])
     assert np.max(np.abs(solution.parameters[: len(values)] - values) / sigma) < 1e-4
     assert 2.0 * solution.weighted_cost == pytest.approx(chi2, rel=1e-6)
     if "loss" in options:
-        assert of_solution.dof == assess(solve(build_problem(robot, m, model=model, **options))).dof
+        assert (
+            of_solution.fit.chi_square.dof
+            == assess(solve(build_problem(robot, m, model=model, **options))).fit.chi_square.dof
+        )
     else:
-        assert of_solution.dof == dof
+        assert of_solution.fit.chi_square.dof == dof
         assert np.allclose(of_solution.covariance, covariance, rtol=1e-3, atol=1e-3 * np.abs(covariance).max())
 
 
@@ -279,10 +282,10 @@ def test_both_ways_agree_to_first_order(kind, model, options):
         assert all(s.converged for s in found)
         if options.get("pair_errors") == "independent":
             return  # estimated joint values are shared by nature, propagated noise is not: they differ
-        sigma = np.array([p.sigma or 1.0 for p in assess(found[0]).parameters])
+        sigma = np.array([p.sigma or 1.0 for p in assess(found[0]).estimates.parameters])
         n = len(sigma)
         apart.append(np.max(np.abs(found[0].parameters[:n] - found[1].parameters[:n]) / sigma))
-        assert assess(found[1]).dof == assess(found[0]).dof
+        assert assess(found[1]).fit.chi_square.dof == assess(found[0]).fit.chi_square.dof
     assert apart[0] < 0.5
     # Propagated noise is left once sigmas move by less than 0.1 %.
     assert apart[1] < max(0.05 * apart[0], 2e-3)
@@ -297,7 +300,7 @@ def test_eliminated_joint_values_of_pairs_are_the_same_whichever_way_they_are_el
         monkeypatch.setattr(error_states, "MAX_DENSE", most)
         monkeypatch.setattr(error_states, "MAX_FILL", filled)
         uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation", encoder="estimated")))
-        values = uncertainty.joint_values
+        values = uncertainty.estimates.joint_errors
         found.append([uncertainty.robot.nominal, uncertainty.covariance, values.error, values.sigma])
     sigma = np.sqrt(np.diag(found[0][1]))
     estimated = [robot.index(name) for name in uncertainty.names]
@@ -325,6 +328,6 @@ def test_estimated_joint_values_keep_honest_sigmas():
         at = [robot.index(name) for name in uncertainty.names]
         error = uncertainty.robot.nominal[at] - true.nominal[at]
         nees.append(error @ np.linalg.solve(uncertainty.covariance, error) / len(at))
-        chi2, dof = chi2 + uncertainty.chi2, dof + uncertainty.dof
+        chi2, dof = chi2 + uncertainty.fit.chi_square.value, dof + uncertainty.fit.chi_square.dof
     assert np.mean(nees) == pytest.approx(1.0, abs=4 * np.sqrt(2 / len(at) / n))
     assert chi2 / dof == pytest.approx(1.0, abs=4 * np.sqrt(2 / dof))

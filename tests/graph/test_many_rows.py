@@ -16,9 +16,9 @@ from fg_calib.graph.noise_models import whitening_of
 from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, row_triangles, subsampled
 from fg_calib.measurements import residuals
 from fg_calib.measurements.residuals import pack, unpack
+from fg_calib.parallel import processors
 from fg_calib.robot import kinematics
 from fg_calib.robot.kinematics import SPAN, pose
-from fg_calib.threads import processors
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -145,7 +145,7 @@ def test_every_bit_is_the_same_on_any_number_of_threads(monkeypatch):
             result = Calibration.of(solution, assess(solution), date="2026-01-01T00:00:00+00:00").result
             document = result.document()
             document["solver"].pop("seconds")
-            goodness = assess(solution).goodness
+            goodness = assess(solution).fit.goodness
             arrays = (solution.parameters, solution.problem.rows[0].parts[0].block.data, goodness.leverage)
             found[n] = pickle.dumps((document, [array.tobytes() for array in arrays]))
     finally:

@@ -15,11 +15,12 @@ from sparing import diagonal
 from test_own_kind import measured
 from touches import corners, touch
 
-from fg_calib import Measurements, Robot, read_job, write_robot
+from fg_calib import Measurements, Robot, read_job
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.io import write_robot
 from fg_calib.io.columns import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.table import Table
@@ -95,11 +96,11 @@ def test_the_optimum_is_that_over_everything(sigma_joint):
     solution = solve(build_problem(robot, tables, **options))
     values, least = everything(robot, tables, sigma_joint)
     uncertainty = assess(solution)
-    sigma = np.array([p.sigma or 1.0 for p in uncertainty.parameters])
+    sigma = np.array([p.sigma or 1.0 for p in uncertainty.estimates.parameters])
     assert solution.converged
     assert np.abs((solution.parameters[: len(values)] - values) / sigma).max() < 1e-4  # where scipy stops
-    assert uncertainty.chi2 == pytest.approx(least, rel=1e-6)
-    assert uncertainty.dof == 3 * 16 + 15 - 6
+    assert uncertainty.fit.chi_square.value == pytest.approx(least, rel=1e-6)
+    assert uncertainty.fit.chi_square.dof == 3 * 16 + 15 - 6
     propagated = solve(build_problem(robot, tables))
     apart = np.abs((propagated.parameters[: len(values)] - values) / sigma).max()
     assert apart < (0.5 if sigma_joint else 1e-4)  # to first order the same
@@ -151,8 +152,8 @@ def test_each_table_has_its_own_frame():
     first, second = (measure(true, 25, rng, sigma=SIGMA, frame=frame) for frame in (PLACED, ELSEWHERE))
     tables = [Table(first, "pose", frame="unknown"), Table(second, "position", frame="unknown")]
     uncertainty = assess(solve(build_problem(robot, tables)))
-    assert len(uncertainty.frames) == 2
-    for found, (turn, shift) in zip(uncertainty.frames, (PLACED, ELSEWHERE), strict=True):
+    assert len(uncertainty.estimates.frames) == 2
+    for found, (turn, shift) in zip(uncertainty.estimates.frames, (PLACED, ELSEWHERE), strict=True):
         off = np.concatenate([(turn.inv() * Rotation.from_quat(found.quaternion_xyzw)).as_rotvec(), found.xyz - shift])
         assert np.all(np.abs(off[:3]) < 6 * found.sigma[:3])
         assert np.linalg.norm(off[3:]) < 6 * np.linalg.norm(found.sigma[3:])
@@ -175,12 +176,12 @@ def test_order_of_tables_and_one_table_in_parts_change_nothing():
     whole = assess(solve(build_problem(robot, m, model="pose")))
     for tables in (parts, parts[::-1]):
         found = assess(solve(build_problem(robot, tables, model="pose")))
-        assert np.array([p.estimate for p in found.parameters]) == pytest.approx(
-            np.array([p.estimate for p in whole.parameters]),
-            abs=1e-6 * np.nanmin([p.sigma or 1 for p in whole.parameters]),
+        assert np.array([p.estimate for p in found.estimates.parameters]) == pytest.approx(
+            np.array([p.estimate for p in whole.estimates.parameters]),
+            abs=1e-6 * np.nanmin([p.sigma or 1 for p in whole.estimates.parameters]),
         )
-        assert found.chi2 == pytest.approx(whole.chi2, rel=1e-9)
-        assert found.dof == whole.dof
+        assert found.fit.chi_square.value == pytest.approx(whole.fit.chi_square.value, rel=1e-9)
+        assert found.fit.chi_square.dof == whole.fit.chi_square.dof
 
 
 @pytest.mark.slow
@@ -205,13 +206,18 @@ def test_a_point_of_one_name_in_two_tables_is_one_point():
 
     first, second = part(of_first, none, "first.csv"), part(~of_first, m.groups.pairs, "second.csv")
     one, two = (assess(solve(build_problem(robot, given, model="distance"))) for given in (m, [first, second]))
-    assert [p.name for p in two.points] == [p.name for p in one.points] == ["g0", "g1", "g2"]
-    assert [p.n for p in two.points] == [8, 8, 8]
-    sigma = np.array([p.sigma or np.inf for p in one.parameters])
-    off = (np.array([p.estimate for p in two.parameters]) - [p.estimate for p in one.parameters]) / sigma
+    assert [p.name for p in two.estimates.landmarks] == [p.name for p in one.estimates.landmarks] == ["g0", "g1", "g2"]
+    assert [p.n for p in two.estimates.landmarks] == [8, 8, 8]
+    sigma = np.array([p.sigma or np.inf for p in one.estimates.parameters])
+    off = (
+        np.array([p.estimate for p in two.estimates.parameters]) - [p.estimate for p in one.estimates.parameters]
+    ) / sigma
     # Both are solved until a step is 1e-9 sigma; sums in another order.
     assert np.abs(off).max() < 1e-6
-    assert (two.dof, two.chi2) == (one.dof, pytest.approx(one.chi2, rel=1e-9))
+    assert (two.fit.chi_square.dof, two.fit.chi_square.value) == (
+        one.fit.chi_square.dof,
+        pytest.approx(one.fit.chi_square.value, rel=1e-9),
+    )
 
 
 def test_an_unknown_of_one_name_started_at_two_places_is_refused():
@@ -250,7 +256,7 @@ def test_noise_is_estimated_table_by_table():
     factors = found.problem.state.factors
     assert factors[0, "position"] == pytest.approx(2.0, rel=0.2)  # 80 rows of three: 5 % each, four sigma
     assert factors[1, "position"] == pytest.approx(0.2, rel=0.2)
-    kinds = assess(found).goodness.kinds
+    kinds = assess(found).fit.goodness.kinds
     assert [(kind.table, kind.kind) for kind in kinds] == [(0, "position"), (1, "position")]
 
 
@@ -266,8 +272,8 @@ def test_a_gross_error_in_one_table_is_left_out():
     assert weights[1][3] < 0.01
     assert weights[0].min() > 0.1
     rows = assess(solution)
-    worst = rows.goodness.suspects[0]
-    assert (rows.residuals.series[worst], rows.residuals.measurement[worst]) == (1, 3)
+    worst = rows.fit.goodness.suspects[0]
+    assert (rows.fit.residuals.series[worst], rows.fit.residuals.measurement[worst]) == (1, 3)
 
 
 # --- through files ----------------------------------------------------------------------------------------------------
@@ -305,7 +311,7 @@ def test_a_job_of_several_tables_runs(fg_calib, tmp_path):
     assert (ended.code, ended.err) == (0, "")
     assert "position of tracker.csv" in ended.out
     assert "distance of bar.csv" in ended.out
-    assert document["chi2"] == pytest.approx(expected.chi2, rel=1e-6)
+    assert document["chi2"] == pytest.approx(expected.fit.chi_square.value, rel=1e-6)
     assert document["model"] == "position + distance"
     assert sorted(document["inputs"]) == ["bar.csv", "job.yaml", "lengths.csv", "robot.yaml", "tracker.csv"]
     rows = pl.read_csv(tmp_path / "result" / "residuals.csv")
@@ -471,9 +477,9 @@ def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, en
     pairs = Pairs(a, b, d, nothing, np.full(len(a), 1e-4), nothing, np.zeros(len(a), bool), "pairs.csv")
     tables = [Table(m, "position"), Table(replace(m, position=None, pairs=pairs, source="bar"), "distance")]
     found = assess(solve(build_problem(robot, tables, loss=loss, encoder=encoder)))
-    z = [(p.estimate - t) / p.sigma for p, t in zip(found.parameters, true.nominal, strict=True) if p.sigma]
+    z = [(p.estimate - t) / p.sigma for p, t in zip(found.estimates.parameters, true.nominal, strict=True) if p.sigma]
     assert np.abs(z).max() < 4.5  # of 16 parameters
-    assert not found.findings
+    assert not found.verdict.errors
 
 
 @pytest.mark.slow
@@ -486,7 +492,7 @@ def test_a_loss_that_drops_a_whole_table_is_a_finding():
     bad = replace(bad, position=bad.position + 0.3 * rng.normal(size=(8, 3)), source="bad.csv")
     found = assess(solve(build_problem(robot, [good, bad], model="position", loss="gnc")))
     said = "loss gnc takes 8 of 8 measurements of position of bad.csv for outliers: more than it can tell from noise"
-    assert said in found.findings
+    assert said in found.verdict.errors
 
 
 @pytest.mark.slow
@@ -497,9 +503,9 @@ def test_a_mistake_in_one_table_names_the_table():
     first, second = (measure(true, 30, rng, sigma=(1e-4, 1e-4)) for _ in range(2))
     second = replace(second, position=second.position * 1e3, source="second.csv")
     found = assess(solve(build_problem(robot, [first, second], model="position")))
-    assert found.setup.table == "second.csv"
-    assert found.findings[0].startswith("second.csv: position residuals fall from ")
-    assert "if x, y, z are in mm" in found.findings[0]
+    assert found.verdict.setup.table == "second.csv"
+    assert found.verdict.errors[0].startswith("second.csv: position residuals fall from ")
+    assert "if x, y, z are in mm" in found.verdict.errors[0]
 
 
 @pytest.mark.slow
@@ -514,7 +520,7 @@ def test_another_target_on_the_tool_in_one_table_is_named():
     first = measure(true, 30, rng, sigma=(1e-4, 1e-4))
     second = replace(measure(true.with_values(values), 30, rng, sigma=(1e-4, 1e-4)), source="second.csv")
     found = assess(solve(build_problem(robot, [first, second], model="position")))
-    assert "if tool or base differ from those of the other tables" in found.findings[0]
+    assert "if tool or base differ from those of the other tables" in found.verdict.errors[0]
 
 
 @pytest.mark.slow
@@ -569,9 +575,9 @@ def test_an_anchor_plane_or_board_of_one_name_in_two_tables_is_one(instrument):
     rows = [robot.index(name) for name in whole.names]
     off = (mixed.robot.nominal - whole.robot.nominal)[rows] / np.sqrt(np.diag(whole.covariance))
     assert np.abs(off).max() < 1e-4
-    named = [[p.name for p in u.points if not p.name.startswith("offset of")] for u in (mixed, whole)]
+    named = [[p.name for p in u.estimates.landmarks if not p.name.startswith("offset of")] for u in (mixed, whole)]
     assert named[0] == named[1]
-    assert mixed.chi2 == pytest.approx(whole.chi2, rel=1e-6)
+    assert mixed.fit.chi_square.value == pytest.approx(whole.fit.chi_square.value, rel=1e-6)
 
 
 @pytest.mark.parametrize("apart", [False, True])

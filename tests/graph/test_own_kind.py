@@ -97,15 +97,15 @@ def test_it_is_solved_to_the_optimum_over_everything(sigma_joint):
     solution = solve(build_problem(robot, table, **options))
     values, anchors, least = everything(robot, table, sigma_joint)
     uncertainty = assess(solution)
-    sigma = np.array([p.sigma or 1.0 for p in uncertainty.parameters])
+    sigma = np.array([p.sigma or 1.0 for p in uncertainty.estimates.parameters])
     assert solution.converged
     assert np.abs((solution.parameters[: len(values)] - values) / sigma).max() < 1e-4  # where scipy stops
-    for point, anchor in zip(uncertainty.points, anchors, strict=True):
+    for point, anchor in zip(uncertainty.estimates.landmarks, anchors, strict=True):
         assert np.abs((point.xyz - anchor) / point.sigma).max() < 1e-4
-    assert uncertainty.chi2 == pytest.approx(least, rel=1e-6)
-    assert uncertainty.dof == 24 - 9  # as many priors as unknowns of the arm
-    assert [p.name for p in uncertainty.points] == ["A", "B", "C"]
-    assert [p.n for p in uncertainty.points] == [8, 8, 8]
+    assert uncertainty.fit.chi_square.value == pytest.approx(least, rel=1e-6)
+    assert uncertainty.fit.chi_square.dof == 24 - 9  # as many priors as unknowns of the arm
+    assert [p.name for p in uncertainty.estimates.landmarks] == ["A", "B", "C"]
+    assert [p.n for p in uncertainty.estimates.landmarks] == [8, 8, 8]
 
 
 class Offset(Kind):
@@ -138,8 +138,8 @@ def test_test_rows_of_an_unknown_that_nothing_else_says_are_not_judged():
     m = measure(robot, 40, np.random.default_rng(0), sigma=(1e-4, 1e-4), readings=table.measurements.readings)
     beside = Table(m, "position", own=(replace(own, test=np.ones(40, bool), unknowns=own.unknowns + 0.05),))
     found = assess(solve(build_problem(robot, beside)))
-    assert found.goodness.test is None or found.goodness.test.n_rows == 0
-    assert not any("test rows" in text for text in found.findings)
+    assert found.fit.goodness.test is None or found.fit.goodness.test.n_rows == 0
+    assert not any("test rows" in text for text in found.verdict.errors)
 
 
 def test_a_sigma_that_may_mean_two_things_is_refused():
@@ -170,7 +170,7 @@ def test_sigmas_and_chi_square_are_honest():
         names = list(uncertainty.names)
         off = np.array([uncertainty.robot.nominal[robot.index(n)] - true.nominal[robot.index(n)] for n in names])
         nees += float(off @ np.linalg.solve(uncertainty.covariance, off)) / len(names) / 40
-        fit, dof = fit + uncertainty.chi2, dof + uncertainty.dof
+        fit, dof = fit + uncertainty.fit.chi_square.value, dof + uncertainty.fit.chi_square.dof
     assert nees == pytest.approx(1.0, abs=5 * np.sqrt(2.0 / (40 * len(names))))
     assert 1e-6 < chi2.sf(fit, dof) < 1 - 1e-6
 
@@ -179,7 +179,7 @@ def test_it_has_residuals_goodness_and_predictions():
     robot, _, table = measured(3, n_test=30)
     solution = solve(build_problem(robot, table))
     uncertainty = assess(solution)
-    rows, fit = uncertainty.residuals, uncertainty.goodness
+    rows, fit = uncertainty.fit.residuals, uncertainty.fit.goodness
     assert set(rows.kind) == {"anchor"}
     assert (int(rows.used.sum()), int(rows.test.sum())) == (60, 30)
     (kind,) = fit.kinds
@@ -218,14 +218,24 @@ def test_robust_losses_leave_gross_errors_out(loss):
     without = assess(solve(build_problem(robot, clean)))
     robust = solve(build_problem(robot, table, loss=loss))
     uncertainty = assess(robust)
-    sigma = np.array([p.sigma or 1.0 for p in without.parameters])
-    apart = np.abs([a.estimate - b.estimate for a, b in zip(uncertainty.parameters, without.parameters, strict=True)])
+    sigma = np.array([p.sigma or 1.0 for p in without.estimates.parameters])
+    apart = np.abs(
+        [
+            a.estimate - b.estimate
+            for a, b in zip(uncertainty.estimates.parameters, without.estimates.parameters, strict=True)
+        ]
+    )
     assert robust.converged
     assert (apart / sigma).max() < (2.0 if loss == "huber" else 1.0)  # least squares is off by tens of sigma
     assert np.all(robust.problem.state.weights[0][:4] < 0.1)
     if loss == "gnc":
         assert (apart / sigma).max() < 0.6  # but for clean ones beyond its 99 %
-        assert {int(i) for i in uncertainty.residuals.measurement[uncertainty.goodness.suspects]} >= {0, 1, 2, 3}
+        assert {int(i) for i in uncertainty.fit.residuals.measurement[uncertainty.fit.goodness.suspects]} >= {
+            0,
+            1,
+            2,
+            3,
+        }
 
 
 # --- what is wrong is named -------------------------------------------------------------------------------------------
@@ -311,9 +321,9 @@ def test_an_anchor_that_too_few_lengths_see_is_unknown_and_harms_nothing():
     solution = solve(build_problem(robot, replace(table, own=(few,))))
     uncertainty = assess(solution)
     assert solution.converged
-    assert np.isnan(uncertainty.points[2].sigma).any()
-    assert np.isfinite(uncertainty.points[0].sigma).all()
-    assert uncertainty.dof == len(keep) - 3 - 3 - 2
+    assert np.isnan(uncertainty.estimates.landmarks[2].sigma).any()
+    assert np.isfinite(uncertainty.estimates.landmarks[0].sigma).all()
+    assert uncertainty.fit.chi_square.dof == len(keep) - 3 - 3 - 2
 
 
 def test_reasons_beside_a_kind_of_ones_own_do_not_say_what_it_cannot_see():

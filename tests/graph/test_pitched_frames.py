@@ -95,10 +95,10 @@ def test_cost_and_the_arm_do_not_depend_on_the_pitch_of_a_frame(frame, noise):
             assert solution.converged
             found = assess(solution)
             costs.append(solution.cost)
-            arm = [p for p in found.parameters if "." not in p.name]
+            arm = [p for p in found.estimates.parameters if "." not in p.name]
             arms.append([p.correction for p in arm])
             sigmas.append([p.sigma for p in arm])
-            angles = [p for p in found.parameters if p.name.startswith(frame) and p.unit == "rad"]
+            angles = [p for p in found.estimates.parameters if p.name.startswith(frame) and p.unit == "rad"]
             assert all(p.sigma is None or 1e-6 < p.sigma < 1.0 for p in angles)
             assert all(abs(p.correction) < 0.03 for p in angles)  # ten times what the frame turned
     # the optimum is found to 1e-5 sigma; the linear covariance is the same but for rounding of its decomposition

@@ -16,7 +16,6 @@ from simulated import small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
-from fg_calib import write_robot
 from fg_calib.assessment import assess
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
@@ -25,6 +24,7 @@ from fg_calib.graph.problem import linear_system, named_triangle
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
+from fg_calib.io import write_robot
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements import residuals
 from fg_calib.measurements.dataset import Groups, Noise, Pairs, no_pairs
@@ -192,12 +192,12 @@ def test_groups_are_all_their_pairs(gauge):
     assert one.names == two.names
     # Residuals of 0.1 mm at lever arms of 1 m: derivatives differ by 1e-4 of themselves where they are turned, which
     # directions that are weakly determined magnify.
-    known = np.array([p.sigma is not None for p in two.parameters])
-    assert [p.sigma is not None for p in one.parameters] == list(known)
-    a, b = (np.array([p.estimate for p in u.parameters])[known] for u in (one, two))
-    sigma = np.array([p.sigma for p in two.parameters], dtype=float)[known]
+    known = np.array([p.sigma is not None for p in two.estimates.parameters])
+    assert [p.sigma is not None for p in one.estimates.parameters] == list(known)
+    a, b = (np.array([p.estimate for p in u.estimates.parameters])[known] for u in (one, two))
+    sigma = np.array([p.sigma for p in two.estimates.parameters], dtype=float)[known]
     assert np.abs(a - b).max() <= 1e-2 * sigma.max()
-    assert np.array([p.sigma for p in one.parameters], dtype=float)[known] == pytest.approx(sigma, rel=1e-2)
+    assert np.array([p.sigma for p in one.estimates.parameters], dtype=float)[known] == pytest.approx(sigma, rel=1e-2)
 
 
 def test_without_noise_the_information_is_that_of_all_pairs():
@@ -219,19 +219,21 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is(distances):
     solution = solve(problem)
     assert solution.converged
     uncertainty = assess(solution)
-    by_name = {p.name: p for p in uncertainty.parameters}
+    by_name = {p.name: p for p in uncertainty.estimates.parameters}
     for name in RIGID:
         assert abs(by_name[name].correction) < rounding(1, 1e4)  # without holding it they move by 0.1 mm and more
         assert by_name[name].sigma is None
         assert by_name[name].identifiability == "ineffective"
-    assert all(np.isnan(p.sigma).all() for p in uncertainty.points)
+    assert all(np.isnan(p.sigma).all() for p in uncertainty.estimates.landmarks)
     # Another place to start the points from changes nothing.
     start = problem.start.copy()
     start[problem.variables.nuisance_span] += 0.01 * np.random.default_rng(4).normal(size=12)
     again = solve(replace(problem, start=start))
     span = problem.variables.robot_span
     apart = [
-        abs(again.parameters[span][i] - p.estimate) / p.sigma for i, p in enumerate(uncertainty.parameters) if p.sigma
+        abs(again.parameters[span][i] - p.estimate) / p.sigma
+        for i, p in enumerate(uncertainty.estimates.parameters)
+        if p.sigma
     ]
     assert max(apart) < 1e-3  # sigma; 1e-6 are left to go along each path, which turned derivatives make another
     for name in RIGID:
@@ -272,8 +274,12 @@ def test_a_point_touched_once_tells_nothing_and_a_distance_holds_the_scale():
     assert g == pytest.approx(f, abs=1e-7 * np.abs(f).max())
     assert build(robot, one_more).n_residuals == build(robot, m).n_residuals + 3
     a, b = (assess(solve(build(robot, x, prior=False))) for x in (m, one_more))
-    assert a.dof == b.dof
-    apart = [abs(p.estimate - q.estimate) / p.sigma for p, q in zip(a.parameters, b.parameters, strict=True) if p.sigma]
+    assert a.fit.chi_square.dof == b.fit.chi_square.dof
+    apart = [
+        abs(p.estimate - q.estimate) / p.sigma
+        for p, q in zip(a.estimates.parameters, b.estimates.parameters, strict=True)
+        if p.sigma
+    ]
     assert len(apart) > 5
     assert max(apart) < NEGLIGIBLE
     # Lengths of all links shrunk together satisfy any touches of one point: a direction of its own without distances.
@@ -359,7 +365,7 @@ class Everything:
 
 def sigmas_from(solution, values):
     """The largest difference from other parameters, in sigma."""
-    parameters = assess(solution).parameters
+    parameters = assess(solution).estimates.parameters
     return max(abs(p.estimate - v) / p.sigma for p, v in zip(parameters, values, strict=True) if p.sigma)
 
 
@@ -446,13 +452,13 @@ def test_estimated_joint_values_give_the_optimum_over_arm_points_and_joint_value
     assert sigmas_from(solution, values) < 1e-3
     assert 2.0 * solution.cost == pytest.approx(2.0 * cost, rel=1e-6)
     uncertainty = assess(solution)
-    for p, xyz in zip(uncertainty.points, points, strict=True):
+    for p, xyz in zip(uncertainty.estimates.landmarks, points, strict=True):
         assert sigmas_apart(p.xyz, xyz, p.sigma) < 1e-3
-    assert uncertainty.joint_values.error.ravel() / 2e-3 == pytest.approx(best[everything.parts[2]], abs=1e-3)
+    assert uncertainty.estimates.joint_errors.error.ravel() / 2e-3 == pytest.approx(best[everything.parts[2]], abs=1e-3)
     # Sigmas are those of all unknowns together; turned residuals, 0.1 mm at 1 m, have derivatives that differ by 1e-4.
     J = central_differences(everything.rows, best, 1e-3)
     sigma = everything.tolerance * np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[everything.parts[0]]
-    found = [uncertainty.parameters[i].sigma for i in everything.chosen]
+    found = [uncertainty.estimates.parameters[i].sigma for i in everything.chosen]
     known = [(a, b) for a, b in zip(found, sigma, strict=True) if a]
     assert len(known) > 5
     assert [a for a, _ in known] == pytest.approx([b for _, b in known], rel=1e-2)
@@ -546,8 +552,10 @@ def test_errors_are_as_large_as_the_sigmas_say(options):
         )
         nees.append(error @ np.linalg.solve(uncertainty.covariance, error))
         z.append(error / np.sqrt(np.diag(uncertainty.covariance)))
-        z_points.append([(p.xyz - truth) / p.sigma for p, truth in zip(uncertainty.points, points, strict=True)])
-        fits.append((uncertainty.chi2, uncertainty.expected_chi2))
+        z_points.append(
+            [(p.xyz - truth) / p.sigma for p, truth in zip(uncertainty.estimates.landmarks, points, strict=True)]
+        )
+        fits.append((uncertainty.fit.chi_square.value, uncertainty.fit.chi_square.expected))
     n = len(uncertainty.names)
     low, high = chi2.ppf([1e-4, 1 - 1e-4], runs * n) / runs
     assert low <= np.mean(nees) <= high
@@ -567,7 +575,7 @@ def test_degrees_of_freedom_count_the_points():
     problem = build(robot, m)
     uncertainty = assess(solve(problem))
     assert problem.n_residuals == 3 * 48 + 1
-    assert uncertainty.dof == 145 + problem.n_priors - problem.variables.n_columns - 12
+    assert uncertainty.fit.chi_square.dof == 145 + problem.n_priors - problem.variables.n_columns - 12
     assert linear_system(problem, problem.start).left.A.shape[1] == problem.variables.n_columns
 
 
@@ -580,9 +588,9 @@ def test_test_groups_are_predicted_and_of_mixed_ones_the_train_rows_fitted():
     uncertainty = assess(solution)
     assert problem.n_residuals == 3 * 35 + 1
     assert [v.symbol for v in problem.variables.nuisance] == ["L(0)", "L(1)", "L(2)"]
-    assert [(p.name, p.n) for p in uncertainty.points] == [("g0", 11), ("g1", 12), ("g2", 12), ("g3", 0)]
-    assert np.isnan(uncertainty.points[3].sigma).all()
-    table = uncertainty.residuals
+    assert [(p.name, p.n) for p in uncertainty.estimates.landmarks] == [("g0", 11), ("g1", 12), ("g2", 12), ("g3", 0)]
+    assert np.isnan(uncertainty.estimates.landmarks[3].sigma).all()
+    table = uncertainty.fit.residuals
     touches = np.char.startswith(table.kind, "point")
     assert np.sum(table.test & touches) == 3 * 13
     distances = np.flatnonzero(table.kind == "distance")
@@ -615,8 +623,8 @@ def test_a_distance_to_a_point_of_test_rows_alone_is_a_test_row_whatever_is_said
     stated = replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.zeros(2, dtype=bool))))
     a, b = (solve(build(robot, x)) for x in (m, stated))
     assert np.array_equal(a.parameters, b.parameters)
-    assert np.array_equal(assess(a).residuals.after, assess(b).residuals.after)
-    assert assess(b).residuals.test[-2:].tolist() == [False, True]
+    assert np.array_equal(assess(a).fit.residuals.after, assess(b).fit.residuals.after)
+    assert assess(b).fit.residuals.test[-2:].tolist() == [False, True]
 
 
 @pytest.mark.slow
@@ -630,7 +638,7 @@ def test_groups_and_pairs_work_side_by_side():
     pairs = Pairs(a, b, distance, nothing, np.full(12, 1e-4), nothing, np.zeros(12, dtype=bool))
     both = assess(solve(build(robot, replace(m, pairs=pairs))))
     alone = assess(solve(build(robot, m)))
-    assert both.dof == alone.dof + 12
+    assert both.fit.chi_square.dof == alone.fit.chi_square.dof + 12
     assert both.trustworthy
     assert np.linalg.slogdet(both.covariance)[1] < np.linalg.slogdet(alone.covariance)[1]
 
@@ -641,9 +649,9 @@ def test_other_gauges_predict_the_same(gauge):
     # Tool and arm of ordinary errors; the rows between touches alone are predicted, whatever holds the rest.
     robot, _, _, m = case(tolerance=None, test=(3,))
     found = assess(solve(build(robot, m, gauge=gauge)))
-    after = found.residuals.rms()["test"]["point"]["after"]
+    after = found.fit.residuals.rms()["test"]["point"]["after"]
     other = assess(solve(build(robot, m, gauge="keep" if gauge == "none" else "none")))
-    assert after == pytest.approx(other.residuals.rms()["test"]["point"]["after"], rel=1e-2)
+    assert after == pytest.approx(other.fit.residuals.rms()["test"]["point"]["after"], rel=1e-2)
 
 
 # --- files ----------------------------------------------------------------------------------------------------------

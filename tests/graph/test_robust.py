@@ -199,7 +199,7 @@ def test_sigmas_and_chi_square_hold_with_a_robust_loss(loss, share):
         error = uncertainty.robot.nominal - true.nominal
         error = error[[robot.index(name) for name in uncertainty.names]]
         nees.append(error @ np.linalg.solve(uncertainty.covariance, error) / len(error))
-        chi2, expected = chi2 + uncertainty.chi2, expected + uncertainty.expected_chi2
+        chi2, expected = chi2 + uncertainty.fit.chi_square.value, expected + uncertainty.fit.chi_square.expected
         assert uncertainty.trustworthy
     assert np.mean(nees) == pytest.approx(1.0, abs=0.5 if (loss, share) == ("huber", 0.2) else 0.15)
     assert chi2 / expected == pytest.approx(1.0, abs=0.2)
@@ -215,8 +215,8 @@ def test_the_cost_is_that_before_any_weight():
     assert np.all(weights[bad] == 0.0)
     assert np.sum(weights[~bad] == 0.0) <= 3
     assert set(np.unique(weights)) <= {0.0, 1.0}
-    table = assess(solution).residuals
-    prior = [(p.correction / p.prior_sigma) ** 2 for p in assess(solution).parameters if p.prior_sigma]
+    table = assess(solution).fit.residuals
+    prior = [(p.correction / p.prior_sigma) ** 2 for p in assess(solution).estimates.parameters if p.prior_sigma]
     assert 2 * solution.cost == pytest.approx(
         np.sum((table.after / table.sigma) ** 2) + sum(prior), rel=rounding(1, 10)
     )

@@ -5,7 +5,8 @@ import pytest
 import scipy.optimize
 from tolerances import rounding
 
-from fg_calib import assess, build_problem, read_urdf, simulate, solve
+from fg_calib import assess, build_problem, simulate, solve
+from fg_calib.io import read_urdf
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import Errors, LengthGauge, RandomReadings, Scenario, Spot
@@ -83,7 +84,7 @@ def test_two_arms_in_contact_are_calibrated_as_one_chain(arms):
     solution = solve(build_problem(whole, s.tables))
     found = assess(solution)
     assert solution.converged
-    assert not found.findings
+    assert not found.verdict.errors
     m = s.tables[0].measurements
     assert (m.length == 0.0).all()
     tolerance = np.array([whole.parameters[whole.index(name)].tolerance for name in found.names])
@@ -102,7 +103,7 @@ def test_two_arms_in_contact_are_calibrated_as_one_chain(arms):
     estimate = solution.parameters[[whole.index(name) for name in found.names]] - nominal
     assert (estimate - by_hand.x[:-6]) / np.sqrt(np.diag(found.covariance)) == pytest.approx(0.0, abs=1e-3)
     assert 2.0 * solution.cost == pytest.approx(2.0 * by_hand.cost, rel=1e-6)
-    points = {p.name: p.xyz for p in found.points}
+    points = {p.name: p.xyz for p in found.estimates.landmarks}
     assert points["pin"] == pytest.approx(by_hand.x[-6:-3], abs=1e-7)
     # and it is the truth, within what the sigmas say
     e = estimate + nominal - s.true_robot.nominal[[whole.index(name) for name in found.names]]

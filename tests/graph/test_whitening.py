@@ -321,8 +321,8 @@ def test_a_calibration_in_steps_is_the_dense_one(kind, monkeypatch):
     assert np.abs(apart[estimated] / sigma).max() < np.sqrt(1e-9)
     assert np.sqrt(np.diag(of_steps.covariance)) == pytest.approx(sigma, rel=1e-9 + rounding(1.0, 1e3))
     assert steps.cost == pytest.approx(dense.cost, rel=1e-8)
-    assert of_steps.goodness.studentised == pytest.approx(of_dense.goodness.studentised, rel=1e-4, nan_ok=True)
-    for a, b in zip(of_steps.goodness.kinds, of_dense.goodness.kinds, strict=True):
+    assert of_steps.fit.goodness.studentised == pytest.approx(of_dense.fit.goodness.studentised, rel=1e-4, nan_ok=True)
+    for a, b in zip(of_steps.fit.goodness.kinds, of_dense.fit.goodness.kinds, strict=True):
         assert a.p_value == pytest.approx(b.p_value, rel=1e-4)
         assert a.expected == pytest.approx(b.expected, rel=1e-6)
     bound = 4.0 * np.sqrt(2.0 * dense.problem.n_residuals / error_states.N_PROBES)
@@ -373,7 +373,7 @@ def test_the_covariance_of_pairs_from_poses_is_that_of_the_errors(pairing):
         m = measure(true, 20, rng, sigma=(1e-3, 5e-4), sigma_joint=3e-4)
         uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation", pairing=Pairing(pairing))))
         found.append(normalised_error(true, uncertainty))
-        chi2, dof = chi2 + uncertainty.chi2, dof + uncertainty.expected_chi2
+        chi2, dof = chi2 + uncertainty.fit.chi_square.value, dof + uncertainty.fit.chi_square.expected
     n = len(uncertainty.names)
     assert np.mean(found) == pytest.approx(1.0, abs=4 * np.sqrt(2 / n / n_draws))
     assert chi2 == pytest.approx(dof, rel=0.08)
@@ -426,6 +426,6 @@ def test_chi_square_of_all_pairs_of_small_motions_is_that_of_the_noise():
             sigma_orientation=np.tile(sigma, (30, 1)),
         )
         uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation", pairing=Pairing("all"))))
-        found.append(uncertainty.reduced_chi2)
+        found.append(uncertainty.fit.chi_square.reduced)
     # Some 150 degrees of freedom: a draw's sd is 0.12 and the mean's 0.035.
     assert np.mean(found) == pytest.approx(1.0, abs=0.14)

@@ -9,9 +9,10 @@ import yaml
 from recordings import FORMATS, NAMES, POSE_TYPES, START, BagWriter, arm, record, write_bag
 from sparing import diagonal
 
-from fg_calib import InputError, Robot, read_measurements, read_robot, write_robot
+from fg_calib import InputError, Robot, read_robot
 from fg_calib.importers.bag import read_bag
 from fg_calib.importers.standstill import average_stops, write_stops
+from fg_calib.io import read_measurements, write_robot
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
@@ -89,7 +90,7 @@ def predicted(robot, motion):
     """Positions of the tool at the stops, after the best rigid fit, shape (n, 3), [m]."""
     from scipy.spatial.transform import Rotation
 
-    from fg_calib import pose
+    from fg_calib.robot import pose
 
     p = pose(robot, motion.true_readings).position
     centre = p.mean(axis=0), motion.true_position.mean(axis=0)

@@ -68,8 +68,8 @@ def test_parameters_are_found_within_their_sigmas_from_images(tmp_path, fg_calib
         (tmp_path / "job.yaml").write_text(yaml.safe_dump(job))
         found[model] = result = calibrate_job(tmp_path / "job.yaml")
         assert result.trustworthy, result.findings
-        u = result.uncertainty
-        assert chi2.cdf(u.chi2, u.dof) < 0.999
+        u = result.assessment
+        assert chi2.cdf(u.fit.chi_square.value, u.fit.chi_square.dof) < 0.999
         places = [[p.name for p in true.parameters].index(name) for name in u.names]
         error = u.robot.nominal[places] - true.nominal[places]
         assert chi2.cdf(error @ np.linalg.solve(u.covariance, error), len(places)) < 0.999

@@ -10,16 +10,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import fg_calib
-from fg_calib import (
-    Calibration,
-    InputError,
-    Robot,
-    calibrate_job,
-    read_job,
-    read_measurements,
-    read_robot,
-    read_scenario,
-)
+from fg_calib import Calibration, InputError, Robot, calibrate_job, read_job, read_robot
+from fg_calib.io import read_measurements
+from fg_calib.simulation import read_scenario
 
 BUNDLED = Path(fg_calib.__file__).parent / "examples"
 URDF = """<?xml version="1.0"?><robot name="r"><link name="a"/><link name="b"/>

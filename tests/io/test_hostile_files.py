@@ -9,8 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from fg_calib import InputError, Robot, read_job, read_measurements
-from fg_calib.sizes import ORDINARY
+from fg_calib import InputError, Robot, read_job
+from fg_calib.arguments import ORDINARY
+from fg_calib.io import read_measurements
 
 ROWS_OF_DH = [[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]]
 ARM = Robot.from_dh(ROWS_OF_DH, convention="dh")

@@ -11,18 +11,10 @@ import json
 import numpy as np
 import pytest
 
-from fg_calib import (
-    InputError,
-    Measurements,
-    Robot,
-    calibrate,
-    pose,
-    read_job,
-    read_measurements,
-    read_result,
-    read_robot,
-    read_scenario,
-)
+from fg_calib import InputError, Measurements, Robot, calibrate, read_job, read_robot
+from fg_calib.io import read_measurements, read_result
+from fg_calib.robot import pose
+from fg_calib.simulation import read_scenario
 
 
 def result_document():

@@ -5,7 +5,8 @@ import polars as pl
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fg_calib import InputError, Measurements, Noise, Options, Robot, Units, read_measurements
+from fg_calib import InputError, Measurements, Noise, Options, Robot
+from fg_calib.io import Units, read_measurements
 from fg_calib.io.columns import write_csv
 from fg_calib.measurements.checks import check_readings
 

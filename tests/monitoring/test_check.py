@@ -9,10 +9,11 @@ from month import SIGMA, arm, calibrated, measured, placed, slipped
 from scipy import stats
 from simulated import true_robot
 
-from fg_calib import Measurements, Robot, Table, calibrate, pose
+from fg_calib import Measurements, Robot, Table, calibrate
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.monitoring.hypotheses import zero_names
+from fg_calib.robot import pose
 
 SMALL = 2.5e-4
 """A slip of some sigma in an unknown frame, [rad]."""

@@ -7,9 +7,10 @@ import pytest
 from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
-from fg_calib import Calibration, Measurements, Table, calibrate, pose
+from fg_calib import Calibration, Measurements, Table, calibrate
 from fg_calib.errors import InputError
 from fg_calib.measurements.dataset import Labels
+from fg_calib.robot import pose
 
 FINE = (5e-8, 1e-7)
 """Noise so small that nothing bends: a thousandth of an instrument's."""
@@ -213,7 +214,7 @@ def classes(calibration):
 
 
 def reasons(calibration):
-    return [lost.reason for lost in calibration.uncertainty.identifiability.lost]
+    return [lost.reason for lost in calibration.assessment.identifiability.lost]
 
 
 def with_still_joint(model, n, rng, true, joint=5):
@@ -271,7 +272,7 @@ def test_what_has_changed_is_determined_by_new_rows_alone():
     updated = calibrate(arm(), old).update(
         new, changed=["theta1", "theta2", "theta3", "theta4", "theta5", "theta6", "d1"]
     )
-    assert updated.uncertainty.observability.rank < calibrate(arm(), old).uncertainty.observability.rank
+    assert updated.assessment.observability.rank < calibrate(arm(), old).assessment.observability.rank
 
 
 ACCEPT = {"position": 5e-4, "orientation": 1e-3}

@@ -5,8 +5,10 @@ import pytest
 from simulated import measure, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib import Bound, InputError, Pairing, cramer_rao, pose
+from fg_calib import InputError, Pairing
 from fg_calib.baseline.comparison import real_errors
+from fg_calib.observability import Bound, cramer_rao
+from fg_calib.robot import pose
 
 SIGMA, TOLERANCE = 1e-3, 5e-3
 N = 9

@@ -6,7 +6,8 @@ from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
-from fg_calib import InputError, Robot, calibrate, correct, pose
+from fg_calib import InputError, Robot, calibrate, correct
+from fg_calib.robot import pose
 from fg_calib.robot.inverse import random_readings
 
 ROWS = [[0, 90, 118, 0], [-613, 0, 0, 0], [-572, 0, 0, 0], [0, 90, 164, 0], [0, -90, 116, 0], [0, 0, 92, 0]]

@@ -5,11 +5,12 @@ import pytest
 from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, pose, predict, solve
+from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, predict, solve
 from fg_calib.prediction import workspace
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
 from fg_calib.prediction.workspace import predict_errors, summed_up
 from fg_calib.predictions import joint_noise_of
+from fg_calib.robot import pose
 from fg_calib.robot.model import Joint, RobotBuilder
 from fg_calib.statistics.covariance import spread_of
 

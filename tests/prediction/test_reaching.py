@@ -7,8 +7,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
-from fg_calib import Robot, pose
+from fg_calib import Robot
 from fg_calib.prediction.correction import misses, reach
+from fg_calib.robot import pose
 from fg_calib.robot.inverse import REACHED, random_readings
 
 NEAR = np.array([0.3, -0.4, 0.1, 0.5])

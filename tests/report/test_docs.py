@@ -30,7 +30,6 @@ from fg_calib import (
     export,
     read_job,
     read_robot,
-    read_scenario,
     simulate,
     solve,
 )
@@ -38,6 +37,7 @@ from fg_calib.cli import EXAMPLES
 from fg_calib.cli.entry import app
 from fg_calib.importers.board import read_calibration_board
 from fg_calib.robot.kinematics import pose
+from fg_calib.simulation import read_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {"README": ROOT / "README.md"} | {path.stem: path for path in sorted((ROOT / "docs").glob("*.md"))}
@@ -266,7 +266,7 @@ def extends_the_graph(code, folder, fg_calib):
     message, expanded = run_python(folder, code).splitlines()
     assert message.startswith("converged: ")
     plain = assess(solve(build_problem(robot, replace(m, rotation=None), model="position")))
-    assert int(message.split()[-1]) == plain.dof + 4 + 1  # the prior's rows, and the distance
+    assert int(message.split()[-1]) == plain.fit.chi_square.dof + 4 + 1  # the prior's rows, and the distance
     size, error, cost = map(float, expanded.split())
     assert size == 30 + 3 + 2  # measurements, priors of three joints, what was added
     assert error == pytest.approx(cost, rel=1e-9)

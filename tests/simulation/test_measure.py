@@ -12,8 +12,9 @@ from scipy.stats import chi2
 from simulated import paper_robot
 from tolerances import rounding
 
-from fg_calib import InputError, calibrate, read_job, simulate, write_simulation
+from fg_calib import InputError, calibrate, read_job, simulate
 from fg_calib.robot.rotations import rotation_angle
+from fg_calib.simulation import write_simulation
 from fg_calib.simulation.scenario import (
     BoardCamera,
     LengthGauge,
@@ -195,7 +196,7 @@ def test_every_instrument_calibrates_as_it_is_simulated(which):
     s = simulate(scenario(INSTRUMENTS[which], n=n, noise=replace(SIGMA, joint=1e-4)), 1)
     result = calibrate(s.robot, s.tables)
     assert result.trustworthy
-    found = result.uncertainty
+    found = result.assessment
     rows = [s.robot.index(name) for name in found.names]
     error = (found.robot.nominal - s.true_robot.nominal)[rows]
     assert chi2.cdf(error @ np.linalg.solve(found.covariance, error), len(rows)) < 0.999

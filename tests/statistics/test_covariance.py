@@ -67,7 +67,7 @@ def test_covariance_equals_gtsams_marginals_where_these_exist(model, frame, esti
     for v in variables.items:
         if v.kind == "frame":
             sigma = np.sqrt(np.diag(joint.marginalCovariance(v.key)))
-            assert uncertainty.frame.sigma == pytest.approx(sigma, rel=1e-6)
+            assert uncertainty.estimates.frame.sigma == pytest.approx(sigma, rel=1e-6)
         else:
             block = D[v.columns, v.columns]
             expected = block @ joint.marginalCovariance(v.key) @ block.T
@@ -85,7 +85,7 @@ def test_without_priors_only_determined_parameters_have_a_sigma():
     ineffective = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]
     relative = ["beta1", "theta2", "beta2", "d3", "theta3", "d4", "d5", "beta5", "theta6"]
     sigma = sigma_of(uncertainty)
-    for p in uncertainty.parameters:
+    for p in uncertainty.estimates.parameters:
         if "." in p.name:
             assert (p.identifiability, p.sigma) == ("fixed", 0.0)
             continue
@@ -95,7 +95,7 @@ def test_without_priors_only_determined_parameters_have_a_sigma():
     known = np.isfinite(np.diag(uncertainty.covariance))
     assert known.sum() == 19
     assert np.all(np.isnan(uncertainty.covariance[~known]))
-    assert uncertainty.dof == 2 * 99 - 23
+    assert uncertainty.fit.chi_square.dof == 2 * 99 - 23
     assert uncertainty.trustworthy
 
 
@@ -138,8 +138,8 @@ def test_monte_carlo_agrees_with_the_stated_covariance():
         index = [robot.index(name) for name in uncertainty.names]
         error = solution.parameters[index] - true.nominal[index]
         nees.append(error @ np.linalg.solve(uncertainty.covariance, error))
-        reduced.append(uncertainty.chi2)
-        dof = uncertainty.dof
+        reduced.append(uncertainty.fit.chi_square.value)
+        dof = uncertainty.fit.chi_square.dof
     n = len(index)
     low, high = chi2.ppf([0.0005, 0.9995], n_runs * n) / n_runs
     assert low < np.mean(nees) < high
@@ -161,7 +161,7 @@ def test_residual_table_holds_every_row_before_and_after(model):
     solution = solve(
         build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=10), model=model, pairing=Pairing("chain"))
     )
-    table = assess(solution).residuals
+    table = assess(solution).fit.residuals
     assert len(table.kind) == (30 * 6 if model == "pose" else 2 * (19 + 9))
     assert table.test.sum() == (10 * 6 if model == "pose" else 2 * 9)
     rms = table.rms()
@@ -177,7 +177,7 @@ def test_position_rms_is_that_of_the_vectors_length():
     rng = np.random.default_rng(8)
     robot = small_arm()
     solution = solve(build_problem(robot, measure(robot, 30, rng), model="position"))
-    table = assess(solution).residuals
+    table = assess(solution).fit.residuals
     lengths = np.linalg.norm(table.after.reshape(-1, 3), axis=1)
     assert table.rms()["train"]["position"]["after"] == pytest.approx(np.sqrt(np.mean(lengths**2)))
     assert table.rms()["test"] == {}
@@ -190,7 +190,7 @@ def test_frame_estimate_is_world_T_base():
     uncertainty = assess(
         solve(build_problem(robot, measure(robot, 60, rng, frame=frame), model="pose", frame="unknown"))
     )
-    found = uncertainty.frame
+    found = uncertainty.estimates.frame
     turned = Rotation.from_quat(found.quaternion_xyzw).inv() * frame[0]
     # the base itself is not determined beside the frame: where its columns are open, the frame moves with them
     assert turned.magnitude() < 0.01

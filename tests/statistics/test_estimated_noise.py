@@ -68,6 +68,6 @@ def test_noise_that_is_kept_where_other_noise_was_stated_far_too_small_is_not_go
     stated = {"sigma_position": m.sigma_position / 25, "sigma_orientation": m.sigma_orientation / 25}
     m = replace(m, **stated, sigma_joint=np.full(4, 1e-3 / 25))
     found = calibrate(robot, m, model="distance-rotation", pairing=Pairing("star"), estimate_noise=True)
-    (finding,) = found.uncertainty.findings
+    (finding,) = found.assessment.verdict.errors
     assert finding.startswith("the noise of angle could not be estimated")
     assert "other noise was stated 34.5 times too small, and so may this be" in finding

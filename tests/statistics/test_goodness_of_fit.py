@@ -83,8 +83,8 @@ def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_r
     by_kind, squares, overall = {}, {}, []
     for _ in range(n_runs):
         uncertainty = assess(solve(case(name, robot, rng)))
-        overall.append(uncertainty.p_value)
-        for fit in uncertainty.goodness.kinds:
+        overall.append(uncertainty.fit.chi_square.p_value)
+        for fit in uncertainty.fit.goodness.kinds:
             by_kind.setdefault(fit.kind, []).append(fit.p_value)
             squares.setdefault(fit.kind, []).append((fit.chi2, fit.expected))
     if "independent" not in name:
@@ -111,7 +111,7 @@ def test_leverages_are_those_of_the_hat_matrix():
     robot = small_arm()
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=4), model="pose"))
     uncertainty = assess(solution)
-    table, goodness = uncertainty.residuals, uncertainty.goodness
+    table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
     (rows,) = solution.problem.rows
     J = rows.linearise(solution.problem.variables.at(solution.parameters))[1]
     H = J @ np.linalg.pinv(J, rcond=1e-9)
@@ -132,7 +132,7 @@ def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
     settings = {"model": "pose"} if name == "pose" else {"model": "distance-rotation", "pairing": Pairing(name)}
     solution = solve(build_problem(robot, m, **settings))
     uncertainty = assess(solution)
-    table, goodness = uncertainty.residuals, uncertainty.goodness
+    table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
     assert goodness.configurations[0].configuration == wrong
     worst = goodness.suspects[0]
     assert wrong in (table.a[worst], table.b[worst])
@@ -147,11 +147,11 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
     robot = small_arm(tolerance=TOLERANCE)
     found = {}
     for what, stated in (("as stated", 1.0), ("too small", 0.5), ("too large", 2.0)):
-        found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, stated))).goodness.kinds}
+        found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, stated))).fit.goodness.kinds}
     assert found == {what: {what} for what in found}
     m = measure(true_robot(robot, rng), 50, rng)
     m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
-    fits = assess(solve(build_problem(robot, m, model="pose"))).goodness.kinds
+    fits = assess(solve(build_problem(robot, m, model="pose"))).fit.goodness.kinds
     assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as stated", "position": "outliers"}
 
 
@@ -178,7 +178,7 @@ def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):
     solution = estimate_noise(case("star", small_arm(tolerance=TOLERANCE), rng, 16, 2.0))
     assert "distance" not in factors_of(solution)
     assert factors_of(solution)["angle"] != 1.0
-    distance, angle = assess(solution).goodness.kinds
+    distance, angle = assess(solution).fit.goodness.kinds
     assert (distance.factor, angle.factor) == (1.0, factors_of(solution)["angle"])
     assert solution.estimated_noise == ((0, "angle"),)
     report = " ".join(format_report(solution, assess(solution)).split())
@@ -208,7 +208,7 @@ def test_a_same_point_that_is_not_is_suspect():
     readings[21, 3] += 10e-3 / np.linalg.norm(apart)  # 10 sigma
     m = replace(m, readings=readings, pairs=replace(m.pairs, distance=distance))
     judged = assess(solve(build_problem(robot, m, model="distance")))
-    table, goodness = judged.residuals, judged.goodness
+    table, goodness = judged.fit.residuals, judged.fit.goodness
     (kind,) = goodness.kinds
     assert (kind.kind, kind.n) == ("distance", 18 + 2 * 3)
     same, other = (np.flatnonzero(table.a == k) for k in (0, 1))
@@ -240,7 +240,7 @@ def test_robust_weights_count_rows_and_flag_outliers():
     solution = solve(problem_module.relinearized_at(problem, problem.start, state))
     assert solution.problem.state.weights is not None
     uncertainty = assess(solution)
-    table, goodness = uncertainty.residuals, uncertainty.goodness
+    table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
     assert {FLAGS[f] for f in goodness.flag[table.a == 5]} == {"outlier"}
     assert all(fit.p_value is None for fit in goodness.kinds)
     assert [fit.seen_over_stated for fit in goodness.kinds] == pytest.approx([1.0, 1.0], abs=0.3)
@@ -311,7 +311,7 @@ def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_th
     n_runs, rng = 50, np.random.default_rng(21)
     off, p_values = {}, {}
     for _ in range(n_runs):
-        goodness = assess(solve(predicted(name, rng))).goodness
+        goodness = assess(solve(predicted(name, rng))).fit.goodness
         fits = {("fitted", fit.table, fit.kind): fit for fit in goodness.kinds}
         fits |= {("predicted", fit.table, fit.kind): fit for fit in goodness.test.kinds}
         for key, fit in (fits | {"together": goodness.test}).items():
@@ -337,7 +337,7 @@ def test_touches_of_a_point_that_is_their_mean_share_its_noise():
     m = touched(robot, rng)
     solution = solve(build_problem(robot, m, model="distance"))
     judged = assess(solution)
-    table, goodness, arm = judged.residuals, judged.goodness, judged.robot
+    table, goodness, arm = judged.fit.residuals, judged.fit.goodness, judged.robot
     columns = [arm.index(name) for name in judged.names]
     at, h = pose(arm, m.readings), 1e-6
     moved = np.empty((len(m.readings), 3, len(columns)))
@@ -375,7 +375,7 @@ def test_the_only_touch_of_a_point_is_met_whatever_was_measured():
     m = replace(m, groups=replace(m.groups, index=index), sigma_point=plus(m.sigma_point, alone, np.nan))
     for loss in ("none", "gnc"):
         judged = assess(solve(build_problem(robot, m, model="distance", loss=loss)))
-        table, goodness = judged.residuals, judged.goodness
+        table, goodness = judged.fit.residuals, judged.fit.goodness
         (first, *_) = met = np.flatnonzero(table.a == alone[0] - 1)
         assert (len(met), table.kind[first]) == (3, "point.x")
         assert np.all(np.isnan(goodness.studentised[met]))
@@ -427,11 +427,11 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
     of_priors = J[test] @ K @ prior @ K @ J[test].T
     A = made_of_noise @ C @ made_of_noise.T + of_priors
     r = (lengths(x, m.readings) - m.pairs.distance)[test]
-    predicted = uncertainty.goodness.studentised[uncertainty.residuals.test]
+    predicted = uncertainty.fit.goodness.studentised[uncertainty.fit.residuals.test]
     apart = np.diag(J[test] @ K @ J[test].T + C[np.ix_(test, test)])
     assert np.max(apart / np.diag(A)) > 1.3
     assert predicted == pytest.approx(r / np.sqrt(np.diag(A)), abs=0.02)
-    assert uncertainty.goodness.test.chi2 == pytest.approx(r @ np.linalg.solve(A, r), rel=0.02)
+    assert uncertainty.fit.goodness.test.chi2 == pytest.approx(r @ np.linalg.solve(A, r), rel=0.02)
 
 
 def test_degrees_of_freedom_count_core_and_landmarks():

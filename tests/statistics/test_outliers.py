@@ -76,8 +76,8 @@ def test_anchors_exchanged_where_the_fit_goes_far_astray_are_outliers(swapped):
     index[[swapped, swapped + 12]] = index[[swapped + 1, swapped + 13]]
     wrong = replace(m, labels={**m.labels, "anchor": replace(anchor, index=index)})
     found = assess(solve(build_problem(robot, [replace(table, measurements=wrong)])))
-    assert {fit.verdict for fit in found.goodness.kinds} == {"outliers"}
-    assert sorted(found.goodness.gross.names) == sorted(str(m.ids[k]) for k in (swapped, swapped + 12))
+    assert {fit.verdict for fit in found.fit.goodness.kinds} == {"outliers"}
+    assert sorted(found.fit.goodness.gross.names) == sorted(str(m.ids[k]) for k in (swapped, swapped + 12))
 
 
 @pytest.mark.parametrize("size", [30.0, 1e3, 1e6])
@@ -140,10 +140,10 @@ SPOILT = ["pose", "star", "all", "anchors", "planes", "board", "targets"]
 def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     problem, wrong = spoilt(name, min(by, 300.0) if name == "all" else by, np.random.default_rng(5))
     found = assess(solve(problem))
-    verdicts = {fit.verdict for fit in found.goodness.kinds}
+    verdicts = {fit.verdict for fit in found.fit.goodness.kinds}
     assert "outliers" in verdicts <= {"outliers", "others", "as stated"}
-    assert [name.removeprefix("0 and ") for name in found.goodness.gross.names] == [wrong]
-    assert found.goodness.gross.ratio < 1.5
+    assert [name.removeprefix("0 and ") for name in found.fit.goodness.gross.names] == [wrong]
+    assert found.fit.goodness.gross.ratio < 1.5
     assert not found.noise_may_be_estimated
 
 
@@ -154,8 +154,8 @@ def test_a_loud_table_with_outliers_is_both(n):
     robot, m = measured("6R", rng, unit=0.5)
     m = replace(m, position=plus(m.position, rng.choice(60, n, replace=False), 0.05))
     found = assess(solve(problem_of(robot, m, "position")))
-    assert [fit.verdict for fit in found.goodness.kinds] == ["both"]
-    assert not found.goodness.spoilt
+    assert [fit.verdict for fit in found.fit.goodness.kinds] == ["both"]
+    assert not found.fit.goodness.spoilt
 
 
 @pytest.mark.slow
@@ -165,6 +165,6 @@ def test_what_is_not_modelled_is_no_outlier(error, k):
     robot, m = measured("6R", np.random.default_rng(k), effect=of_joint(k, error))
     solution = solve(problem_of(robot, m, "pose"))
     found = assess(solution)
-    assert not {fit.verdict for fit in found.goodness.kinds} & {"outliers", "others"}
-    assert not found.goodness.spoilt
+    assert not {fit.verdict for fit in found.fit.goodness.kinds} & {"outliers", "others"}
+    assert not found.fit.goodness.spoilt
     assert "loss: gnc" not in format_report(solution, found)

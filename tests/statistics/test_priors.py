@@ -153,7 +153,7 @@ def test_scales_of_every_kind_are_found_within_their_intervals():
 def test_the_estimate_is_that_with_the_tolerances_found_stated():
     robot = small_arm(tolerance=tolerances_of(solved()))
     again = solve(build_problem(robot, solved().problem.measurements, model="pose"))
-    sigma = np.array([p.sigma or 0.0 for p in assess(again).parameters])
+    sigma = np.array([p.sigma or 0.0 for p in assess(again).estimates.parameters])
     n = len(sigma)
     assert sigmas_apart(solved().parameters[:n], again.parameters[:n], sigma) < NEGLIGIBLE
 
@@ -163,7 +163,11 @@ def test_not_knowing_the_scales_makes_sigmas_larger():
     problem, _ = drawn_problem("distance", n=14, estimate_tolerance="kind")
     solution = estimate_tolerances(problem)
     found, known = assess(solution), assess(replace(solution, estimated_tolerances=None))
-    wider = [a.sigma / b.sigma for a, b in zip(found.parameters, known.parameters, strict=True) if b.sigma]
+    wider = [
+        a.sigma / b.sigma
+        for a, b in zip(found.estimates.parameters, known.estimates.parameters, strict=True)
+        if b.sigma
+    ]
     assert min(wider) > 0.9  # that of a mean scale need not be the least
     assert np.median(wider) > 1.02
 
@@ -171,8 +175,8 @@ def test_not_knowing_the_scales_makes_sigmas_larger():
 @pytest.mark.usefixtures("without_reasons", "without_mistakes")
 def test_corrections_beyond_their_tolerances_are_no_finding_once_these_are_estimated():
     problem, _ = drawn_problem()
-    assert any("corrections" in finding for finding in assess(solve(problem)).findings)
-    assert not assess(solved()).findings
+    assert any("corrections" in finding for finding in assess(solve(problem)).verdict.errors)
+    assert not assess(solved()).verdict.errors
 
 
 def test_a_joint_may_have_one_scale():

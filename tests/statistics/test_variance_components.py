@@ -190,7 +190,7 @@ def test_factors_are_the_most_likely_ones(name):
 def test_without_joint_noise_the_components_are_sums_of_squares_and_redundancies_of_kinds():
     problem, _ = draw("no joint noise", np.random.default_rng(2), joint=0.0)
     solution = solve(problem)
-    found, kinds = noise_components(solution), assess(solution).goodness.kinds
+    found, kinds = noise_components(solution), assess(solution).fit.goodness.kinds
     assert found.names == tuple((fit.table, fit.kind) for fit in kinds)
     assert found.squares == pytest.approx([fit.chi2 for fit in kinds], rel=1e-9)
     assert found.expected == pytest.approx([fit.expected for fit in kinds], rel=1e-9)
@@ -238,7 +238,7 @@ def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeyp
     monkeypatch.setattr(estimation, "MAX_ROUNDS", 1)
     solution = estimate_noise(draw("pose", np.random.default_rng(11))[0])
     assert not solution.converged
-    assert assess(solution).findings[0].startswith("not converged: the estimated noise still moved by ")
+    assert assess(solution).verdict.errors[0].startswith("not converged: the estimated noise still moved by ")
 
 
 N_DRAWS = 24
@@ -271,7 +271,7 @@ def test_sigmas_are_honest_with_estimated_noise(name):
         nees.append(float(off @ np.linalg.solve(spread.tangent[:n, :n], off)))
         for key in solution.estimated_noise:
             factors.setdefault(key, []).append(np.log(solution.problem.state.factors[key]))
-        test = assess(solution).goodness.test if name in ("pose", "random") else None
+        test = assess(solution).fit.goodness.test if name in ("pose", "random") else None
         p += [test.p_value] if test is not None else []
     low, high = chi2.ppf([5e-4, 1 - 5e-4], N_DRAWS * n) / (N_DRAWS * n)
     assert low < np.mean(nees) / n < high + 0.06, np.mean(nees) / n

@@ -1,3 +1,0 @@
-"""Former name of `parallel`."""
-
-from fg_calib.parallel import *  # noqa: F403
