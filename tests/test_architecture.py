@@ -47,9 +47,6 @@ FOLDERS = (
 )
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 
-UPWARD = {}
-"""Imports that still run upwards: none is added."""
-
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" and "examples" not in p.parts)
 NAMES = [p.relative_to(PACKAGE).with_suffix("").as_posix() for p in MODULES]
 EVERY_MODULE = pytest.mark.parametrize(("name", "path"), list(zip(NAMES, MODULES, strict=True)), ids=NAMES)
@@ -98,7 +95,7 @@ def test_every_module_stands_in_a_folder():
 @EVERY_MODULE
 def test_a_folder_imports_from_lower_ones_only(name, path):
     upward = {other for other in imported(parse(path)) if floor(other) > floor(name)}
-    assert upward <= UPWARD.get(name, set())
+    assert upward == set()
 
 
 @EVERY_MODULE
@@ -127,7 +124,7 @@ def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
         used |= more
     others = {other for name in used for other in imported(parse(PACKAGE / f"{name}.py"))} - used
     of_folders = {other.partition("/")[0] for other in others}
-    assert of_folders == {"errors", "arguments", "arrays", "options", "robot", "measurements", "threads"}
+    assert of_folders == {"errors", "arguments", "arrays", "options", "robot", "measurements", "parallel"}
 
 
 @EVERY_MODULE

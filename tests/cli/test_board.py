@@ -12,7 +12,7 @@ from boards import CAMERA, SIZE, render, views
 from scipy.spatial.transform import Rotation
 
 from fg_calib.importers import board as images
-from fg_calib.importers.board import CalibrationBoard, read_calibration_board
+from fg_calib.importers.board import CalibrationBoard
 from fg_calib.importers.opencv import opencv
 from fg_calib.io.job import read_camera
 
@@ -263,24 +263,3 @@ def test_what_cannot_be_used_is_named(case, job, fg_calib):
     assert ended.err.startswith(f"error: {message}".replace("{job}", str(job)))
     assert ended.err.count("\n") == 1
     assert not (job / "out").exists()
-
-
-def test_a_principal_point_outside_the_images_is_told(job, fg_calib, caplog):
-    (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"cx": 960.0}))
-    assert run(fg_calib, job).code == 3
-    assert "camera.yaml: cx = 960 px is outside the images of 640 x 480 px; is it the camera" in caplog.text
-
-
-def test_a_configuration_table_is_not_replaced_by_what_is_made_of_it(job, fg_calib):
-    ended = fg_calib(*("board", job / "images", "--board", job / "board.yaml", "--camera", job / "camera.yaml"),
-                     *("--configurations", job / "pixels.csv", "--out", job))  # fmt: skip
-    expected = f"error: {job / 'pixels.csv'}: would be replaced by what is made of it, expected another folder\n"
-    assert (ended.code, ended.err) == (1, expected)
-
-
-def test_every_key_of_a_board_is_read(tmp_path):
-    (tmp_path / "board.yaml").write_text(yaml.safe_dump(CHARUCO | {"legacy": True, "name": "b"}))
-    expected = CalibrationBoard("charuco", 9, 7, 0.02, 0.014, "DICT_5X5_100", legacy=True, name="b")
-    found = read_calibration_board(tmp_path / "board.yaml")
-    assert found.square == pytest.approx(expected.square)
-    assert asdict(found) | {"square": 0.02, "marker": 0.014} == asdict(expected)

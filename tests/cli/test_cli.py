@@ -360,10 +360,6 @@ BAD = {
         "units, noise, prior, gauge, prefer, pair_errors, encoder, loss, max_iterations, accept, folds, truth, "
         "targets, anchors, tolerance, offset, camera, columns; did you mean pairing?",
     ),
-    "unknown id in pairs": (
-        pairs("a,b,distance\np0,p1,1\np0,p999,1\n"),
-        "pairs.csv:3: b = 'p999' is not an id of poses.csv",
-    ),
     "degrees read as radians": (
         sub(JOB, "angle: deg", "angle: rad"),
         "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is the table in deg?",

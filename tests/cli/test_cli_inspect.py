@@ -124,17 +124,3 @@ def test_bad_input_ends_with_1_and_the_line_that_calibrate_gives(fg_calib, examp
     assert ended.err.startswith(says)
     assert ended.err.count("\n") == 1
     assert fg_calib("calibrate", path).err == ended.err
-
-
-def test_names_from_files_steer_no_terminal(fg_calib, example):
-    table = (example / "poses.csv").read_text().splitlines()
-    cells = table[3].split(",")
-    header = table[0].split(",")
-    cells[header.index("x")] = "9.0"
-    if "id" in header:
-        cells[header.index("id")] = "\x1b[31mred"
-    table[3] = ",".join(cells)
-    (example / "poses.csv").write_text("\n".join(table) + "\n")
-    ended = fg_calib("inspect", example / JOB)
-    assert ended.code == 3
-    assert "\x1b" not in ended.out + ended.err

@@ -68,12 +68,6 @@ def test_configurations_give_sigmas_and_files(fg_calib, example, tmp_path):
     assert halved["a2"] == pytest.approx(found["sigma"]["a2"] / 2, rel=1e-3)
 
 
-def test_the_users_order_decides_what_is_kept(fg_calib, example):
-    found = json.loads(fg_calib("observe", example / "robot_nominal.yaml", "--prefer", "d3, beta2", "--json").out)
-    assert {"d3", "beta2"} <= set(found["kept"])
-    assert not {"d5", "theta3"} & set(found["kept"])
-
-
 def test_a_frame_may_be_unknown(fg_calib, example):
     ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "pose", "--frame", "unknown", "--json")
     assert json.loads(ended.out)["rank"] == 25
@@ -165,11 +159,3 @@ def test_what_it_refuses(fg_calib, example, tmp_path, arguments, code, message):
     if code == 1:
         assert ended.err.startswith("error: ")
         assert ended.err.count("\n") == 1
-
-
-@pytest.mark.slow
-def test_the_model_that_was_asked_for_is_named(fg_calib, example, tmp_path):
-    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "pixels", "--out", tmp_path / "out")
-    assert ended.out.startswith("space-robot: pixels, as poses of the board, structural, ")
-    document = json.loads((tmp_path / "out" / "observability.json").read_text())
-    assert document["model"] == document["with_fixed_known"]["model"] == "pixels"

@@ -6,7 +6,6 @@ import subprocess
 import sys
 
 import pytest
-from rich.console import Console
 
 from fg_calib import Calibration, InputError, calibrate_job, simulate
 from fg_calib.simulation import read_scenario, write_simulation
@@ -93,18 +92,6 @@ def test_no_name_steers_the_terminal(fg_calib, job, tmp_path, command):
 def found(job):
     """Its calibration."""
     return calibrate_job(job)
-
-
-@pytest.mark.slow
-def test_a_terminal_gets_colours_and_no_others(found):
-    from fg_calib.report.text import build_report
-
-    console = Console(force_terminal=True, color_system="standard", width=100, highlight=False)
-    with console.capture() as capture:
-        console.print(build_report(*found.assessed))
-    assert "\x1b[1;31mDOUBTFUL: " in capture.get()
-    assert "\x1b[31m" not in capture.get()
-    assert f"p2{SHOWN}" in capture.get()
 
 
 def test_a_notebook_a_saved_result_and_reprs_are_clean(found, tmp_path):

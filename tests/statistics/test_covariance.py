@@ -24,7 +24,7 @@ TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}
 
 
 def sigma_of(uncertainty):
-    return {p.name: p.sigma for p in uncertainty.parameters}
+    return {p.name: p.sigma for p in uncertainty.estimates.parameters}
 
 
 def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
