@@ -23,6 +23,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from itertools import count
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -214,7 +215,8 @@ def linearise(task: Task) -> Row:
     with TemporaryDirectory() as name:
         job = read_job(write_pairs(Path(name), n, "parquet"))
     problem = build_problem(job.robot, job.tables, job.options)
-    seconds = min(median_of(lambda: problem.linearize(problem.start), 1) for _ in range(3))
+    places = (problem.start * (1.0 + 1e-9 * k) for k in count())  # the system of a place is remembered
+    seconds = min(median_of(lambda: problem.linearize(next(places)), 1) for _ in range(3))
     return {"us a pair": 1e6 * seconds / n}
 
 

@@ -147,6 +147,14 @@ class Problem(FrozenArrays):
             f" {len(v.keys)} variables"
         )
 
+    def linearize(self, parameters: Floats | None = None) -> NormalSystem:
+        """The normal system of measurements, priors and added factors at a parameter vector, at `start` if None.
+
+        Raises:
+            SolverError: A residual or derivative is not finite.
+        """
+        return linear_system(self, self.start if parameters is None else parameters)
+
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
         """The rows of each series and their noise at `start`: of a million pairs as large as everything else."""

@@ -52,6 +52,15 @@ def test_the_calibrated_arm_predicts_what_it_was_not_fitted_to(model, prior):
     assert after < 1e-3  # noise 0.1 mm: prediction error of 0.2 to 0.4 mm over the whole workspace, measured
 
 
+def test_a_problem_can_be_linearised_anywhere():
+    rng = np.random.default_rng(1)
+    robot = small_arm(tolerance={"a": 1e-3, "theta": 1e-3})
+    problem = build_problem(robot, measure(true_robot(robot, rng), 20, rng), model="pose")
+    assert problem.linearize().cost == pytest.approx(cost_at(problem, problem.start), rel=1e-12)
+    solution = solve(problem)
+    assert problem.linearize(solution.parameters).decrement < 3e-7
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", ["pose", "distance-rotation"])
 def test_the_optimum_is_scipys(model):
