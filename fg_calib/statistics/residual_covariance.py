@@ -41,12 +41,14 @@ class ResidualCovariance:
         L: Errors of few rows, sparse, shape (n, n_errors).
         d: Diagonal of D, shape (n,).
         sign: Diagonal of S, 1 or -1, shape (k,).
+        noise: Variances by noise alone, shape (n,).
     """
 
     P: Floats
     L: Sparse
     d: Floats
     sign: Floats
+    noise: Floats
 
     @property
     def diagonal(self) -> Floats:
@@ -59,16 +61,17 @@ class ResidualCovariance:
         """The same covariance with errors that reach many rows, which would fill a sparse factor, among P."""
         columns = L.tocsc()
         many = np.diff(columns.indptr) > MANY_ROWS
-        wide = columns[:, many].toarray()
-        return cls(np.hstack([P, wide]), columns[:, ~many].tocsr(), d, np.append(sign, np.ones(wide.shape[1])))
+        wide, noise = columns[:, many].toarray(), d + row_squares(L)
+        return cls(np.hstack([P, wide]), columns[:, ~many].tocsr(), d, np.append(sign, np.ones(wide.shape[1])), noise)
 
     def at(self, rows: Integers) -> ResidualCovariance:
         """The part at some rows."""
-        return ResidualCovariance(self.P[rows], self.L[rows], self.d[rows], self.sign)
+        return ResidualCovariance(self.P[rows], self.L[rows], self.d[rows], self.sign, self.noise[rows])
 
     def over(self, scale: Floats) -> ResidualCovariance:
         """The covariance of rows divided by a scale, shape (n,)."""
-        return ResidualCovariance(self.P / scale[:, None], _scaled(self.L, scale), self.d / scale**2, self.sign)
+        P, L, d, noise = self.P / scale[:, None], _scaled(self.L, scale), self.d / scale**2, self.noise / scale**2
+        return ResidualCovariance(P, L, d, self.sign, noise)
 
     def moments(self, rows: Integers) -> tuple[float, float]:
         """Trace, and trace of the square, of the part at some rows."""
@@ -87,7 +90,7 @@ class ResidualCovariance:
         Args:
             z: The rows, shape (n,).
         """
-        added = np.maximum(PRIVATE_SHARE * (self.d + row_squares(self.L)) - self.d, 0.0)
+        added = np.maximum(PRIVATE_SHARE * self.noise - self.d, 0.0)
         T = scipy.sparse.csc_array(self.L @ self.L.T + scipy.sparse.diags_array(self.d + added))
         factor, k = splu(T), self.P.shape[1]
         V, Tz = np.split(factor.solve(np.column_stack([self.P, z])), [k], axis=1)

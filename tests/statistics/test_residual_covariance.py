@@ -11,11 +11,17 @@ N = 60
 
 
 def star(rng, private=1.0):
-    """Pairs of rows with two errors of their own, and three errors and four parameters that all of them have."""
+    """Pairs of rows with two errors of their own, and three errors and four parameters that all of them have.
+
+    Returns:
+        The covariance, and the variances by noise alone.
+    """
     own = scipy.sparse.block_diag([scipy.sparse.coo_array(rng.normal(size=(2, 2))) for _ in range(N // 2)])
     L = scipy.sparse.csr_array(scipy.sparse.hstack([rng.normal(size=(N, 3)), own]))
     P = np.hstack([rng.normal(size=(N, 2)), 1e-3 * rng.normal(size=(N, 2))])
-    return ResidualCovariance(P, L, private * rng.uniform(0.5, 1.0, N), np.array([1.0, 1.0, -1.0, -1.0]))
+    d = private * rng.uniform(0.5, 1.0, N)
+    noise = d + np.sum(L.toarray() ** 2, axis=1)
+    return ResidualCovariance.build(P, L, d, np.array([1.0, 1.0, -1.0, -1.0])), noise
 
 
 def dense(covariance):
@@ -27,9 +33,8 @@ def dense(covariance):
 def test_whitened_rows_have_the_moments_of_the_whole_matrix(private):
     """Chi-square, its mean and its degrees of freedom, with and without the least private noise."""
     rng = np.random.default_rng(1)
-    covariance, z = star(rng, private), rng.normal(size=N)
-    L = covariance.L.toarray()
-    added = np.maximum(PRIVATE_SHARE * (covariance.d + np.sum(L**2, axis=1)) - covariance.d, 0.0)
+    (covariance, noise), z = star(rng, private), rng.normal(size=N)
+    added = np.maximum(PRIVATE_SHARE * noise - covariance.d, 0.0)
     assert added.any() == (private == 0.0)
     inverse = np.linalg.inv(dense(covariance) + np.diag(added))
     B = np.eye(N) - inverse @ np.diag(added)
@@ -39,7 +44,7 @@ def test_whitened_rows_have_the_moments_of_the_whole_matrix(private):
 
 def test_moments_are_the_traces_of_the_matrix_and_of_its_square():
     rng = np.random.default_rng(3)
-    covariance, rows = star(rng), np.sort(rng.choice(N, 25, replace=False))
+    (covariance, _), rows = star(rng), np.sort(rng.choice(N, 25, replace=False))
     A = dense(covariance)[np.ix_(rows, rows)]
     np.testing.assert_allclose(covariance.moments(rows), (np.trace(A), np.sum(A * A)), rtol=1e-12)
     np.testing.assert_allclose(covariance.diagonal[rows], np.diag(A), rtol=1e-12)
