@@ -16,7 +16,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
+from pydantic import (
+    AliasChoices,
+    AliasPath,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    WrapSerializer,
+)
 
 from fg_calib import __version__
 from fg_calib.arguments import checked
@@ -157,13 +166,13 @@ class Knowledge(Section):
     rows at the nominal arm, which parameters are classed by.
     """
 
-    columns: tuple[str, ...] = ()
+    columns: tuple[str, ...] = Field((), validation_alias=AliasChoices("columns", AliasPath("variables", "names")))
     unknowns: tuple[tuple[str, str], ...] = ()
     at: Floats
     rows: Floats
     right: Floats
     views: tuple[tuple[Model, FrameKnowledge], ...] = ()
-    parameters: Floats
+    parameters: Floats = Field(validation_alias=AliasChoices("parameters", AliasPath("robot", "nominal")))
     nominal: Knowledge | None = None
 
 
@@ -518,20 +527,7 @@ def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
     for (table, kind), factor in problem.state.factors.items():
         source = "" if table < 0 else problem.data.tables[table].measurements.source
         noise.setdefault(source.partition(", station ")[0], {})[kind] = factor
-    knowledge = None
-    if known is not None:
-        nominal = known.nominal
-        assert nominal is not None
-        values: dict[str, Any] = {"columns": known.variables.names, "unknowns": known.unknowns, "views": known.views}
-        at_nominal = Knowledge(at=nominal.at, rows=nominal.rows, right=nominal.right, parameters=nominal.robot.nominal)
-        knowledge = Knowledge(
-            **values,
-            at=known.at,
-            rows=known.rows,
-            right=known.right,
-            parameters=known.robot.nominal,
-            nominal=at_nominal,
-        )
+    knowledge = None if known is None else Knowledge.model_validate(known)
     return Carried(job=dict(job), rows=fingerprints(problem.data.tables), noise=noise, knowledge=knowledge)
 
 
