@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from exported import matrix, off, scara
+from exported import matrix
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot
@@ -14,9 +14,7 @@ from fg_calib.exports.dh import (
     errors,
     in_table,
     left_over,
-    links_of,
     plane_crossing,
-    poses,
     row_transform,
 )
 from fg_calib.robot.model import CONVENTIONS
@@ -108,16 +106,3 @@ def test_there_and_back_is_the_same_arm(there, back):
         assert found.joints == robot.joints
         error = errors(found, robot, q)
         assert max(error.position_max, error.rotation_max) < EXACT
-
-
-def test_links_of_an_arm_are_its_chain():
-    robot = off(scara())
-    links = links_of(robot)
-    q = np.array([0.3, -0.7, 0.1, 2.0])
-    T = links.base
-    for L, joint, value in zip(links.between, robot.joints, q, strict=False):
-        moved = matrix(Rotation.from_rotvec([0, 0, 0 if joint.prismatic else value]).as_matrix(), np.zeros(3))
-        moved[2, 3] = value if joint.prismatic else 0.0
-        T = T @ L @ moved
-    at = poses(robot, q[None])
-    assert T @ links.between[-1] @ links.tool == pytest.approx(matrix(at.rotation[0], at.position[0]), abs=1e-14)

@@ -251,8 +251,6 @@ JUNK = [
     '<link name="r0"><inertial><mass value="heavy"/></inertial><visual><geometry><mesh/></geometry></visual></link>',
     '<transmission name="t"><joint name="r1"><mechanicalReduction>100</mechanicalReduction></joint></transmission>',
     '<gazebo reference="r1"><link name="inside"/><joint name="r1" type="screw"/></gazebo>',
-    '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"><link name="r1"/><joint name="r1"/></x:macro>',
-    '<x:joint xmlns:x="http://www.ros.org/wiki/xacro" name="r1"/>',
     '<link name="right_1"/><!-- again --><?editor <joint name="r1"/>?><![CDATA[<joint name="r1"/>]]>',
 ]
 """What yourdfpy reads, refuses or skips, and what says nothing of the chain."""
