@@ -83,7 +83,7 @@ def as_hinted(place: str, value: Any, hint: Any) -> Any:
         InputError: The value does not fit.
     """
     kinds = _alternatives(hint)
-    if _fits(value, hint) and not (Path in kinds and value == ""):
+    if _fits(value, hint) and not (Path in kinds and isinstance(value, str) and not value):
         return value
     if Path in kinds and isinstance(value, os.PathLike):
         return Path(os.fspath(value))
