@@ -22,7 +22,7 @@ if sys.argv[2] == "1" and hasattr(os, "sched_setaffinity"):
 import json
 import fg_calib as fg
 from fg_calib.graph import problem_of
-from fg_calib.observability import cramer_rao
+from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.report import comparison_document, observability_document
 
 def hexadecimal(found):

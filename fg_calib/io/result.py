@@ -577,10 +577,11 @@ def _contradictions(result: Result) -> Iterator[tuple[str, str, str]]:
     matrices = {"covariance": (result.covariance.matrix, len(names))}
     matrices["posterior: covariance"] = result.posterior.covariance, sum(map(len, result.posterior.variables.values()))
     for key, (matrix, n) in matrices.items():
+        size = np.nanmin(np.abs(matrix.diagonal()), initial=1.0) if matrix.ndim == 2 else 0.0  # rounding is less
         with np.errstate(invalid="ignore"):
             if matrix.size != n * n or (n and matrix.shape != (n, n)):
                 yield key, f"shape {matrix.shape}", f"{n} rows of {n}, one of each name"
-            elif not np.array_equal(matrix, matrix.T, equal_nan=True) or (np.diag(matrix) < 0.0).any():
+            elif not np.allclose(matrix, matrix.T, 1e-6, 1e-9 * size, equal_nan=True) or (np.diag(matrix) < 0.0).any():
                 yield key, "no covariance", "a symmetric matrix with variances from 0 on"
     if len(of) < len(result.parameters) or len(set(names)) < len(names) or not of.keys() >= set(names):
         yield "covariance: names", "a name twice or of no parameter", "different names of parameters"

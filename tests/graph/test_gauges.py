@@ -44,7 +44,7 @@ def coverage(robot, model, gauge, n_draws, seed, **options):
         found = assessed(robot, true, rng, model, gauge, **options)
         values = dict(zip([p.name for p in robot.parameters], true.nominal, strict=True))
         nominal = dict(zip([p.name for p in robot.parameters], robot.nominal, strict=True))
-        for p in found.parameters:
+        for p in found.estimates.parameters:
             if p.sigma:
                 hits[p.identifiability].append(abs(p.estimate - values[p.name]) < Z * p.sigma)
             if p.stands_for:
@@ -93,7 +93,7 @@ def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
     rng = np.random.default_rng(3)
     robot = paper_robot(tolerance=HAYATI | {"d3": 3e-3, "d4": 4e-3})
     found = assessed(robot, true_robot(robot, rng), rng, "distance-rotation")
-    by_name = {p.name: p for p in found.parameters}
+    by_name = {p.name: p for p in found.estimates.parameters}
     d5 = by_name["d5"]
     assert d5.stands_for == {"d5": 1.0, "d3": 1.0, "d4": 1.0}
     # the axes of the estimated arm are not quite parallel: by some mrad
@@ -135,10 +135,10 @@ def test_without_a_tolerance_only_what_does_not_depend_on_it_is_known(gauge):
     rng = np.random.default_rng(4)
     robot = paper_robot(tolerance=None if gauge == "none" else {"theta": 1e-3, "beta": 1e-3})
     found = assessed(robot, true_robot(robot, rng), rng, "distance-rotation", gauge)
-    by_name = {p.name: p for p in found.parameters}
+    by_name = {p.name: p for p in found.estimates.parameters}
     assert [by_name[name].sigma for name in ("d3", "d4", "d5", "a1", "alpha1")] == [None] * 5
     assert (by_name["theta3"].sigma is None) == (gauge == "none")
-    assert all(p.sigma is not None for p in found.parameters if p.identifiability == "independent")
+    assert all(p.sigma is not None for p in found.estimates.parameters if p.identifiability == "independent")
 
     def sums(r):
         value = dict(zip([p.name for p in r.parameters], r.nominal, strict=True))

@@ -7,7 +7,7 @@ from simulated import planar_robot
 from tolerances import rounding
 
 from fg_calib import Measurements, Table, assess, build_problem, solve
-from fg_calib.observability import cramer_rao
+from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot.kinematics import pose
 
 SIGMA = 1e-4

@@ -7,7 +7,7 @@ from tolerances import rounding
 
 from fg_calib import InputError, Pairing
 from fg_calib.baseline.comparison import real_errors
-from fg_calib.observability import Bound, cramer_rao
+from fg_calib.observability.cramer_rao import Bound, cramer_rao
 from fg_calib.robot import pose
 
 SIGMA, TOLERANCE = 1e-3, 5e-3
