@@ -71,21 +71,16 @@ SPOILT = {
 }
 """Mistakes in a table: how they are named, and how they are made."""
 
-LENGTHS = [key for key in SPOILT if key.startswith(("x,", "columns x", "z has"))]
-TURNS = ["the orientations are inverted", "columns qx, qy, qz, qw hold w, x, y, z"]
-JOINTS = [key for key in SPOILT if "joint" in key]
+ROTATIONS = ["the orientations are inverted", "columns qx, qy, qz, qw hold w, x, y, z"]
+SHOWN = {
+    ("pose", "unknown"): list(SPOILT),
+    ("position", "known"): [key for key in SPOILT if key not in ROTATIONS],
+    ("orientation", "known"): ROTATIONS,
+    ("distance-rotation", "known"): [key for key in SPOILT if "joint" in key or "x, y, z are in mm" in key],
+}
+"""Mistakes that a model shows, the measurement frame known or not."""
 
-CASES = [
-    *[("pose", "known", key) for key in SPOILT],
-    *[("pose", "unknown", key) for key in SPOILT],
-    *[("position", "known", key) for key in SPOILT if key not in TURNS],
-    *[("position", "unknown", key) for key in SPOILT if key in JOINTS],
-    *[("orientation", "known", key) for key in TURNS],
-    *[("orientation", "unknown", key) for key in TURNS],
-    *[("distance-rotation", "known", key) for key in SPOILT if key not in LENGTHS + TURNS or "in mm" in key],
-    *[("distance", "known", key) for key in SPOILT if key not in LENGTHS + TURNS or "in m, not" in key],
-    *[("rotation", "known", key) for key in SPOILT if key in JOINTS and "deg, not" in key],
-]
+CASES = [(*model, mistake) for model, mistakes in SHOWN.items() for mistake in mistakes]
 
 
 def named(check):
