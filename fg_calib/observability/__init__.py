@@ -5,7 +5,6 @@ from fg_calib._lazy import attach
 __getattr__, __dir__ = attach(
     __name__,
     {
-        "fg_calib.observability.cramer_rao": "Bound cramer_rao",
         "fg_calib.observability.identifiability": "Identifiability observe_configurations observe_structure",
     },
 )
