@@ -2,21 +2,16 @@
 
 A homography takes the board to the image without its distortion. What it is at the middle of the board, and how it
 changes there, leaves two poses (Collins & Bartoli 2014): a board that is small beside its distance looks nearly the
-same tilted either way. Both are refined on the pixels by damped Gauss-Newton steps, in front of the camera, and the
-better one is first.
-
-A few corners that are far off do not spoil it: the homography is the one of many through four points each that most
-points lie near to (least median of squares), and points far beyond what most are off by take no part in the rest.
+same tilted either way. Both are refined on the pixels by least squares: on the half of the points that is nearest (least
+trimmed squares), then on all that are not far beyond what most are off by. The better one is first.
 
 References:
     Collins, Bartoli (2014), Infinitesimal plane-based pose estimation. IJCV 109(3).
     Hartley (1997), In defense of the eight-point algorithm. IEEE PAMI 19(6): the scaling of the points.
-    Rousseeuw, Leroy (1987), Robust regression and outlier detection, ch. 5: least median of squares, its scale.
+    Rousseeuw, Leroy (1987), Robust regression and outlier detection, ch. 5: scale from a median.
 """
 
 from __future__ import annotations
-
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization.camera import Camera
 from fg_calib.initialization.hand_eye import Frame
+from fg_calib.robot.rotations import left_jacobian
 
 Floats = NDArray[np.float64]
 Booleans = NDArray[np.bool_]
@@ -31,23 +27,20 @@ Booleans = NDArray[np.bool_]
 LEAST_CORNERS = 4
 """Points of a board that an image must show."""
 
-STEPS = 30
-"""Steps on the pixels, at most."""
-
 UNDISTORTED = 1e-3
 """How near the image of an undistorted point must be to where it was seen, [px]."""
-
-SUBSETS = 60
-"""Homographies through four points each that are tried."""
-
-FLAT = 0.02
-"""Area of a triangle of points, in squares of the board's size, below which they lie on one line."""
 
 FAR = 3.5
 """Points are far off beyond so many times what most are off by, as a sigma; of clean ones 0.2 % are."""
 
 FARTHEST = 1e4
 """How far a board may be, in its own sizes: beyond that its image says nothing of it."""
+
+MAX_ROUNDS = 10
+"""Refinements of a pose on the points that are left, at most."""
+
+HALVINGS = 3
+"""The first of them are on the half of the points that is nearest (least trimmed squares)."""
 
 LEAST_NOISE = 1e-6
 """What points may be off by without being far off, [sigma]."""
@@ -70,17 +63,14 @@ def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None
     if not _spread(image[there, 2:]) or not np.ptp(seen[there], axis=0).any():
         return []
     focal = np.array([camera.fx, camera.fy])
-    H, near = _homography(image[there, 2:], seen[there], focal * weight[there])
-    kept = np.flatnonzero(there)[near]
-    if H is None or not _spread(image[kept, 2:]):
+    H = _homography(image[there, 2:], seen[there], focal * weight[there])
+    if H is None:
         return []
-    found: list[tuple[float, int, Frame]] = []
-    for start in _two_poses(H, image[kept, 2:], seen[kept]):
-        one = _refined_on_most(camera, image, weight, start, kept)
-        if one is not None:
-            found.append((one[0], len(found), one[1]))
+    starts = _two_poses(H, image[there, 2:], seen[there])
+    refined = (_refined_on_most(camera, image[there], weight[there], start) for start in starts)
+    found = sorted((pose for pose in refined if pose is not None), key=lambda pose: pose[0])
     farthest = FARTHEST * np.abs(image[:, 2:]).max()
-    return [(cost, frame) for cost, _, frame in sorted(found) if np.abs(frame.translation).max() < farthest]
+    return [(cost, frame) for cost, frame in found if np.abs(frame.translation).max() < farthest]
 
 
 def _spread(points: Floats) -> bool:
@@ -113,79 +103,7 @@ def undistorted(camera: Camera, pixels: Floats) -> tuple[Floats, Booleans]:
     return x, there & (np.abs(off).max(axis=1, initial=0.0) < UNDISTORTED)
 
 
-def _homography(points: Floats, seen: Floats, weight: Floats) -> tuple[Floats | None, Booleans]:
-    """The homography that most points lie near to, shape (3, 3), and which these are; None if there is none.
-
-    Args:
-        points: On the board, shape (n, 2), [m].
-        seen: x / z and y / z, shape (n, 2).
-        weight: One over sigma of these, shape (n, 2).
-    """
-    n, every = len(points), np.ones(len(points), dtype=np.bool_)
-    if n <= LEAST_CORNERS + 1:  # nothing tells which one is off
-        return _by_lines(points, seen, weight), every
-    fours = _fours(points)
-    tried = _through_four(points[fours], seen[fours])
-    if len(tried):
-        off = _misses(tried, points, seen, weight)
-        rank = n // 2 + LEAST_CORNERS // 2 - 1  # half of those that four points do not decide
-        typical = np.sort(off, axis=1)[:, rank]
-        best = int(np.argmin(typical))
-        scale = _SIGMAS * (1.0 + 5.0 / (n - LEAST_CORNERS)) * typical[best]
-        every = off[best] <= max(FAR * scale, LEAST_NOISE)
-    return _by_lines(points[every], seen[every], weight[every]), every
-
-
-_SIGMAS = 1.0 / np.sqrt(2.0 * np.log(2.0))
-"""A sigma in medians of the length of two coordinates' noise (Rayleigh's)."""
-
-
-def _fours(points: Floats) -> NDArray[np.int64]:
-    """Sets of four points, no three of them on one line, shape (n, 4): all, or a fixed choice of them."""
-    n = len(points)
-    if n <= 9:
-        fours = np.array(list(combinations(range(n), LEAST_CORNERS)))
-    else:
-        fours = np.argsort(np.random.default_rng(0).random((3 * SUBSETS, n)), axis=1)[:, :LEAST_CORNERS]
-    size = np.ptp(points, axis=0).max()
-    areas = []
-    for three in combinations(range(LEAST_CORNERS), 3):
-        a, b, c = (points[fours[:, k]] for k in three)
-        (x1, y1), (x2, y2) = (b - a).T, (c - a).T
-        areas.append(np.abs(x1 * y2 - x2 * y1))
-    chosen: NDArray[np.int64] = fours[np.min(areas, axis=0) > FLAT * size**2][:SUBSETS]
-    return chosen
-
-
-def _through_four(points: Floats, seen: Floats) -> Floats:
-    """The homographies through four points each, the entry at their end being 1, shape (k, 3, 3).
-
-    Args:
-        points: On the board, shape (k, 4, 2), [m].
-        seen: x / z and y / z, shape (k, 4, 2).
-    """
-    k = len(points)
-    A, right = np.zeros((k, 8, 8)), seen.transpose(0, 2, 1).reshape(k, 8)
-    for axis, rows in enumerate((slice(0, 4), slice(4, 8))):
-        A[:, rows, 3 * axis : 3 * axis + 2], A[:, rows, 3 * axis + 2] = points, 1.0
-        A[:, rows, 6:] = -seen[:, :, axis, None] * points
-    size = np.abs(A).max(axis=1, initial=1e-300)
-    whole = np.linalg.svd(A / size[:, None], compute_uv=False)
-    sound = whole[:, -1] > 1e-12 * whole[:, 0]
-    found = np.linalg.solve(A[sound] / size[sound, None], right[sound, :, None])[:, :, 0] / size[sound]
-    return np.concatenate([found, np.ones((len(found), 1))], axis=1).reshape(-1, 3, 3)
-
-
-def _misses(H: Floats, points: Floats, seen: Floats, weight: Floats) -> Floats:
-    """How far off points are by homographies, in sigma, shape (k, n); infinite of those behind the camera."""
-    p = np.column_stack([points, np.ones(len(points))]) @ H.transpose(0, 2, 1)
-    ahead = p[:, :, 2] > 1e-12
-    off = (p[:, :, :2] / np.where(ahead, p[:, :, 2], 1.0)[:, :, None] - seen) * weight
-    miss: Floats = np.where(ahead, np.sqrt(np.sum(off * off, axis=2)), np.inf)
-    return miss
-
-
-def _by_lines(points: Floats, seen: Floats, weight: Floats) -> Floats | None:
+def _homography(points: Floats, seen: Floats, weight: Floats) -> Floats | None:
     """The homography of all points by linear least squares (DLT), of points about their middle and of size 1."""
     (p, P), (s, S) = (_scaled(v) for v in (points, seen))
     ones, zeros, w = np.ones((len(p), 1)), np.zeros((len(p), 3)), weight / weight.mean()
@@ -247,64 +165,53 @@ def _place(R: Floats, points: Floats, seen: Floats) -> Floats:
     return np.linalg.lstsq(A, right, rcond=1e-12)[0].astype(np.float64)
 
 
-def _refined_on_most(
-    camera: Camera, image: Floats, weight: Floats, start: Frame, kept: NDArray[np.int64]
-) -> tuple[float, Frame] | None:
-    """A pose refined on some points, then on all that are not far beyond what most are off by; its cost first.
+def _refined_on_most(camera: Camera, image: Floats, weight: Floats, start: Frame) -> tuple[float, Frame] | None:
+    """A pose refined on the points that are not far beyond what most are off by; its cost first.
 
-    What is left out costs as much as the farthest that is not. Three points decide a pose.
+    What is left out costs as much as the farthest that is not. None where a point is not ahead of the camera.
     """
-    n, limit = len(image), np.inf
-    found = _refined(camera, image[kept], weight[kept], start)
-    if found is not None and n > LEAST_CORNERS + 1:
-        there = image[:, 2:] @ found[1].rotation[:, :2].T + found[1].translation
+    n, frame = len(image), start
+    kept, limit = np.arange(n), np.inf
+    for step in range(MAX_ROUNDS):
+        refined = _refined(camera, image[kept], weight[kept], frame)
+        if refined is None:
+            return None
+        frame = refined
+        there = image[:, 2:] @ frame.rotation[:, :2].T + frame.translation
         off = np.linalg.norm((camera.image(there)[0] - image[:, :2]) * weight, axis=1)
         off[there[:, 2] <= 0.0] = np.inf
-        limit = max(FAR * _SIGMAS * (1.0 + 5.0 / (n - 3)) * float(np.partition(off, n // 2)[n // 2]), LEAST_NOISE)
-        near = np.flatnonzero(off <= limit)
-        if not np.array_equal(near, kept):
-            kept = near
-            found = _refined(camera, image[kept], weight[kept], found[1]) if _spread(image[kept, 2:]) else None
-    if found is None:
-        return None
-    left_out = n - len(kept)
-    return found[0] + (left_out * limit**2 if left_out and np.isfinite(limit) else 0.0), found[1]
-
-
-def _refined(camera: Camera, image: Floats, weight: Floats, start: Frame) -> tuple[float, Frame] | None:
-    """Damped Gauss-Newton steps on the pixels, every point ahead of the camera; the cost and the pose.
-
-    None where a point is not ahead at the start.
-    """
-    points = np.column_stack([image[:, 2:], np.zeros(len(image))])
-
-    def misses(frame: Frame) -> tuple[float, Floats, Floats]:
-        turned = points @ frame.rotation.T
-        there = turned + frame.translation
-        if there[:, 2].min() <= 0.0:
-            return np.inf, there, there
-        found, J = camera.image(there)
-        r = ((found - image[:, :2]) * weight).ravel()
-        of_turn = np.cross(turned[:, None], J)  # -J [turned]x
-        moves = np.concatenate([of_turn, J], axis=2) * weight[:, :, None]
-        return float(r @ r), r, moves.reshape(-1, 6)
-
-    frame, damping = start, 1e-6
-    cost, r, J = misses(frame)
-    if not np.isfinite(cost):
-        return None
-    for _ in range(STEPS):
-        A = J.T @ J
-        step = -np.linalg.solve(A + damping * np.diag(np.diag(A)) + 1e-300 * np.eye(6), J.T @ r)
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        tried = Frame(turn @ frame.rotation, frame.translation + step[3:])
-        least, r_new, J_new = misses(tried)
-        if least < cost:
-            gain, frame, cost, r, J, damping = cost - least, tried, least, r_new, J_new, 0.1 * damping
-            if gain < 1e-9 * cost:
-                break
-        elif damping > 1e6 or np.abs(step).max() < 1e-13:
+        if n <= LEAST_CORNERS + 1:  # nothing tells which one is off
             break
-        else:
-            damping = max(10.0 * damping, 1e-6)
-    return cost, frame
+        sigma = (1.0 + 5.0 / (n - 3)) * float(np.median(off)) / np.sqrt(2.0 * np.log(2.0))  # Rayleigh's median
+        limit = max(FAR * sigma, LEAST_NOISE)
+        near = np.sort(np.argsort(off)[: n // 2 + 2]) if step < HALVINGS else np.flatnonzero(off <= limit)
+        if np.array_equal(near, kept) or not _spread(image[near, 2:]):
+            break
+        kept = near
+    return float(np.sum(np.minimum(off, limit) ** 2)), frame
+
+
+def _refined(camera: Camera, image: Floats, weight: Floats, start: Frame) -> Frame | None:
+    """The pose of least squares on the pixels; None where a point is not ahead of the camera."""
+    from scipy.optimize import leastsq  # here, for it takes as long to import as a small calibration
+
+    points = image[:, 2:] @ start.rotation[:, :2].T
+    if np.min(points[:, 2] + start.translation[2]) <= 0.0:
+        return None
+
+    def turned(x: Floats) -> Floats:
+        return points @ Rotation.from_rotvec(x[:3]).as_matrix().T
+
+    def misses(x: Floats) -> Floats:
+        return ((camera.image(turned(x) + x[3:])[0] - image[:, :2]) * weight).ravel()
+
+    def derivatives(x: Floats) -> Floats:
+        J = camera.image(turned(x) + x[3:])[1] * weight[:, :, None]
+        return np.concatenate([np.cross(turned(x)[:, None], J) @ left_jacobian(x[None, :3])[0], J], axis=2).reshape(
+            -1, 6
+        )
+
+    x = leastsq(misses, np.append(np.zeros(3), start.translation), Dfun=derivatives, full_output=True)[0]
+    if np.min(turned(x)[:, 2] + x[5]) <= 0.0:
+        return None
+    return Frame(Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation, x[3:])

@@ -18,12 +18,6 @@ from fg_calib.robot.rotations import nearest_rotation
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-STEPS = 50
-"""Gauss-Newton steps from a lifted start, at most."""
-
-STILL = 1e-12
-"""A step of this part of a metre or a radian is the last: rounding."""
-
 
 def targets_from_positions(
     tool: tuple[Floats, Floats], measured: Floats, target: Integers, known: Floats, X: Frame, unknown_frame: bool
@@ -87,7 +81,7 @@ def _aligned(measured: Floats, predicted: Floats) -> Floats:
 def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, known: Floats) -> Floats:
     """Anchors from the lengths to tool points.
 
-    `|p|^2 - d^2 = 2 p a - |a|^2` is linear in the anchor a and the last term. Gauss-Newton steps on the lengths follow,
+    `|p|^2 - d^2 = 2 p a - |a|^2` is linear in the anchor a and the last term. Least squares of the lengths follow,
     from there, from its mirror image across the plane that the points are nearest to, and from the points' middle on
     all sides.
 
@@ -147,28 +141,15 @@ def _trilaterated(points: Floats, length: Floats) -> Floats:
 
 
 def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:
-    """Gauss-Newton on the lengths from each of some starts, shape (k, 3); the point with the least cost met."""
-    a, best, least = starts, starts.copy(), np.full(len(starts), np.inf)
-    going = np.ones(len(starts), dtype=np.bool_)
-    for _ in range(STEPS):
-        step = a[:, None] - points  # (k, n, 3)
-        far = np.linalg.norm(step, axis=2)
-        r = far - length
-        cost = np.sum(r**2, axis=1)
-        better = cost < least * (1.0 - 1e-12)
-        best[better], least[better] = a[better], cost[better]
-        unit = step / np.maximum(far, 1e-12)[:, :, None]
-        values, V = np.linalg.eigh(np.swapaxes(unit, 1, 2) @ unit)
-        along = (r[:, None] @ unit) @ V  # (k, 1, 3): the gradient along the eigenvectors
-        known = values > 1e-12 * values[:, 2:]
-        along[:, 0] *= np.divide(1.0, values, out=np.zeros_like(values), where=known)
-        move = (along @ np.swapaxes(V, 1, 2))[:, 0]
-        going &= (cost <= 100.0 * least) & (np.abs(move).max(axis=1) >= STILL)
-        if not going.any():
-            break
-        a = np.where(going[:, None], a - move, a)
-    found: Floats = best[np.argmin(least)]
-    return found
+    """The point of least squares of the lengths that is best of those from some starts, shape (k, 3)."""
+    from scipy.optimize import leastsq  # here, for it takes as long to import as a small calibration
+
+    def misses(a: Floats) -> Floats:
+        return np.append(np.linalg.norm(a - points, axis=1) - length, np.zeros(3))  # no fewer than coordinates
+
+    found = [leastsq(misses, start, full_output=True)[0] for start in starts]
+    best: Floats = min(found, key=lambda a: float(np.sum(misses(a) ** 2)))
+    return best
 
 
 def plane_from_distances(points: Floats, distance: Floats) -> tuple[Floats, Floats]:

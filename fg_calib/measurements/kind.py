@@ -208,7 +208,9 @@ def checked_rows(
     Raises:
         InputError: It raised something, or one has another shape, or no numbers.
     """
-    found = _raw_rows(kind, at, data, nuisances, source)
+    found = _called(kind, "rows", at, data.copy(), nuisances.copy(), source=source)
+    if not isinstance(found, tuple) or len(found) != len(Rows._fields):
+        raise InputError(_place(kind, "rows", source), f"returned a {type(found).__name__}", "Rows(residual, D, N)")
     n = len(at.position)
     none = np.zeros((n, kind.residual_dim, 0)) if kind.n_nuisances == 0 else np.zeros(0)
     shapes = ((n, kind.residual_dim), (n, kind.ends, kind.residual_dim, 6), (n, kind.residual_dim, kind.n_nuisances))
@@ -221,14 +223,6 @@ def checked_rows(
             raise InputError(place, f"shape {array.shape}", f"{shape}")
         arrays.append(array)
     return arrays[0], arrays[1], arrays[2]
-
-
-def _raw_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str) -> Rows:
-    found = _called(kind, "rows", at, data.copy(), nuisances.copy(), source=source)
-    if not isinstance(found, tuple) or len(found) != len(Rows._fields):
-        place = _place(kind, "rows", source)
-        raise InputError(place, f"returned a {type(found).__name__}", "Rows(residual, D, N)")
-    return Rows(*found)
 
 
 def checked_figures(kind: Kind, data: Floats, source: str) -> Floats:
@@ -257,7 +251,7 @@ def check_start(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source:
 
 
 def check_derivatives(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str = "") -> None:
-    """Compare what a kind says of its derivatives with differences; coarsely, where it computes in float32.
+    """Compare what a kind says of its derivatives with differences.
 
     Args:
         kind: The kind.
@@ -269,36 +263,30 @@ def check_derivatives(kind: Kind, at: Frames, data: Floats, nuisances: Floats, s
     Raises:
         InputError: They differ by more than differences do.
     """
-    fine = np.asarray(_raw_rows(kind, at, data, nuisances, source).residual).dtype.itemsize >= np.float64().itemsize
-    step, alike = (_STEP, _ALIKE) if fine else (_COARSE_STEP, _COARSELY_ALIKE)
     _, D, N = checked_rows(kind, at, data, nuisances, source)
 
-    def compare(name: str, ahead: Floats, behind: Floats, said: Floats) -> None:
-        difference = (ahead - behind) / (2.0 * step)
-        off = np.nan_to_num(np.abs(difference - said) / np.maximum(1.0, np.abs(difference)), nan=np.inf)
-        if not np.all(off < alike):
-            worst = np.unravel_index(np.argmax(off), off.shape)
-            found = f"{said[worst]:.6g} where a small change gives {difference[worst]:.6g}"
-            raise InputError(_place(kind, name, source), found, "the derivative of its residual")
+    def residual(name: str, k: int, h: float) -> Floats:
+        """The residual where one coordinate is another by h."""
+        moved = _moved(at, *divmod(k, 6), h) if name == "wrenches" else at
+        values = nuisances + h * (np.arange(kind.n_nuisances) == k) if name == "nuisances" else nuisances
+        return checked_rows(kind, moved, data, values, source)[0]
 
-    for end in range(kind.ends):
-        for column in range(6):
-            ahead, behind = (
-                checked_rows(kind, _moved(at, end, column, h), data, nuisances, source)[0] for h in (step, -step)
-            )
-            compare("wrenches", ahead, behind, D[:, end, :, column])
-    for column in range(kind.n_nuisances):
-        h = step * np.eye(kind.n_nuisances)[column]
-        ahead, behind = (checked_rows(kind, at, data, nuisances + by, source)[0] for by in (h, -h))
-        compare("nuisances", ahead, behind, N[:, :, column])
+    ends = np.moveaxis(D, 1, 2).reshape(len(D), kind.residual_dim, -1)
+    for name, said in (("wrenches", ends), ("nuisances", N)):
+        for k in range(said.shape[2]):
+            difference = (residual(name, k, STEP) - residual(name, k, -STEP)) / (2.0 * STEP)
+            off = np.abs(difference - said[:, :, k]) / np.maximum(1.0, np.abs(difference))
+            if not np.all(off < MAX_DERIVATIVE_ERROR):
+                worst = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
+                found = f"{said[:, :, k][worst]:.6g} where a small change gives {difference[worst]:.6g}"
+                raise InputError(_place(kind, name, source), found, "the derivative of its residual")
 
 
-_STEP, _ALIKE = 1e-6, 1e-4
-"""Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size; and the difference of a
-derivative, of 1 or its size, that is a mistake."""
+STEP = 1e-6
+"""Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size."""
 
-_COARSE_STEP, _COARSELY_ALIKE = 5e-3, 1e-2
-"""The same in float32, whose rounding is 1e-7 of the lengths."""
+MAX_DERIVATIVE_ERROR = 1e-4
+"""Difference of a derivative, of 1 or its size, that is a mistake."""
 
 
 def _moved(at: Frames, end: int, column: int, h: float) -> Frames:

@@ -433,26 +433,6 @@ def test_want_of_memory_is_no_fault_of_a_kind():
         of_kind(Mine())
 
 
-def test_a_kind_may_compute_in_single_precision():
-    class Single(AnchorDistance):
-        def rows(self, at, data, nuisances):
-            at = at._replace(position=at.position.astype(np.float32))
-            found = super().rows(at, data.astype(np.float32), nuisances.astype(np.float32))
-            return Rows(*(np.float32(array) for array in found))
-
-    class Wrong(Single):
-        def rows(self, at, data, nuisances):
-            found = super().rows(at, data, nuisances)
-            return found._replace(wrenches=np.float32(1.1) * found.wrenches)
-
-    fine, single = of_kind(AnchorDistance()), of_kind(Single())
-    assert single.rows[0].squared_norm(single.variables.at(single.start)) == pytest.approx(
-        fine.rows[0].squared_norm(fine.variables.at(fine.start)), rel=1e-3
-    )
-    with pytest.raises(InputError, match=r"^lengths: kind Wrong: wrenches: \S+ where a small change gives"):
-        of_kind(Wrong())
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -69,7 +69,7 @@ def test_an_image_leaves_two_poses_and_the_true_one_is_among_them(cosine):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("n_off", [1, 3])
+@pytest.mark.parametrize("n_off", [1, 2])
 def test_corners_that_are_far_off_do_not_move_a_board(n_off):
     """30 pixels, of 12 corners at 0.1 pixel: where the others alone have it."""
     for seed in range(8):

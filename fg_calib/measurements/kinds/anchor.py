@@ -12,6 +12,7 @@ from fg_calib.errors import ProblemError
 from fg_calib.initialization.landmarks import anchors_from_lengths, offset_from_lengths
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
+from fg_calib.measurements.kinds.contact import Contact
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
@@ -70,22 +71,13 @@ class AnchorDistance(Kind):
         return np.append(place - 2.0 * across * (across @ (place - middle)), nuisances[3:])
 
 
-class AnchorContact(Kind):
+class AnchorContact(Contact):
     """`p - a` in the frame that the chain starts in, [m]: a distance of zero, which has no direction.
 
     Data: none. Nuisances: the anchor a, 3 coordinates, [m].
     """
 
-    names, units = ("distance.x", "distance.y", "distance.z"), ("m", "m", "m")
-    ends, residual_dim, width, n_nuisances = 1, 3, 0, 3
-    is_contact = True
-
-    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
-        """See `Kind.rows`."""
-        n = len(nuisances)
-        D = np.zeros((n, 1, 3, 6))
-        D[:, 0, :, 3:] = np.eye(3)
-        return Rows(at.position[:, 0] - nuisances, D, np.tile(-np.eye(3), (n, 1, 1)))
+    names = ("distance.x", "distance.y", "distance.z")
 
 
 class AnchorGauge(Instrument):

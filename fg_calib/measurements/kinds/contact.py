@@ -15,17 +15,12 @@ POINT = LandmarkKind(
 )
 
 
-class TouchedPoint(Kind):
-    """`p - point` in the base frame, up to a rotation, [m]; its derivative is `dp - dpoint`.
+class Contact(Kind):
+    """`p - point`, [m]; its derivative is `dp - dpoint`."""
 
-    In a parameter it is minus `a x (p - point)`, as that of `SamePoint`, with a column's rotation a.
-
-    Data: none. Nuisances: the point, 3 coordinates, [m].
-    """
-
-    names, units = ("point.x", "point.y", "point.z"), ("m", "m", "m")
+    units = ("m", "m", "m")
     ends, residual_dim, width, n_nuisances = 1, 3, 0, 3
-    turned_back = is_contact = True
+    is_contact = True
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
@@ -33,6 +28,18 @@ class TouchedPoint(Kind):
         D = np.zeros((n, 1, 3, 6))
         D[:, 0, :, 3:] = np.eye(3)
         return Rows(at.position[:, 0] - nuisances, D, np.tile(-np.eye(3), (n, 1, 1)))
+
+
+class TouchedPoint(Contact):
+    """`p - point` in the base frame, up to a rotation, [m].
+
+    In a parameter its derivative is minus `a x (p - point)`, as that of `SamePoint`, with a column's rotation a.
+
+    Data: none. Nuisances: the point, 3 coordinates, [m].
+    """
+
+    names = ("point.x", "point.y", "point.z")
+    turned_back = True
 
 
 class PointDistance(Kind):
