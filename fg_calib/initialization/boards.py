@@ -2,8 +2,8 @@
 
 A homography takes the board to the image without its distortion. What it is at the middle of the board, and how it
 changes there, leaves two poses (Collins & Bartoli 2014): a board that is small beside its distance looks nearly the
-same tilted either way. Both are refined on the pixels by least squares: on the half of the points that is nearest (least
-trimmed squares), then on all that are not far beyond what most are off by. The better one is first.
+same tilted either way. Both are refined on the pixels by least squares: on the half of the points that is nearest, then
+on all that are not far beyond what most are off by. The better one is first.
 
 References:
     Collins, Bartoli (2014), Infinitesimal plane-based pose estimation. IJCV 109(3).

@@ -276,13 +276,7 @@ def _common_axis(R_F: Floats) -> Floats:
 
 def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: Unknown) -> list[Floats]:
     """Candidates for the frame's rotation from positions alone."""
-
-    def align(t: Floats) -> Floats:
-        """Umeyama: the rotation that takes the predicted points to the measured ones, both about their means."""
-        p = p_F + R_F @ t
-        return nearest_rotation((p_M - p_M.mean(axis=0)).T @ (p - p.mean(axis=0)))
-
-    candidates = [align(t)]
+    candidates = [align_points(p_M, p_F + R_F @ t)]
     if unknown.tool_translation.any():
         # X^T (p_M - t_X) = p_F + R_F t is linear in X^T, X^T t_X and t.
         n = len(p_F)
@@ -292,8 +286,16 @@ def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: 
             A[:, k, 9 + k] = 1.0
         A[:, :, 12:] = -R_F
         solution: Floats = np.linalg.lstsq(A.reshape(-1, 15), p_F.ravel(), rcond=1e-10)[0].astype(np.float64)
-        candidates += [nearest_rotation(solution[:9].reshape(3, 3).T), align(solution[12:])]
+        candidates += [
+            nearest_rotation(solution[:9].reshape(3, 3).T),
+            align_points(p_M, p_F + R_F @ solution[12:]),
+        ]
     return candidates
+
+
+def align_points(measured: Floats, predicted: Floats) -> Floats:
+    """The rotation that takes predicted points to measured ones, both about their means (Umeyama 1991)."""
+    return nearest_rotation((measured - measured.mean(axis=0)).T @ (predicted - predicted.mean(axis=0)))
 
 
 def _with_translations(

@@ -4,7 +4,6 @@ From the nominal arm, wherever these are: metres away, or turned by half a turn.
 
 References:
     Gander (1981), Least squares with a quadratic constraint. Numerische Mathematik 36.
-    Umeyama (1991), Least-squares estimation of transformation parameters between two point patterns. IEEE PAMI 13(4).
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.initialization.hand_eye import Frame
+from fg_calib.initialization.hand_eye import Frame, align_points
 from fg_calib.robot.rotations import nearest_rotation
 
 Floats = NDArray[np.float64]
@@ -57,7 +56,7 @@ def targets_from_positions(
         A = np.concatenate([lift, -lever], axis=2).reshape(3 * n, -1)
         found = np.linalg.lstsq(A, at.ravel(), rcond=1e-10)[0]
         by_lift = at + np.einsum("nij,j->ni", lever, found[12:])
-        rotations = [_aligned(measured, predicted) for predicted in (at, by_lift)]
+        rotations = [align_points(measured, predicted) for predicted in (at, by_lift)]
         rotations.append(nearest_rotation(found[:9].reshape(3, 3).T))
     fits: list[tuple[float, int, Floats, Floats]] = []
     for rotation in rotations:
@@ -71,11 +70,6 @@ def targets_from_positions(
     shift, moved = np.split(step, [3 if unknown_frame else 0])
     places[free] = moved.reshape(-1, 3)
     return Frame(rotation, X.translation + (shift if unknown_frame else 0.0)), places
-
-
-def _aligned(measured: Floats, predicted: Floats) -> Floats:
-    """The rotation that takes predicted points to measured ones, both about their means (Umeyama 1991)."""
-    return nearest_rotation((measured - measured.mean(axis=0)).T @ (predicted - predicted.mean(axis=0)))
 
 
 def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, known: Floats) -> Floats:
