@@ -209,7 +209,11 @@ def check_fit(case: Case) -> list[Statement]:
     if case.fit.priors is not None and case.fit.chi_square.too_large and not case.too_large:
         return []
     updated = case.problem.knowledge is not None
-    return check_chi_square(case.fit.chi_square, case.gross, evaluated=case.problem.evaluated, updated=updated)
+    found = check_chi_square(case.fit.chi_square, case.gross, evaluated=case.problem.evaluated, updated=updated)
+    if not case.fit.goodness.searched and case.fit.chi_square.too_large:
+        text = "outliers were not searched for: there are too many rows; let a robust loss do so (loss: gnc)"
+        found.append(Statement("warning", text))
+    return found
 
 
 def check_chi_square(
@@ -270,10 +274,10 @@ def check_test_rows(case: Case) -> list[Statement]:
     if fit is None:
         return []
     count = fit.outliers
-    most = min(1.0, (count.fitted + 1.0 + 3.0 * np.sqrt(count.fitted + 1.0)) / max(count.of_fitted, 1))
-    if count.test and special.bdtrc(count.test - 1, count.of_test, most) < (1.0 - CONFIDENCE) / 2.0:
-        text = f"test rows: the loss takes {count.test} of {count.of_test} measurements for outliers"
-        return [Statement("error", f"{text}, of those fitted {count.fitted} of {count.of_fitted}")]
+    most = min(1.0, (count.fitted + 1.0 + 3.0 * np.sqrt(count.fitted + 1.0)) / max(count.n_fitted, 1))
+    if count.test and special.bdtrc(count.test - 1, count.n_test, most) < (1.0 - CONFIDENCE) / 2.0:
+        text = f"test rows: the loss takes {count.test} of {count.n_test} measurements for outliers"
+        return [Statement("error", f"{text}, of those fitted {count.fitted} of {count.n_fitted}")]
     if not fit.n or fit.p_value >= (1.0 - CONFIDENCE) / 2.0:
         return []
     ratio = fit.chi2 / fit.expected

@@ -240,7 +240,7 @@ def _prediction(result: Result) -> list[Section]:
     headings = ("", "rows", "chi-square", "expected", "ratio", "p-value", "")
     notes = []
     if fit.outliers.test:
-        notes.append(f"{fit.outliers.test} of {fit.outliers.of_test} measurements do not count: outliers by the loss")
+        notes.append(f"{fit.outliers.test} of {fit.outliers.n_test} measurements do not count: outliers by the loss")
     if fit.n_unknown:
         notes.append(f"{fit.n_unknown} rows are not judged: they depend on what is not determined")
     table = table_of(headings, rows, left="lrrrrrl", wrap=True)

@@ -219,9 +219,9 @@ class OutlierCounts(NamedTuple):
     """Test and fitted measurements, and those among them that a robust loss takes for outliers; zeros without one."""
 
     test: int = 0
-    of_test: int = 0
+    n_test: int = 0
     fitted: int = 0
-    of_fitted: int = 0
+    n_fitted: int = 0
 
 
 @dataclass(frozen=True)
@@ -269,6 +269,7 @@ class Goodness(FrozenArrays):
         configurations: Suspect configurations among the fitted rows, the worst first.
         test: The predicted rows; None without any that can be judged.
         gross: The few gross errors that spoil the fit; None if there are none, or it cannot be told.
+        searched: Whether these were searched for, as far as the fit asks for it: not among too many rows.
     """
 
     kinds: tuple[KindFit, ...]
@@ -281,6 +282,7 @@ class Goodness(FrozenArrays):
     configurations: tuple[SuspectConfiguration, ...]
     test: PredictedFit | None
     gross: GrossErrors | None = None
+    searched: bool = True
 
     def unknown(self, table: ResidualTable) -> Booleans:
         """Predicted rows that depend on what neither data nor priors determine, shape (n,)."""

@@ -88,7 +88,7 @@ def find_outliers(
         priors: Whitened residuals of the core's priors there, and their derivatives.
     """
     W = _inverse_noise(errors)
-    if W is None or dof < 1.0:
+    if dof < 1.0:
         return None
     r_prior, J_prior = priors if priors is not None else (np.zeros(0), np.zeros((0, len(tangent))))
     P = errors.root(tangent)
@@ -103,13 +103,11 @@ def find_outliers(
     return search.best()
 
 
-def _inverse_noise(errors: RowErrors) -> Sparse | None:
-    """C^-1 of rows by their noise, shape (n, n); None if too many rows share errors."""
+def _inverse_noise(errors: RowErrors) -> Sparse:
+    """C^-1 of rows by their noise, shape (n, n)."""
     d, L = np.maximum(errors.private, PRIVATE_SHARE * errors.noise), errors.L
     if not L.nnz:
         return Sparse(scipy.sparse.diags_array(1.0 / d))
-    if len(d) > MAX_SHARED_ROWS:
-        return None
     factor = scipy.linalg.cho_factor((L @ L.T).toarray() + np.diag(d))
     return Sparse(scipy.linalg.cho_solve(factor, np.eye(len(d))))
 
@@ -212,8 +210,11 @@ def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTa
         fit: Its goodness of fit.
     """
     robust = solution.problem.state.weights is not None or solution.estimated_noise is not None
-    if robust or _is_fine(fit) or solution.problem.evaluated or solution.problem.has_more or table.n > MAX_ROWS:
+    if robust or _is_fine(fit) or solution.problem.evaluated or solution.problem.has_more:
         return fit
+    shared = any(noise.sources for noise in solution.noises)
+    if table.n > MAX_ROWS or (shared and int(np.sum(table.used)) > MAX_SHARED_ROWS):
+        return replace(fit, searched=False)
     found = _fit_without_outliers(solution, table, (solution, spread, table))
     if found is None or not _is_fine(found[2]):  # the nominal arm is nearer to the truth than a fit that went astray
         nominal = replace(solution, parameters=solution.before)

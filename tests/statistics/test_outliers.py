@@ -18,6 +18,7 @@ from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.options import Pairing
+from fg_calib.statistics import outliers
 from fg_calib.statistics.outliers import find_outliers, log_chance
 from fg_calib.statistics.residual_covariance import RowErrors
 
@@ -130,6 +131,14 @@ def spoilt(name, by, rng):
     if name == "pose":
         return build_problem(robot, m, model="pose"), "9"
     return build_problem(robot, m, model="distance-rotation", pairing=Pairing(name)), "9"
+
+
+def test_too_many_rows_to_search_for_outliers_are_a_warning(monkeypatch):
+    problem, _ = spoilt("star", 300.0, np.random.default_rng(5))
+    monkeypatch.setattr(outliers, "MAX_SHARED_ROWS", 10)
+    found = assess(solve(problem))
+    assert found.fit.goodness.gross is None
+    assert any("outliers were not searched for: there are too many rows" in text for text in found.verdict.warnings)
 
 
 SPOILT = ["pose", "star", "all", "anchors", "planes", "board", "targets"]
