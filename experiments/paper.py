@@ -153,7 +153,8 @@ def fit(simulation: Simulation, model: str, estimator: str) -> Robot:
     """Calibrate from a star of pairs, or from poses in the base frame, by one of the `ESTIMATORS`."""
     robot, rows = simulation.robot, simulation.measurements
     if estimator == "least squares":
-        return fit_least_squares(robot, rows, model=model, names=papers_names(robot, model), weighted=False).robot
+        data = build_problem(robot, rows, model=model).data
+        return fit_least_squares(robot, data, names=papers_names(robot, model)).robot
     return solve(build_problem(robot, rows, model=model)).robot
 
 

@@ -23,7 +23,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -55,7 +55,7 @@ ResidualRms = dict[str, dict[str, dict[str, float]]]
 ESTIMATORS: Mapping[str, str] = {
     "graph": "the factor graph, as the job says",
     "graph-keep": "the factor graph, the kept parameters alone and no priors",
-    "gauss-newton": "plain least squares of the kept parameters, metres beside radians: Eq. (54) of Jia et al. (2019)",
+    "gauss-newton": "plain least squares of the kept parameters without weights: Eq. (54) of Jia et al. (2019)",
     "weighted-gauss-newton": "the same, weighted by noise, each measurement as if it were alone",
     "scipy": "scipy.optimize.least_squares of the same parameters and weights",
 }
@@ -124,11 +124,6 @@ class Estimate(Brief):
     predicted_fitted_rms: float | None = None
     errors: RealErrors | None = None
 
-    @property
-    def description(self) -> str:
-        """The estimator in words."""
-        return ESTIMATORS[self.name]
-
 
 @dataclass(frozen=True)
 class Comparison(Brief):
@@ -137,8 +132,7 @@ class Comparison(Brief):
     Attributes:
         job: The job.
         estimates: One of each estimator, in the order of `ESTIMATORS`; the job's own graph first.
-        before: The nominal arm, its tool fitted where that is unknown: where the residuals `before` come from.
-        errors_before: Its real errors; None where the truth is not known.
+        errors_before: Real errors of the nominal arm, its tool fitted where that is unknown; None without the truth.
         judged_on: `test`, or `train` where there are no test rows.
         n_judged: Number of configurations judged on.
         findings: Why the graph's result is not to be trusted; empty if it is.
@@ -147,7 +141,6 @@ class Comparison(Brief):
 
     job: Job
     estimates: tuple[Estimate, ...]
-    before: Robot
     errors_before: RealErrors | None
     judged_on: Literal["test", "train"]
     n_judged: int
@@ -179,16 +172,42 @@ def compare(job: Job) -> Comparison:
     if solution.problem.evaluated:
         raise ProblemError(data.source, "test rows alone", "train rows, for there is nothing to compare")
     configurations, judged_on = judged_configurations(data)
-    readings = data.readings[configurations]
-    assessed = assess(solution)
+    readings, assessed = data.readings[configurations], assess(solution)
 
-    judge = _Judge(job, solution, readings)
-    before = job.robot.with_values(solution.before[solution.problem.variables.robot_span])
+    def errors(robot: Robot) -> RealErrors | None:
+        return None if job.truth is None else real_errors(robot, job.truth, readings)
+
+    def judged(name: str, fit: Solution | LeastSquares, assessed: Assessment | None = None) -> Estimate:
+        """An estimate on the same rows and configurations, by the same formulas."""
+        if isinstance(fit, LeastSquares):
+            robot, sigma, predicted = fit.robot, fit.sigma, _predicted(fit, readings)
+        else:
+            assessed = assessed or assess(fit)
+            robot, spread = assessed.robot, assessed.spread
+            values = np.sqrt(np.diag(spread.named())).tolist()
+            sigma, predicted = dict(zip(spread.variables.names, values, strict=False)), errors_at(spread, readings)
+        return Estimate(
+            name=name,
+            robot=robot,
+            sigma=sigma,
+            residual_rms=residual_table(replace(solution, parameters=fit.parameters)).rms(),
+            predicted_rms=predicted[0].position,
+            predicted_fitted_rms=predicted[1].position,
+            errors=errors(robot),
+            **{key: getattr(fit, key) for key in ("converged", "message", "iterations", "seconds")},
+        )
+
+    def without_priors(name: str) -> Estimate:
+        try:
+            problem = problem_of(job, gauge="keep")
+            return judged(name, solve_job(job, problem) if name == "graph-keep" else _fit_kept(job, problem, name))
+        except CalibrationError as error:
+            return Estimate(name, None, {}, False, f"could not run: {error}")
+
     return Comparison(
         job=job,
-        estimates=(judge.of_graph("graph", solution, assessed), *map(judge.of_kept, list(ESTIMATORS)[1:])),
-        before=before,
-        errors_before=judge.errors(before),
+        estimates=(judged("graph", solution, assessed), *map(without_priors, list(ESTIMATORS)[1:])),
+        errors_before=errors(job.robot.with_values(solution.before[solution.problem.variables.robot_span])),
         judged_on=judged_on,
         n_judged=len(readings),
         findings=assessed.verdict.errors,
@@ -196,59 +215,11 @@ def compare(job: Job) -> Comparison:
     )
 
 
-@dataclass(frozen=True)
-class _Judge:
-    """Judgement of every estimate on the same rows and configurations, by the same formulas."""
-
-    job: Job
-    solution: Solution
-    readings: Floats
-
-    def errors(self, robot: Robot) -> RealErrors | None:
-        return None if self.job.truth is None else real_errors(robot, self.job.truth, self.readings)
-
-    def estimate(
-        self,
-        name: str,
-        fit: Solution | LeastSquares,
-        robot: Robot,
-        sigma: Mapping[str, float],
-        predicted: Sequence[PoseRms],
-    ) -> Estimate:
-        return Estimate(
-            name=name,
-            robot=robot,
-            sigma=sigma,
-            converged=fit.converged,
-            message=fit.message,
-            iterations=fit.iterations,
-            seconds=fit.seconds,
-            residual_rms=residual_table(replace(self.solution, parameters=fit.parameters)).rms(),
-            predicted_rms=predicted[0].position,
-            predicted_fitted_rms=predicted[1].position,
-            errors=self.errors(robot),
-        )
-
-    def of_graph(self, name: str, solution: Solution, assessed: Assessment) -> Estimate:
-        spread = assessed.spread
-        sigma = dict(zip(spread.variables.names, np.sqrt(np.diag(spread.named())).tolist(), strict=False))
-        return self.estimate(name, solution, assessed.robot, sigma, errors_at(spread, self.readings))
-
-    def of_baseline(self, name: str, fit: LeastSquares) -> Estimate:
-        chain = build_chain(fit.robot, {fit.robot.index(p): k for k, p in enumerate(fit.names)})
-        at = forward(chain, fit.robot.trig(self.readings))
-        predicted = pose_rms(at.position, at.jacobian, lambda rows: np.sum((rows @ fit.covariance) * rows, axis=1))
-        return self.estimate(name, fit, fit.robot, fit.sigma, predicted)
-
-    def of_kept(self, name: str) -> Estimate:
-        try:
-            problem = problem_of(self.job, gauge="keep")
-            if name != "graph-keep":
-                return self.of_baseline(name, _fit_kept(self.job, problem, name))
-            found = solve_job(self.job, problem)
-            return self.of_graph(name, found, assess(found))
-        except CalibrationError as error:
-            return Estimate(name, None, {}, False, f"could not run: {error}")
+def _predicted(fit: LeastSquares, readings: Floats) -> tuple[PoseRms, PoseRms]:
+    """Errors of the tool that the covariance predicts, in the base frame and after the best rigid fit."""
+    chain = build_chain(fit.robot, {fit.robot.index(p): k for k, p in enumerate(fit.names)})
+    at = forward(chain, fit.robot.trig(readings))
+    return pose_rms(at.position, at.jacobian, lambda rows: np.sum((rows @ fit.covariance) * rows, axis=1))
 
 
 def _fit_kept(job: Job, problem: Problem, name: str) -> LeastSquares:
@@ -272,25 +243,16 @@ def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:
     """Errors of an estimated arm at joint readings, shape (n, n_joints), [rad] (prismatic: [m])."""
     at, truth = (forward(build_chain(r), r.trig(readings)) for r in (estimated, true))
 
-    def error(R: Floats, t: Floats) -> PoseError:
-        distance = np.linalg.norm(at.position @ R.T + t - truth.position, axis=1)
-        turn = rotation_vector(np.swapaxes(R @ at.rotation, 1, 2) @ truth.rotation)
+    def error(points: Floats, onto: Floats, R: Floats) -> PoseError:
+        distance = np.linalg.norm(points @ R.T - onto, axis=1)
+        rotation = rotation_vector(np.swapaxes(R @ at.rotation, 1, 2) @ truth.rotation)
         rms = float(np.sqrt(np.mean(distance**2)))
-        orientation_rms = float(np.sqrt(np.mean(np.sum(turn**2, axis=1))))
+        orientation_rms = float(np.sqrt(np.mean(np.sum(rotation**2, axis=1))))
         return PoseError(float(distance.max()), float(distance.mean()), rms, orientation_rms)
 
-    fitted = error(*best_rigid_fit(at.position, truth.position)) if len(readings) >= 3 else None
-    return RealErrors(error(np.eye(3), np.zeros(3)), fitted)
-
-
-def best_rigid_fit(points: Floats, onto: Floats) -> tuple[Floats, Floats]:
-    """Rotation R and translation t that minimise the sum of |R p + t - q|^2 (Umeyama 1991, without scale).
-
-    Args:
-        points: The points p, shape (n, 3), [m].
-        onto: The points q, shape (n, 3), [m].
-    """
-    p, q = points.mean(axis=0), onto.mean(axis=0)
-    U, _, Vt = np.linalg.svd((onto - q).T @ (points - p))
-    R: Floats = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return R, q - R @ p
+    base, fitted = error(at.position, truth.position, np.eye(3)), None
+    if len(readings) >= 3:
+        points, onto = (p - p.mean(axis=0) for p in (at.position, truth.position))
+        U, _, Vt = np.linalg.svd(onto.T @ points)  # Umeyama, without scale
+        fitted = error(points, onto, U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+    return RealErrors(base, fitted)

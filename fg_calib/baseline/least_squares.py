@@ -29,7 +29,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,22 +38,10 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Brief
 from fg_calib.errors import InputError
 from fg_calib.measurements import residuals
-from fg_calib.measurements.build import Dataset, build_dataset
-from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.build import Dataset
 from fg_calib.measurements.kinds.pair import usable_pairs
 from fg_calib.measurements.residuals import Block, unit_whitening
-from fg_calib.measurements.table import Table
-from fg_calib.options import (
-    PAIR_MODELS,
-    POSE_MODELS,
-    FrameKnowledge,
-    Model,
-    Pairing,
-    as_pairing,
-    check,
-    check_names,
-    check_number,
-)
+from fg_calib.options import check, check_names, check_number
 from fg_calib.parallel import single_threaded
 from fg_calib.robot.kinematics import Chain, build_chain
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
@@ -157,13 +145,10 @@ class LeastSquares(Fit):
 @single_threaded
 def fit_least_squares(
     robot: Robot,
-    measurements: Measurements | Dataset,
+    data: Dataset,
     *,
-    model: Model | None = None,
-    pairing: Pairing | None = None,
     names: Sequence[str] | None = None,
     start: Floats | None = None,
-    frame: FrameKnowledge = "known",
     weighted: bool = False,
     method: Method = "gauss-newton",
     max_iterations: int = 50,
@@ -173,16 +158,12 @@ def fit_least_squares(
 
     Args:
         robot: The nominal robot; its tolerances are not used.
-        measurements: What was measured; or all tables of a calibration with their landmarks, which need no `model`,
-            `pairing` and `frame`.
-        model: Which measurements take part: a model of poses or pairs.
-        pairing: How pairs are formed from poses where none were measured directly; a star if None.
+        data: What was measured: all tables of a calibration with their landmarks (see `measurements.build_dataset`).
         names: The parameters to estimate; all that the robot's file lets be estimated if None. With more than the
             measurements determine every step is a minimum-norm step.
-        start: Values to start from, shape (n_parameters,), [m] or [rad], or with x, y, z, yaw, pitch, roll of the
-            measurement frames (six values at least) and coordinates of estimated landmarks. Nominal values and the
-            identity if None.
-        frame: `unknown` estimates world_T_base with the parameters; of no meaning for models of pairs.
+        start: Values to start from, as `Problem.start`: of the robot, [m] or [rad]; x, y, z, yaw, pitch, roll of the
+            measurement frames (six values at least); coordinates of estimated landmarks. Without landmarks those of
+            the robot suffice. Nominal values and the identity if None.
         weighted: Whether rows are whitened by the noise of measurements and, to first order, of joint readings. The
             weights are those at the start, then those at the estimate, until they change nothing more.
         method: `gauss-newton`, as printed; `scipy`: `scipy.optimize.least_squares` with the same derivatives.
@@ -190,42 +171,16 @@ def fit_least_squares(
         tolerance: Length of a Gauss-Newton step that is small enough, metres and radians side by side.
 
     Raises:
-        InputError: An argument is not one of those possible, the measurements lack what the model needs, there is no
-            row to fit, or nothing to estimate.
+        InputError: An argument is not one of those possible, there is no row to fit, or nothing to estimate.
     """
     clock = time.perf_counter()
     check("method", method, Method)
     check_number("max_iterations", max_iterations, least=1, whole=True)
     check_number("tolerance", tolerance, finite=False)
-    if isinstance(measurements, Measurements):
-        measurements = _dataset(robot, measurements, model, pairing, frame, weighted)
-    system = _System(robot, measurements, _chosen(robot, names), start)
+    system = _System(robot, data, _chosen(robot, names), start)
     solver = partial(_METHODS[method], limit=max_iterations, tolerance=tolerance)
     fit, weights = system.solve(solver, weighted)
     return replace(system.result(fit, weights), seconds=time.perf_counter() - clock)
-
-
-def _dataset(
-    robot: Robot, m: Measurements, model: Model | None, pairing: Pairing | None, frame: FrameKnowledge, weighted: bool
-) -> Dataset:
-    """Measurements of one table, checked; unweighted fits need no noise."""
-    check("model", model, Model)
-    check("frame", frame, FrameKnowledge)
-    if model not in (*POSE_MODELS, *PAIR_MODELS):
-        raise InputError("model", f"found {model!r}", f"one of {', '.join((*POSE_MODELS, *PAIR_MODELS))} here")
-    known: FrameKnowledge = "known" if model in PAIR_MODELS else frame
-    return build_dataset(robot, [Table(m if weighted else _with_unit_noise(m), model, as_pairing(pairing), known)])
-
-
-def _with_unit_noise(m: Measurements) -> Measurements:
-    """Measurements with a sigma of 1 m or 1 rad where none is stated, for unweighted fits."""
-    ones = {f"sigma_{name}": np.ones((len(m.readings), 3)) for name in ("position", "orientation")}
-    missing: dict[str, Any] = {name: sigma for name, sigma in ones.items() if getattr(m, name) is None}
-    pairs = m.pairs
-    if pairs is not None:
-        sigmas = {name: np.nan_to_num(getattr(pairs, name), nan=1.0) for name in ("sigma_distance", "sigma_angle")}
-        pairs = replace(pairs, **sigmas)
-    return replace(m, pairs=pairs, **missing)
 
 
 def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
@@ -247,34 +202,31 @@ Weights = tuple[Floats, ...]
 def gauss_newton(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) -> Fit:
     """Minimum by Eq. (54) and (55) of the paper."""
     steps: list[float] = []
-
-    def end(converged: bool, message: str) -> Fit:
-        return Fit(x, converged, message, len(steps), tuple(steps))
-
-    for _ in range(limit):
+    converged, message = False, ""
+    while not message:
         with np.errstate(all="ignore"):
             r, J = evaluate(x)
-            if not (np.isfinite(r).all() and np.isfinite(J).all()):
-                return end(False, f"diverged: residuals are not finite after {len(steps)} steps")
-            try:
-                step = np.linalg.pinv(J, rcond=RCOND) @ -r
-            except np.linalg.LinAlgError as error:
-                return end(False, f"no step possible: {error}")
+            finite = np.isfinite(r).all() and np.isfinite(J).all()
+            step = np.linalg.pinv(J, rcond=RCOND) @ -r if finite else np.full(len(x), np.nan)
         if not np.isfinite(step).all():
-            return end(False, f"diverged: step {len(steps) + 1} is not finite")
+            message = f"diverged: residuals are not finite after {len(steps)} steps"
+            break
         x = x + step
         steps.append(float(np.linalg.norm(step)))
-        if steps[-1] <= tolerance:
-            return end(True, f"converged: the last step was {steps[-1]:.1e}")
-        if steps[-1] <= ROUNDING and len(steps) > 1 and steps[-1] >= steps[-2]:
-            return end(True, f"converged to rounding: steps of {steps[-1]:.1e} no longer shrink")
-    return end(False, f"not converged: {limit} iterations, the last step was {steps[-1]:.1e}")
+        rounding = steps[-1] <= ROUNDING and len(steps) > 1 and steps[-1] >= steps[-2]
+        converged = steps[-1] <= tolerance or rounding
+        if converged:
+            message = f"converged: the last step was {steps[-1]:.1e}"
+        elif len(steps) == limit:
+            message = f"not converged: {limit} iterations, the last step was {steps[-1]:.1e}"
+    return Fit(x, converged, message, len(steps), tuple(steps))
 
 
 def scipy_fit(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) -> Fit:
     """Minimum by MINPACK's Levenberg-Marquardt, or scipy's trust region with fewer rows than unknowns."""
     from scipy import optimize  # here: it takes as long to import as a small calibration
 
+    method: Literal["lm", "trf"] = "lm" if len(evaluate(x)[0]) >= len(x) else "trf"
     exact = 1e-15  # near the least that MINPACK takes
 
     def residual(x: Floats) -> Floats:
@@ -288,7 +240,7 @@ def scipy_fit(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) ->
             residual,
             x,
             jac=jacobian,
-            method="lm" if len(residual(x)) >= len(x) else "trf",
+            method=method,
             x_scale="jac",
             ftol=exact,
             xtol=max(exact, tolerance),
@@ -350,9 +302,9 @@ class _Rows:
         if not all(part.ends == 2 and part.quantity in ("distance", "angle") and not part.is_contact for part in parts):
             return self
         predicted = residuals.residual(self.block, chain) + self.block.data
-        is_angle = np.array([part.quantity == "angle" for part in parts])
-        excluded = (predicted < NOT_DIFFERENTIABLE) | (is_angle & (predicted > np.pi - NOT_DIFFERENTIABLE))
-        return replace(self, use=self.use & ~excluded)
+        most = np.array([np.pi if part.quantity == "angle" else np.inf for part in parts])
+        good = (predicted >= NOT_DIFFERENTIABLE) & (predicted <= most - NOT_DIFFERENTIABLE)
+        return replace(self, use=self.use & good)
 
     def whitening(self, chain: Chain, coordinates: Floats, sigma_joint: Floats) -> Floats:
         """W with W S W^T = 1 of each measurement, lower triangular, shape (n, residual_dim, residual_dim).
@@ -410,7 +362,7 @@ class _System:
         self._coordinates: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
         self._priors = [(p, self._coordinates[p], t) for p, t in zip(places, tolerances, strict=True) if t is not None]
         n, n_frames, m = len(robot.parameters), int(unknown.sum()), len(chosen)
-        given = _checked_start(robot, start, n + 6 * max(1, n_frames), len(self._estimated))
+        given = _checked_start(robot, start, n_frames, len(self._estimated))
         self._values, self._frames = given[:n], given[n : n + 6 * n_frames].reshape(-1, 6)
         landmarks = given[n + 6 * max(1, n_frames) :]
         self._coordinates[self._estimated] = landmarks
@@ -514,20 +466,19 @@ class _System:
         ), weights
 
 
-def _checked_start(robot: Robot, start: Floats | None, with_frames: int, n_landmarks: int) -> Floats:
-    """Values of the robot, of measurement frames (zeros where they are left out), and of landmarks.
+def _checked_start(robot: Robot, start: Floats | None, n_frames: int, n_landmarks: int) -> Floats:
+    """Values of the robot, of at least one measurement frame (zeros where they are left out), and of landmarks.
 
     Raises:
         InputError: There are more or fewer, or one is not finite.
     """
     given, n = np.asarray(robot.nominal if start is None else start, dtype=np.float64), len(robot.parameters)
-    if given.shape == (n,):
-        given = np.append(given, np.zeros(with_frames - n))
-    if given.shape != (with_frames + n_landmarks,) or not np.isfinite(given).all():
+    whole = n + 6 * max(1, n_frames) + n_landmarks
+    if given.shape == (n,) and not n_landmarks:
+        given = np.append(given, np.zeros(whole - n))
+    if given.shape != (whole,) or not np.isfinite(given).all():
         found = f"shape {given.shape}" if np.isfinite(given).all() else "a value that is not finite"
-        landmarks = f", then {n_landmarks} of landmarks" if n_landmarks else ""
-        expected = f"{n} values of the robot, or {with_frames} with the measurement frame's{landmarks}"
-        raise InputError("start", found, expected)
+        raise InputError("start", found, f"{n} values of the robot, or {whole} with the measurement frame's")
     return given
 
 

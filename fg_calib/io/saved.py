@@ -42,7 +42,7 @@ RESULT_FILES = {
     "report.html": b"<!DOCTYPE html>",
     **{
         f"{name}.svg": b"<svg"
-        for name in ("accuracy", "joints", "ranges", "parameters", "correlations", "residuals", "workspace")
+        for name in ("accuracy", "joints", "parameters", "correlations", "residuals", "workspace")
     },
     "joints.csv": b"id,joint,unit,reading,estimate,",
     "robot_calibrated.yaml": b"",

@@ -49,19 +49,18 @@ def tag(name: str, content: str = "", **attributes: str | float) -> str:
     Args:
         name: Of the element.
         content: Elements, or text that has been escaped.
-        attributes: By name, a trailing _ removed and others as -.
+        attributes: By name, a trailing _ removed.
     """
-    plain = (f' {key.rstrip("_").replace("_", "-")}="{_attribute(value)}"' for key, value in attributes.items())
+    plain = [
+        f' {key.rstrip("_")}="{escape(escaped(value)) if isinstance(value, str) else coordinate(value)}"'
+        for key, value in attributes.items()
+    ]
     return f"<{name}{''.join(plain)}>{content}</{name}>"
-
-
-def _attribute(value: str | float) -> str:
-    return escape(escaped(value)) if isinstance(value, str) else coordinate(value)
 
 
 def coordinate(value: float) -> str:
     """A coordinate in few characters."""
-    return f"{value:.1f}".removesuffix(".0") if abs(value) < 1e6 else f"{value:g}"
+    return f"{round(value, 1):g}"
 
 
 def words(x: float, y: float, text: str, kind: str, **attributes: str) -> str:
@@ -178,7 +177,7 @@ class Plot:
         at = np.column_stack([self.x(x[good]), self.y(y[good])])
         if len(at):
             at = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), MAX_DOTS)).astype(np.int64))]
-            path = "".join(f"M{coordinate(a)} {coordinate(b)}h0" for a, b in at.tolist())
+            path = "".join([f"M{a:g} {b:g}h0" for a, b in np.round(at, 1).tolist()])
             self.add(tag("path", d=path, class_=f"dots {kind}"))
 
     def ring(self, x: float, y: float, text: str) -> None:
@@ -221,8 +220,13 @@ def bars(rows: Sequence[tuple[str, Sequence[tuple[str, float, str]]]], caption: 
     return framed(caption, WIDTH, y, *elements)
 
 
-Whisker = tuple[str, float, float, float]
-"""Name, value, its sigma (nan: unknown), and its prior sigma (nan: none)."""
+class Whisker(NamedTuple):
+    """A name, a value, its sigma (nan: unknown), and its prior sigma (nan: none)."""
+
+    name: str
+    value: float
+    sigma: float
+    prior: float
 
 
 def whiskers(rows: Sequence[Whisker], caption: str, name: str) -> Chart:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from rich.text import Text
 
 from fg_calib import __version__
 from fg_calib.arguments import checked
-from fg_calib.baseline.comparison import Comparison, Estimate, PoseError, RealErrors
+from fg_calib.baseline.comparison import ESTIMATORS as DESCRIPTIONS
+from fg_calib.baseline.comparison import Comparison, Estimate, RealErrors
 from fg_calib.diagnostics.verdict import probability
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import fill_folder, write_text
@@ -34,7 +35,6 @@ from fg_calib.report.tables import (
     table_of,
 )
 from fg_calib.report.text import summary
-from fg_calib.robot.model import Robot
 
 ESTIMATORS = {
     "graph": "graph",
@@ -45,12 +45,13 @@ ESTIMATORS = {
 }
 """Headings of the estimators."""
 
-POSE_ERRORS: tuple[tuple[str, str, Callable[[PoseError], float]], ...] = (
-    ("position, max", "m", lambda e: e.max),
-    ("position, mean", "m", lambda e: e.mean),
-    ("position, RMS", "m", lambda e: e.rms),
-    ("orientation, RMS", "rad", lambda e: e.orientation_rms),
-)
+POSE_ERRORS = {
+    "max": ("position, max", "m"),
+    "mean": ("position, mean", "m"),
+    "rms": ("position, RMS", "m"),
+    "orientation_rms": ("orientation, RMS", "rad"),
+}
+"""Name and unit of each field of `PoseError`."""
 
 INDEPENDENT = (
     "The sigma of a change assumes independent calibrations; with common priors or measurements it is too small."
@@ -65,75 +66,72 @@ def format_comparison(comparison: Comparison, width: int = WIDTH) -> str:
 
 def build_comparison_report(comparison: Comparison) -> RenderableType:
     """Estimators compared: errors, residuals, effort, then the parameters of each."""
-    job = comparison.job
+    job, names = comparison.job, [ESTIMATORS[e.name] for e in comparison.estimates]
     title = f"{job.robot.name}: {job.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
     parts: list[RenderableType] = [line(title)]
     parts += [line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings]
-    headings = ("", "", "nominal", *(ESTIMATORS[e.name] for e in comparison.estimates))
-    parts += [line(""), table_of(headings, _accuracy(comparison), left="ll")]
-    parts += section("Corrections (± sigma)", _corrections(comparison))
-    estimators = [(f"  {ESTIMATORS[e.name]}", f"{e.description}; {e.message}") for e in comparison.estimates]
+    parts += [line(""), table_of(("", "", "nominal", *names), _accuracy(comparison), left="ll")]
+    headings = ("", "", *(["truth"] if job.truth is not None else []), *names)
+    parts += section("Corrections (± sigma)", table_of(headings, _corrections(comparison), left="ll", wrap=True))
+    estimators = [(f"  {ESTIMATORS[e.name]}", f"{DESCRIPTIONS[e.name]}; {e.message}") for e in comparison.estimates]
     nominal = ("  nominal", "the arm before the calibration, tool and measurement frame fitted where unknown")
     parts += section("Estimators", table_of(("", ""), [nominal, *estimators], left="ll", wrap=True))
     return Group(*parts, *section("Notes", *indented(_comparison_notes(comparison))))
 
 
 def _accuracy(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
+    """Errors, residuals and effort of each estimator, a quantity a row, under headings."""
     estimates = comparison.estimates
-    empty = [""] * (len(estimates) + 2)
+
+    def heading(text: str) -> Sequence[str | Text]:
+        return line(text, "bold"), *[""] * (len(estimates) + 2)
 
     def row(label: str, unit: str, values: Iterable[float | None]) -> tuple[str, ...]:
         factor, shown, decimals = SHOWN[unit]
         return (f"  {label}", shown, *("-" if v is None else _large(v * factor, decimals - 1) for v in values))
 
     errors = [comparison.errors_before, *(e.errors for e in estimates)]
-    for heading, chosen in (
-        ("Real error in the base frame", [None if e is None else e.base for e in errors]),
-        ("Real error after the best rigid fit", [None if e is None else e.fitted for e in errors]),
-    ):
+    for key, words in (("base", "in the base frame"), ("fitted", "after the best rigid fit")):
+        chosen = [getattr(e, key, None) for e in errors]
         if any(chosen):
-            yield line(heading, "bold"), *empty
-            for label, unit, value in POSE_ERRORS:
-                yield row(label, unit, [None if e is None else value(e) for e in chosen])
-    yield line("Error predicted by its sigmas", "bold"), *empty
+            yield heading(f"Real error {words}")
+            for field, (label, unit) in POSE_ERRORS.items():
+                yield row(label, unit, [getattr(e, field, None) for e in chosen])
+    yield heading("Error predicted by its sigmas")
     yield row("position, RMS", "m", [None, *(e.predicted_rms for e in estimates)])
     yield row("after best rigid fit", "m", [None, *(e.predicted_fitted_rms for e in estimates)])
-    before = estimates[0].residual_rms or {}
-    for split in ("train", "test"):
-        if before.get(split):
-            yield line(f"Residuals, {split} rows (RMS)", "bold"), *empty
-        for family in in_order(before.get(split, {})):
+    for split, before in (estimates[0].residual_rms or {}).items():
+        if before:
+            yield heading(f"Residuals, {split} rows (RMS)")
+        for family in in_order(before):
             after = [None if e.residual_rms is None else e.residual_rms[split][family]["after"] for e in estimates]
-            yield row(family, comparison.units[family], [before[split][family]["before"], *after])
-    yield line("Effort", "bold"), *empty
-    efforts = [(f"{len(e.sigma)}", f"{e.iterations}", f"{e.seconds * 1e3:.1f}") for e in estimates]
-    for k, (label, unit) in enumerate((("parameters", ""), ("iterations", ""), ("time", "ms"))):
-        yield f"  {label}", unit, "-", *("-" if e.robot is None else efforts[i][k] for i, e in enumerate(estimates))
+            yield row(family, comparison.units[family], [before[family]["before"], *after])
+    yield heading("Effort")
+    efforts = {
+        "parameters": ("", [f"{len(e.sigma)}" for e in estimates]),
+        "iterations": ("", [f"{e.iterations}" for e in estimates]),
+        "time": ("ms", [f"{e.seconds * 1e3:.1f}" for e in estimates]),
+    }
+    for label, (unit, values) in efforts.items():
+        yield f"  {label}", unit, "-", *("-" if e.robot is None else v for e, v in zip(estimates, values, strict=True))
     yield "  converged", "", "-", *("yes" if e.converged else "NO" for e in estimates)
 
 
-def _corrections(comparison: Comparison) -> RenderableType:
-    job, rows = comparison.job, []
-    for p in job.robot.parameters:
-        if not p.estimated:
-            continue
+def _corrections(comparison: Comparison) -> Iterator[tuple[str, ...]]:
+    """The correction of each parameter by each estimator, with its sigma."""
+    truth = comparison.job.truth
+    for p in (p for p in comparison.job.robot.parameters if p.estimated):
         factor, unit, decimals = SHOWN[p.unit]
-
-        def correction(robot: Robot, name: str = p.name, f: float = factor, d: int = decimals - 1) -> str:
-            return _large(comparison.correction(robot, name) * f, d, "+")
-
-        def cell(e: Estimate, name: str = p.name, f: float = factor, d: int = decimals - 1) -> str:
-            if e.robot is None or name not in e.sigma:
-                return "-" if e.robot is None else "fixed"
-            sigma = e.sigma[name]
-            shown = _large(sigma * f, d) if np.isfinite(sigma) else "unknown"
-            return f"{correction(e.robot, name, f, d)} ±{shown}"
-
-        truth = [] if job.truth is None else [correction(job.truth)]
-        rows.append((p.name, unit, *truth, *map(cell, comparison.estimates)))
-    truth = [] if job.truth is None else ["truth"]
-    headings = ("", "", *truth, *(ESTIMATORS[e.name] for e in comparison.estimates))
-    return table_of(headings, rows, left="ll", wrap=True)
+        cells = [] if truth is None else [_large(comparison.correction(truth, p.name) * factor, decimals - 1, "+")]
+        for e in comparison.estimates:
+            sigma = e.sigma.get(p.name)
+            if e.robot is None or sigma is None:
+                cells.append("-" if e.robot is None else "fixed")
+                continue
+            shown = _large(sigma * factor, decimals - 1) if np.isfinite(sigma) else "unknown"
+            correction = _large(comparison.correction(e.robot, p.name) * factor, decimals - 1, "+")
+            cells.append(f"{correction} ±{shown}")
+        yield p.name, unit, *cells
 
 
 def _large(value: float, decimals: int, sign: str = "") -> str:
@@ -208,7 +206,8 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
         if robot is not None and p.estimated
     ]
     return {
-        **{key: getattr(e, key) for key in ("name", "description", "converged", "message", "iterations", "seconds")},
+        **{key: getattr(e, key) for key in ("name", "converged", "message", "iterations", "seconds")},
+        "description": DESCRIPTIONS[e.name],
         "ran": robot is not None,
         "n_estimated": len(e.sigma),
         "residual_rms": _rms(e, "after"),
@@ -299,12 +298,10 @@ def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -
 def _largest_change(before: Run, run: Run) -> dict[str, Any] | None:
     """The parameter that changed most from one run to the next, in the sigma that it had before."""
     found: list[dict[str, Any]] = []
-    for name, (estimate, _, unit) in run.parameters.items():
-        if name in before.parameters:
-            then, sigma, _ = before.parameters[name]
-            change = estimate - then
-            in_sigma = abs(change) / sigma if sigma else None
-            found.append({"name": name, "unit": unit, "change": change, "in_sigma": in_sigma})
+    for name in (name for name in run.parameters if name in before.parameters):
+        then, sigma, unit = before.parameters[name]
+        change = run.parameters[name][0] - then
+        found.append({"name": name, "unit": unit, "change": change, "in_sigma": abs(change) / sigma if sigma else None})
     return max(found, key=lambda one: one["in_sigma"] or -1.0, default=None)
 
 

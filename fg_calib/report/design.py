@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -143,26 +143,17 @@ def _notes(design: Design) -> Iterator[str]:
     if best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
         yield f"pairing: {best} in the job is more accurate with the same measurements"
     if lost := len(design.observability.lost):
-        yield f"{lost} direction{'s are' if lost > 1 else ' is'} not identifiable: fg-calib observe says which and why"
+        yield f"not identifiable: {lost} directions; fg-calib observe says which and why"
     if design.expected.position is None:
         yield "the error over the task depends on what the measurements do not determine"
     if design.target is not None and not design.reached:
-        yield _why_missed(design)
+        yield "more poses (--n, --candidates), lower noise, other measurements or a wider range of poses would reach it"
     if design.asked is not None and design.n < design.asked:
         yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
     after = math.inf if design.after_fit is None else design.after_fit.position or math.inf
     if design.after_fit is not None and after < 0.5 * (design.expected.position or 0.0):
         best_fit = f"after the best rigid fit {_pose(design.after_fit)}"
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
-
-
-def _why_missed(design: Design) -> str:
-    """What would reach a target that was missed: the last half of the poses may have gained less than a tenth."""
-    half = min(design.curve, key=lambda p: abs(p.n - design.n / 2))
-    if half.designed < 1.1 * design.curve[-1].designed:
-        return "more poses would not do: lower noise, other measurements or a wider range of poses would"
-    more = design.n >= design.n_candidates
-    return "all candidates are taken: --candidates draws more" if more else "more poses may do: specify them with --n"
 
 
 def _lengths(design: Design) -> dict[str, tuple[float, float]]:
@@ -230,10 +221,8 @@ def _shown(errors: Sequence[object]) -> Floats:
 def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     """Write where to measure, the job to be filled in, and what to expect.
 
-    Files of an earlier plan that this one has not are removed.
-
     Args:
-        folder: Where to.
+        folder: Where to; files of an earlier design there are replaced, or removed.
         design: The design.
         units: Of the tables and the job.
 
@@ -244,59 +233,44 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
             have been filled in.
     """
-    names, write, own = _filling(folder, design, units)
-    fill_folder(folder, write, own)
-    return names
-
-
-def _filling(
-    folder: Path, design: Design, units: Units
-) -> tuple[tuple[str, ...], Callable[[Path], None], Mapping[str, bytes]]:
-    """The names of a plan's files, and what writes them.
-
-    Raises:
-        InputError: A table of this or an earlier plan has been filled in, or has the name of another file.
-    """
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     tables = design.tables if design.pool.scenario is not None else ()
-    files = {
+    filled = {
         name: to_fill_in(dict(columns) | _told(t.measurements.readings, robot, units, columns), touched=_is_touched(t))
         for t in tables
         for name, columns in table_columns(t, robot, units).items()
     }
     urdf = "robot.urdf" if robot.urdf is not None and tables else None
-    names = [CONFIGURATIONS, _DOCUMENT, "design.svg"]
-    if tables:
-        names += [*files, "robot.yaml", *([urdf] if urdf else []), "calibration.yaml"]
+    job = ("robot.yaml", "calibration.yaml") if tables else ()
+    names = (CONFIGURATIONS, _DOCUMENT, "design.svg", *filled, *job, *([urdf] if urdf else []))
+    earlier = _files_before(folder)
+    for name in (*filled, *earlier):
+        if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml") and name in filled:
+            raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the design", "another name")
+        if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
+            raise InputError(str(folder / name), "a table that has been filled in", "another folder")
 
     def write(into: Path) -> None:
         write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
         write_text(into / _DOCUMENT, json_text(design_document(design) | {"files": names}))
         write_charts(into, {"design": [draw_design(design)]})
-        if not tables:
-            return
-        for name, columns in files.items():
+        for name, columns in filled.items():
             write_csv(into / name, columns)
         if urdf is not None:
             write_urdf(into / urdf, robot)
-        write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
-        then = _CALIBRATE if design.pool.before is None else _UPDATE
-        write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, tables, units))
+        if tables:
+            write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
+            then = _CALIBRATE if design.pool.before is None else _UPDATE
+            write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, tables, units))
 
-    for name in files:
-        if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml"):
-            raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the plan", "another name")
-    before = _files_before(folder)
-    for name in (*files, *before):
-        if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
-            raise InputError(str(folder / name), "a table that has been filled in", "another folder")
     whose = {_DOCUMENT: _BEGINS}  # first: it says of the others whose they are
-    own = whose | dict.fromkeys([*before, *names], b"") | {"calibration.yaml": _JOB_BEGINS.encode()} | whose
-    return tuple(names), write, own
+    own = whose | dict.fromkeys([*earlier, *names], b"") | {"calibration.yaml": _JOB_BEGINS.encode()} | whose
+    fill_folder(folder, write, own)
+    return names
 
 
 def _files_before(folder: Path) -> list[str]:
-    """Names of the files of an earlier plan in a folder; none where there was none."""
+    """Names of the files of an earlier design in a folder; none where there was none."""
     path = folder / _DOCUMENT
     if not exists(path) or not read_bytes(path).startswith(_BEGINS):
         return []

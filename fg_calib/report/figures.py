@@ -17,24 +17,19 @@ from fg_calib.prediction.workspace import PredictedErrors, predict_errors
 from fg_calib.report.charts import (
     BOTTOM,
     LEFT,
-    NAMES,
     RIGHT,
     TOP,
     WIDTH,
     Chart,
     Plot,
-    Scale,
+    Whisker,
     bars,
     colour,
-    framed,
     legend,
     limits_of,
     matrix,
     short,
-    tag,
-    title,
     whiskers,
-    words,
 )
 from fg_calib.report.tables import SHOWN, in_words
 from fg_calib.robot.model import Robot
@@ -122,15 +117,15 @@ class Drawn:
 def figures_of(drawn: Drawn) -> dict[str, Sequence[Chart]]:
     """All figures of a calibration by name; those that its tables lack are left out."""
     correlations, space = correlation_matrix(drawn), drawn.workspace
-    known = space is not None and not drawn.result.evaluated_only and space.unknown < 1.0
+    if drawn.result.evaluated_only or (space is not None and space.unknown == 1.0):
+        space = None
     every: dict[str, Sequence[Chart]] = {
         "accuracy": [accuracy_bars(drawn)],
         "joints": error_over_joints(drawn),
-        "ranges": [] if space is None else [joint_ranges(space)],
         "parameters": parameter_whiskers(drawn.result),
         "correlations": [] if correlations is None else [correlations],
         "residuals": residual_charts(drawn),
-        "workspace": workspace_slices(space) if known and space is not None else [],
+        "workspace": error_slices(space.errors.position, space.expected[:, 0], space.measured) if space else [],
     }
     return {name: charts for name, charts in every.items() if charts}
 
@@ -173,45 +168,19 @@ def _colours(test: Booleans) -> str:
     return ", ".join(["blue fitted"] * (not test.all()) + ["orange held out"] * bool(test.any()))
 
 
-def joint_ranges(space: PredictedErrors) -> Chart:
-    """The readings of every joint within its limits, and the widest gap."""
-    row, elements = 24.0, []
-    for i, joint in enumerate(space.joints):
-        ends = [v for v in (*joint.limits, *joint.range) if np.isfinite(v)]
-        low, high = min(ends), max(ends)
-        scale, y = Scale(low, high if high > low else low + 1.0, NAMES, WIDTH - RIGHT), TOP + row * i
-        factor, unit, _ = SHOWN[joint.unit]
-        (start, end), gap = scale(np.array(joint.range)).tolist(), scale(np.array(joint.gap)).tolist()
-        nothing = f"{joint.name}: nothing between {joint.gap[0] * factor:.4g} and {joint.gap[1] * factor:.4g} {unit}"
-        elements += [
-            words(NAMES - 6.0, y + 10.0, short(joint.name), "tick end"),
-            tag("rect", x=NAMES, y=y, width=WIDTH - RIGHT - NAMES, height=12.0, class_="band"),
-            tag("rect", x=start, y=y + 3.0, width=max(end - start, 1.0), height=6.0, class_="after"),
-            tag("rect", title(nothing), x=gap[0], y=y, width=gap[1] - gap[0], height=12.0, class_="gap"),
-            words(NAMES, y + 21.0, f"{low * factor:.4g}", "tick"),
-            words(WIDTH - RIGHT, y + 21.0, f"{high * factor:.4g} {unit}", "tick end"),
-        ]
-    caption = "pale: between the limits; blue: from the lowest to the highest reading; amber: the widest gap"
-    return framed(caption, WIDTH, TOP + row * len(space.joints), *elements)
-
-
 def parameter_whiskers(result: Result) -> list[Chart]:
     """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
     charts = []
     for unit, what in (("m", "Lengths"), ("rad", "Angles")):
         factor, name, _ = SHOWN[unit]
         rows = [
-            (p.name, p.correction * factor, _times(p.sigma, factor), _times(p.prior_sigma, factor))
+            Whisker(p.name, *(np.nan if v is None else v * factor for v in (p.correction, p.sigma, p.prior_sigma)))
             for p in result.estimated
             if p.unit == unit
         ]
         if rows:
             charts.append(whiskers(rows, f"{what}: correction [{name}]", f"[{name}]"))
     return charts
-
-
-def _times(value: float | None, factor: float) -> float:
-    return np.nan if value is None else value * factor
 
 
 def correlation_matrix(drawn: Drawn) -> Chart | None:
@@ -287,11 +256,6 @@ def _histogram(values: Floats, caption: str) -> Chart:
     return plot.chart(caption)
 
 
-def workspace_slices(space: PredictedErrors) -> list[Chart]:
-    """Expected error of the tool in three slices through the middle of the measured configurations."""
-    return error_slices(space.errors.position, space.expected[:, 0], space.measured)
-
-
 def error_slices(position: Floats, error: Floats, measured: Floats) -> list[Chart]:
     """Expected error of the tool in three slices through the middle of the measured configurations.
 
@@ -335,7 +299,7 @@ def _draw_cells(plot: Plot, at: Floats, error: Floats, ends: Floats) -> None:
 
 
 def draw_observability(found: Identifiability) -> dict[str, Sequence[Chart]]:
-    """The singular values, the null-space directions and, of practical analyses, the correlations."""
+    """The singular values and the null-space directions."""
     o = found.observability
     s = np.maximum(o.singular_values / (o.singular_values.max(initial=0.0) or 1.0), 1e-18)
     number, kept = np.arange(1.0, len(s) + 1.0), np.arange(len(s)) < o.rank
@@ -350,10 +314,6 @@ def draw_observability(found: Identifiability) -> dict[str, Sequence[Chart]]:
         reasons = [lost.reason.partition(":")[0] for lost in found.lost]
         caption = "Null-space directions: change of each parameter [m], [rad], orange positive, blue negative"
         figures["groups"] = [matrix(reasons, names, changes, caption)]
-    if found.kind == "practical" and len(o.kept) > 1:
-        below = np.where(np.tri(len(o.kept), k=-1, dtype=np.bool_), o.correlation, np.nan)
-        caption = "Correlations of the kept parameters: orange positive, blue negative"
-        figures["correlations"] = [matrix(o.kept, o.kept, below, caption)]
     return figures
 
 

@@ -39,7 +39,6 @@ FIGURES = {
     "parameters": PARAMETERS,
     "residuals": "Studentised residuals",
     "joints": "Error over joint space",
-    "ranges": "Where the joints were measured",
     "correlations": "Correlations",
     "workspace": "Expected error over the workspace",
 }
@@ -52,7 +51,6 @@ EXPLANATIONS = {
     "residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1 in 370 is"
     " beyond 3.",
     "joints": "Each dot is a configuration. A trend shows an unmodelled effect of that joint.",
-    "ranges": "Configurations outside the measured ranges are extrapolated.",
     "correlations": "Strong colours: errors of the two parameters go together.",
     "workspace": "RMS error of the tool's position expected from the covariance. Unmodelled effects are not included.",
 }
@@ -84,7 +82,7 @@ def build_page(drawn: Drawn) -> str:
     for name, title in FIGURES.items():
         if name in charts and title not in known:
             content: list[RenderableType] = []
-            if name == "ranges" and space is not None:
+            if name == "joints" and space is not None:
                 content = indented(_gaps(space))
             elif name == "workspace" and space is not None:
                 content = [size_table(space), *indented(percentages(space))]

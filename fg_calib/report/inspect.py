@@ -46,7 +46,7 @@ from fg_calib.report.text import expected_tool_error
 
 FILES = {
     "observability.json": b'{\n "schema": "fg-calib/observability/',
-    **dict.fromkeys(("singular_values.svg", "groups.svg", "correlations.svg"), b"<svg"),
+    **dict.fromkeys(("singular_values.svg", "groups.svg"), b"<svg"),
 }
 """The files that `write_observability` may write, and how each begins."""
 

@@ -53,41 +53,33 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
         result: The result of the calibration.
         ids: Names of the configurations, where they were given.
     """
-    names, errors = _names(found, ids), found.errors
-    noise, total, worst = errors.joint_noise, found.with_joint_noise, found.worst
-    expected = {
-        "base": _sizes(errors.base),
-        "fitted": _sizes(errors.fitted),
-        "joint_noise": None if noise is None else _sizes(noise),
-        "total": None if total is None else _sizes(total),
-    }
+    names, errors, worst = _names(found, ids), found.errors, found.worst
+    sizes = {"base": errors.base, "fitted": errors.fitted, "joint_noise": errors.joint_noise}
     of_worst: dict[str, Any] | None = None
     if worst is not None:
         of_worst = _configuration(worst.errors, 0, "" if worst.row is None else names[worst.row], near=not worst.far)
         of_worst |= {"axes": worst.axes, "sigma": worst.sigma, "responsible": _shares(worst.responsible, result)}
     each = range(len(names)) if found.given else ()
-    document = {
-        "schema": "fg-calib/predict/1",
-        "version": __version__,
-        "robot": result.robot,
-        "trustworthy": not result.findings,
-        "findings": result.findings,
-        "reservations": result.reservations,
-        "at": "configurations" if found.given else "workspace",
-        "n": len(errors.readings),
-        "counts": "fitted" if found.fitted else "base",
-        "expected": expected,
-        "unknown": found.unknown,
-        "undetermined": found.undetermined,
-        "far": float(np.mean(found.far)),
-        "limit": found.limit,
-        "within": found.within,
-        "worst": of_worst,
-        "responsible": _shares(found.responsible, result),
-        "configurations": [_configuration(errors, k, names[k], near=not found.far[k]) for k in each],
-    }
-    plain_document: dict[str, Any] = plain(document)
-    return plain_document
+    document: dict[str, Any] = plain(
+        {
+            "schema": "fg-calib/predict/1",
+            "version": __version__,
+            "robot": result.robot,
+            "trustworthy": not result.findings,
+            "findings": result.findings,
+            "reservations": result.reservations,
+            "at": "configurations" if found.given else "workspace",
+            "n": len(errors.readings),
+            "counts": "fitted" if found.fitted else "base",
+            "expected": {key: _sizes(values) for key, values in (sizes | {"total": found.with_joint_noise}).items()},
+            "far": float(np.mean(found.far)),
+            **{key: getattr(found, key) for key in ("unknown", "undetermined", "limit", "within")},
+            "worst": of_worst,
+            "responsible": _shares(found.responsible, result),
+            "configurations": [_configuration(errors, k, names[k], near=not found.far[k]) for k in each],
+        }
+    )
+    return document
 
 
 def _names(found: PredictedErrors, ids: Sequence[str]) -> tuple[str, ...]:
@@ -95,7 +87,9 @@ def _names(found: PredictedErrors, ids: Sequence[str]) -> tuple[str, ...]:
     return tuple(ids) or tuple(map(str, range(len(found.errors.readings))))
 
 
-def _sizes(errors: Floats) -> dict[str, Any]:
+def _sizes(errors: Floats | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
     return {kind: summed_up(column) for column, (kind, _) in zip(errors.T, KINDS, strict=True)}
 
 
@@ -279,27 +273,20 @@ def correction_document(name: str, ids: Sequence[str], correction: Correction) -
         kinds = ("position", "orientation") if correction.turns or of == "expected" else ("position",)
         return dict(zip(kinds, getattr(correction, of)[i].tolist(), strict=False))
 
-    document = {
-        "schema": "fg-calib/correct/1",
-        "robot": name,
-        "n_targets": len(ids),
-        "n_reached": int(correction.reached.sum()),
-        "expected_fitted": correction.expected_fitted,
-        "targets": [
-            {
-                "id": target,
-                "reached": bool(correction.reached[i]),
-                "readings": correction.readings[i],
-                "nominal_readings": correction.nominal_readings[i],
-                "position": correction.position[i],
-                "quaternion_xyzw": quaternion[i],
-                **{of: errors(of, i) for of in ERRORS},
-            }
-            for i, target in enumerate(ids)
-        ],
-    }
-    plain_document: dict[str, Any] = plain(document)
-    return plain_document
+    targets = [
+        {
+            "id": target,
+            "reached": bool(correction.reached[i]),
+            **{key: getattr(correction, key)[i] for key in ("readings", "nominal_readings", "position")},
+            "quaternion_xyzw": quaternion[i],
+            **{of: errors(of, i) for of in ERRORS},
+        }
+        for i, target in enumerate(ids)
+    ]
+    counts = {"n_targets": len(ids), "n_reached": int(correction.reached.sum())}
+    head = {"schema": "fg-calib/correct/1", "robot": name, **counts, "expected_fitted": correction.expected_fitted}
+    document: dict[str, Any] = plain(head | {"targets": targets})
+    return document
 
 
 def build_correction_report(ids: Sequence[str], correction: Correction, robot: Robot) -> RenderableType:

@@ -259,29 +259,16 @@ def _cross_validation(result: Result) -> list[Section]:
         rows.append((kind, SHOWN[unit][1], f"{held.n}", *values))
     table = table_of(("", "", "held out", "before", "after", "specified noise"), rows, left="ll")
     title = f"Cross-validation ({found.n} folds of configurations, each predicted without it; RMS)"
-    return section(title, table, *indented(spread_in_words(result)))
-
-
-def spread_in_words(result: Result) -> list[str]:
-    """How parameters spread between folds, compared with their sigmas."""
-    found = result.folds
-    assert found is not None
-    lines = []
-    ratio, wide = found.beyond({p.name: p.sigma for p in result.estimated})
+    lines, (ratio, wide) = [], found.beyond({p.name: p.sigma for p in result.estimated})
     if ratio:
-        by, median = 100.0 / np.sqrt(2.0 * (found.n - 1)), np.median(list(ratio.values()))
-        lines.append(
-            f"spread of a parameter between folds over its sigma: median {median:.2f} (each is known to {by:.0f} %;"
-            " below 1 where priors determine it)"
-        )
-    if found.of_pairs:
-        lines.append("for pairs it is 1.4 to 1.7 times as large, because a pair leaves with either configuration")
+        median = f"{np.median(list(ratio.values())):.2f}" + " (pairs: expect 1.4 to 1.7)" * found.of_pairs
+        lines.append(f"spread of a parameter between folds over its sigma: median {median}, below 1 where priors act")
     if wide:
         named = shortened([f"{name} {ratio[name]:.1f}" for name in wide], 5)
-        lines.append(f"significantly larger than their sigmas: {named}")
+        lines.append(f"spread significantly larger than sigma: {named}; the model lacks an effect, or rows are wrong")
     if found.not_converged:
         lines.append(f"{found.not_converged} of {found.n} calibrations did not converge")
-    return lines
+    return section(title, table, *indented(lines))
 
 
 def expected_tool_error(expected: ExpectedError | None) -> list[Section]:

@@ -160,12 +160,12 @@ class KindFit:
 
 
 VERDICTS = {
-    "as stated": "as stated",
-    "too large": "noise stated too large",
-    "too small": "most rows too large: noise stated too small, or effects not modelled",
+    "as stated": "as specified",
+    "too large": "noise specified too large",
+    "too small": "most rows too large: noise specified too small, or effects not modelled",
     "outliers": "few rows far too large: outliers",
-    "others": "as stated once the outliers are left out",
-    "both": "noise stated too small or effects not modelled, and outliers",
+    "others": "as specified once the outliers are left out",
+    "both": "noise specified too small or effects not modelled, and outliers",
     "many": "many rows far too large: something changed between them, or effects not modelled",
     "unknown": "too few rows to tell",
 }

@@ -6,26 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import touches
 from instruments import measured_by
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib.assessment import assess
 from fg_calib.baseline import comparison as comparison_module
-from fg_calib.baseline.comparison import ESTIMATORS, best_rigid_fit, compare, real_errors
+from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
-from fg_calib.graph.build import build_problem, problem_of
-from fg_calib.graph.solver import solve
+from fg_calib.graph.build import problem_of
 from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job
 from fg_calib.measurements.table import Table
-from fg_calib.options import Options, Pairing
+from fg_calib.options import Options
 from fg_calib.report.compare import comparison_document, format_comparison
 from fg_calib.robot.kinematics import pose
 
@@ -99,27 +96,11 @@ def test_all_estimators_run_on_the_same_job(simulated_job):
 
 
 @pytest.mark.slow
-def test_the_graph_is_the_one_that_calibrate_shows(simulated_job):
-    job = simulated_job
-    found = compare(job)
-    solution = solve(build_problem(job.robot, job.measurements, model=job.options.model, pair_errors="independent"))
-    uncertainty = assess(solution)
-    graph = found.estimates[0]
-    assert np.array_equal(graph.robot.nominal, uncertainty.robot.nominal)
-    assert graph.residual_rms == uncertainty.fit.residuals.rms()
-    assert graph.sigma == {p.name: p.sigma for p in uncertainty.estimates.parameters if p.name in uncertainty.names}
-    for name, correction in ((p.name, p.correction) for p in uncertainty.estimates.parameters):
-        assert found.correction(graph.robot, name) == correction
-
-
-@pytest.mark.slow
 def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     found = compare(simulated_job)
     job, weighted = simulated_job, found.estimates[3]
     readings = job.measurements.readings[job.measurements.test]
-    fit = fit_least_squares(
-        job.robot, job.measurements, model=job.options.model, names=list(weighted.sigma), weighted=True
-    )
+    fit = fit_least_squares(job.robot, problem_of(job).data, names=list(weighted.sigma), weighted=True)
     total = 0.0
     for q in readings:
         G = np.empty((3, len(fit.names)))
@@ -130,22 +111,6 @@ def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
             G[:, k] = (up - down) / 2e-6
         total += np.trace(G @ fit.covariance @ G.T)
     assert weighted.predicted_rms == pytest.approx(np.sqrt(total / len(readings)), rel=1e-6)
-
-
-@pytest.mark.long
-def test_predicted_errors_come_true(tmp_path):
-    """RMS over 30 simulated calibrations with known noise, poses in the base frame: within a fifth."""
-    rng = np.random.default_rng(8)
-    robot = small_arm(tolerance={"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3})
-    ratios = {name: [] for name in ESTIMATORS}
-    for _ in range(30):
-        true = true_robot(robot, rng)
-        found = compare(job_of(robot, true, measure(true, 30, rng, n_test=20), "pose", tmp_path))
-        for e in found.estimates:
-            ratios[e.name].append(e.errors.base.rms / e.predicted_rms)
-    for name in ("graph", "graph-keep", "weighted-gauss-newton", "scipy"):
-        # about 16 parameters determine each calibration's error: 30 of them know its mean square to some 15 %
-        assert np.sqrt(np.mean(np.square(ratios[name]))) == pytest.approx(1.0, abs=0.2), name
 
 
 @pytest.mark.sampled(1)
@@ -183,8 +148,8 @@ def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
     assert all(e.errors is None for e in found.estimates)
     text = format_comparison(found)
     assert "judged at 85 train configurations" in text
-    assert "  no test rows: judged at the train configurations, which flatters every estimator" in text
-    assert "  the truth is not known: no real errors (key truth of a job)" in text
+    assert "  no test rows: judged at the train configurations, which is optimistic for every estimator" in text
+    assert "  the truth is unknown: no real errors (key truth of a job)" in text
     assert "Real error" not in text
     assert "truth " not in text.partition("Corrections")[2].partition("Estimators")[0]
 
@@ -229,19 +194,6 @@ def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
     assert re.search(r"parameters +- +2 +- +- +- +-\n", format_comparison(found))
 
 
-def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
-    job = replace(simulated_job, options=Options("distance", Pairing("chain"), prefer=("d3",)))
-    problem = problem_of(job)
-    assert (problem.options.model, problem.options.pairing.strategy, problem.options.gauge) == (
-        "distance",
-        "chain",
-        "prior",
-    )
-    changed = problem_of(job, gauge="keep")
-    assert changed.options.gauge == "keep"
-    assert "d3" in [p.name for p in changed.estimated]
-
-
 # --- every instrument -------------------------------------------------------------------------------------------------
 
 
@@ -249,12 +201,10 @@ def test_problem_of_takes_the_jobs_settings_but_for_changes(simulated_job):
 @pytest.mark.parametrize(
     "instrument",
     [
-        *("targets", "targets known", "targets nearly", "targets stations", "anchors offset", "anchors nearly"),
+        *("targets", "targets nearly", "targets stations", "anchors offset"),
         *(
             "planes",
-            "board",
-            pytest.param("pixels", marks=pytest.mark.slow),
-            "room",
+            "pixels",
         ),
     ],
 )
@@ -265,7 +215,7 @@ def test_plain_least_squares_finds_the_graphs_optimum_of_every_instrument(instru
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
+@pytest.mark.parametrize("instrument", ["anchors", "board"])
 def test_of_one_row_a_configuration_joint_noise_weighs_as_in_the_graph(instrument, tmp_path):
     robot, true, table = measured_by(instrument, np.random.default_rng(0), sigma_joint=5e-4)
     _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
@@ -287,31 +237,6 @@ def test_several_tables_have_one_optimum_and_are_told_of_together(tmp_path):
     assert (document["model"], document["frame"], document["pairing"]) == ("anchor + position", "unknown", None)
 
 
-@pytest.mark.slow
-def test_touched_points_are_unknowns_of_plain_least_squares_too(tmp_path):
-    rng = np.random.default_rng(3)
-    robot = small_arm(tolerance=touches.TOLERANCE)
-    true = true_robot(robot, rng)
-    measurements = touches.touch(true, touches.corners(true, 3, rng), 14, rng, distances=((0, 1, 1e-4), (1, 2, 1e-4)))
-    found = compare(Job(tmp_path / "job.yaml", robot, measurements, Options("distance"), true))
-    _same_optimum(found)
-    assert found.units == {"point": "m", "distance": "m"}
-
-
-@pytest.mark.slow
-def test_pixels_stand_in_report_and_document(tmp_path):
-    robot, true, table = measured_by("room", np.random.default_rng(0))
-    found = compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true))
-    after = found.estimates[3].residual_rms["train"]["pixel"]["after"]
-    line = next(line for line in format_comparison(found).splitlines() if line.startswith("  pixel "))
-    assert line.split()[1:] == [
-        "px",
-        *(f"{found.estimates[0].residual_rms['train']['pixel']['before']:.2f}",),
-        *5 * [f"{after:.2f}"],
-    ]
-    assert comparison_document(found)["estimates"][3]["residual_rms"]["train"]["pixel"] == after
-
-
 def _same_optimum(found):
     """Of the graph that is weighted by the same noise and has no priors, and of what is claimed there."""
     _, keep, plain, *weighted = found.estimates
@@ -328,20 +253,6 @@ def _same_optimum(found):
 
 
 # --- real errors ------------------------------------------------------------------------------------------------------
-
-
-def test_the_best_rigid_fit_is_scipys():
-    rng = np.random.default_rng(0)
-    for n in (3, 4, 50):
-        points = rng.normal(size=(n, 3))
-        turn = Rotation.random(random_state=n)
-        onto = turn.apply(points) + [1.0, 2.0, 3.0] + 0.3 * rng.normal(size=(n, 3))
-        R, t = best_rigid_fit(points, onto)
-        expected, rssd = Rotation.align_vectors(onto - onto.mean(axis=0), points - points.mean(axis=0))
-        assert R == pytest.approx(expected.as_matrix(), abs=rounding(1, 10))
-        assert np.linalg.norm(points @ R.T + t - onto) == pytest.approx(rssd, rel=rounding(1, 10))
-    mirrored = points * [1.0, 1.0, -1.0]
-    assert np.linalg.det(best_rigid_fit(points, mirrored)[0]) == pytest.approx(1.0)
 
 
 def test_real_errors_are_those_of_the_tool_poses():
@@ -374,16 +285,6 @@ def test_an_arm_that_was_only_moved_has_no_error_after_the_fit():
     assert found.fitted.max == pytest.approx(0.0, abs=rounding(10.0))
     assert found.fitted.orientation_rms == pytest.approx(0.0, abs=rounding(10.0))
     assert real_errors(moved, robot, q[:2]).fitted is None
-
-
-@pytest.mark.slow
-def test_a_correction_goes_the_shorter_way(simulated_job):
-    found = compare(simulated_job)
-    robot = simulated_job.robot
-    for name, value, expected in (("tool.yaw", 6.0, 6.0 - 2 * np.pi), ("tool.x", 6.0, 6.0), ("theta2", 6.0, 6.0)):
-        values = robot.nominal
-        values[robot.index(name)] += value
-        assert found.correction(robot.with_values(values), name) == pytest.approx(expected, abs=rounding(10.0))
 
 
 # --- report, document, command ----------------------------------------------------------------------------------------
@@ -422,22 +323,10 @@ def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
     truth = f"{found.correction(simulated_job.truth, 'a2') * 1e3:+.3f}"
     assert a2.split() == ["a2", "mm", truth, *" ".join(shown).split()]
     a1 = next(line for line in lines if line.startswith("a1 "))
-    assert a1.split()[-4:] == ["held"] * 4
+    assert a1.split()[-4:] == ["fixed"] * 4
     assert all(len(line) <= 100 for line in lines)
     assert "…" not in text
     assert " -0.000 " not in text
-
-
-@pytest.mark.slow
-def test_figures_that_went_astray_stay_within_the_page(simulated_job):
-    found = compare(simulated_job)
-    astray = found.estimates[2].robot.with_values(found.estimates[2].robot.nominal * 1e7 + 1e6)
-    far = replace(found.estimates[2], robot=astray, predicted_rms=1e9)
-    changed = replace(found, estimates=(*found.estimates[:2], far, *found.estimates[3:]))
-    text = format_comparison(changed)
-    assert all(len(line) <= 100 for line in text.splitlines())
-    assert "1.0e+12" in text
-    assert "e+09" in text.split("\na2 ")[1].split("\nalpha2 ")[0]
 
 
 @pytest.mark.slow
@@ -507,18 +396,3 @@ def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simula
         rms = np.sqrt(np.mean(np.sum(step**2, axis=1)))
         assert e["errors"]["base_frame"]["rms"] == pytest.approx(rms, rel=rounding(1, 10), abs=0)
         assert e["errors"]["best_rigid_fit"]["rms"] < rms
-
-
-@pytest.mark.slow
-def test_a_comparison_not_to_be_trusted_ends_with_three(fg_calib, example):
-    job = example / "calibration.yaml"
-    job.write_text(re.sub(r"noise:.*", "noise: {position: 0.00001, orientation: 0.0001}", job.read_text()))
-    ended = fg_calib("compare", job)
-    assert ended.code == 3
-    assert ended.err.startswith("not to be trusted: reduced chi-square ")
-
-
-def test_comparing_bad_input_is_one_line(fg_calib, tmp_path):
-    ended = fg_calib("compare", tmp_path / "nowhere.yaml")
-    assert (ended.code, ended.out) == (1, "")
-    assert ended.err == f"error: {tmp_path / 'nowhere.yaml'}: no such file\n"

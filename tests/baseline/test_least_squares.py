@@ -6,29 +6,35 @@ import numpy as np
 import pytest
 from oracle import central_differences, tool_pose
 from scipy.spatial.transform import Rotation
-from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from simulated import measure, paper_robot, planar_robot, small_arm, true_robot
 from sparing import diagonal
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
 from fg_calib.baseline import least_squares
-from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs
+from fg_calib.measurements.table import Table
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
 
 PAPERS = ["distance", "distance-rotation", "pose"]
-OTHERS = ["rotation", "position", "orientation"]
 TO_THE_END = SolverOptions(decrement=1e-9)
 NOISE = 1e-4
 """Of every row unless a test says otherwise, [m] and [rad]."""
 
 CREPT = 1e-7
 """Of a row's noise: what damping may leave of the way where nothing holds some directions; 2e-9 was measured."""
+
+
+def fit_least_squares(robot, measurements, *, model, frame="known", **options):
+    """Plain least squares of one table."""
+    data = build_dataset(robot, [Table(measurements, model, Pairing("star"), frame)])
+    return least_squares.fit_least_squares(robot, data, **options)
 
 
 def apart(fit, values):
@@ -87,20 +93,6 @@ def test_with_equal_weights_and_no_priors_all_estimators_agree(model):
             assert fit.converged, fit.message
             assert (fit.n_rows, fit.rank) == (problem.n_residuals, len(names))
             assert apart(fit, graph) < NEGLIGIBLE, (method, weighted)
-
-
-@pytest.mark.parametrize("model", OTHERS)
-def test_the_other_models_agree_too(model):
-    """MINPACK's steps may end a thousandth of a sigma short of the optimum, Gauss-Newton's and the graph's do not."""
-    robot = paper_robot()
-    measurements = simulated(robot, model)
-    problem = build_problem(robot, measurements, model=model, gauge="keep")
-    graph = solve(problem, TO_THE_END).parameters[:-6]
-    names = [p.name for p in problem.estimated]
-    plain = fit_least_squares(robot, measurements, model=model, names=names)
-    assert apart(plain, graph) < NEGLIGIBLE
-    scipys = fit_least_squares(robot, measurements, model=model, names=names, method="scipy")
-    assert apart(scipys, graph) < 1e-4  # 5e-6 was measured
 
 
 @pytest.mark.slow
@@ -211,19 +203,6 @@ def test_the_frame_is_one_frame_whatever_its_pitch(upright):
     assert Rotation.from_euler("ZYX", fit.frame[3:]).as_matrix() == pytest.approx(turn.as_matrix(), abs=rounding(10.0))
 
 
-def test_an_unknown_tool_is_the_graphs():
-    robot = small_arm(estimate=TOOL)
-    rng = np.random.default_rng(4)
-    measurements = measure(true_robot(robot, rng), 60, rng, sigma=(1e-4, 1e-4))
-    problem = build_problem(robot, measurements, model="pose", gauge="keep")
-    names = [p.name for p in problem.estimated]
-    assert any(name.startswith("tool.") for name in names)
-    solution = solve(problem, TO_THE_END)
-    for start in (problem.start, None):
-        fit = fit_least_squares(robot, measurements, model="pose", names=names, start=start)
-        assert apart(fit, solution.parameters[:-6]) < NEGLIGIBLE
-
-
 # --- Eq. (54) and what it claims --------------------------------------------------------------------------------------
 
 
@@ -268,19 +247,6 @@ def test_one_step_is_the_pseudoinverse_times_what_is_left(model):
     if model != "pose":
         for name in ("a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"):
             assert step[fit.names.index(name)] == pytest.approx(0.0, abs=rounding(10.0)), name
-
-
-def test_what_is_not_estimated_stays_at_its_value():
-    robot = paper_robot()
-    measurements = simulated(robot, "distance-rotation")
-    names = [p.name for p in build_problem(robot, measurements, model="distance-rotation", gauge="keep").estimated]
-    fit = fit_least_squares(robot, measurements, model="distance-rotation", names=names)
-    held = [i for i, p in enumerate(robot.parameters) if p.name not in names]
-    assert len(held) == 12 + 12  # of the arm, and base and tool
-    assert np.array_equal(fit.robot.nominal[held], robot.nominal[held])
-    started = robot.nominal + 1e-4
-    fit = fit_least_squares(robot, measurements, model="distance-rotation", names=names, start=started)
-    assert np.array_equal(fit.robot.nominal[held], started[held])
 
 
 def planar_measurements(offsets):
@@ -376,15 +342,6 @@ def test_it_says_when_it_has_not_arrived():
     assert fit.message == "not converged: The maximum number of function evaluations is exceeded"
 
 
-def test_it_says_when_the_weights_do_not_settle(monkeypatch):
-    monkeypatch.setattr(least_squares, "_ROUNDS", 1)
-    measurements = simulated(paper_robot(), "pose", sigma_joint=3e-4)
-    fit = fit_least_squares(paper_robot(), measurements, model="pose", weighted=True)
-    assert not fit.converged
-    assert fit.message.startswith("not converged: new weights still move it by ")
-    assert fit_least_squares(paper_robot(), measurements, model="pose").converged
-
-
 def test_it_says_when_it_went_astray():
     robot = small_arm()
     measurements = measure(robot, 20, np.random.default_rng(7))
@@ -406,10 +363,7 @@ def test_scipy_takes_fewer_rows_than_unknowns():
 
 ROBOT = planar_robot()
 MISTAKES = [
-    ({"model": "poses"}, "model: found 'poses', expected one of pose, position, orientation, distance, rotation, "
-     "distance-rotation, anchor, plane, board, pixels; did you mean pose?"),
     ({"method": "newton"}, "method: found 'newton', expected one of gauss-newton, scipy"),
-    ({"frame": "lost"}, "frame: found 'lost', expected one of known, unknown"),
     ({"max_iterations": 0}, "max_iterations: found 0, expected a whole number not below 1"),
     ({"tolerance": float("nan")}, "tolerance: found nan, expected a number not below 0"),
     ({"start": np.zeros(3)}, "start: shape (3,), expected 20 values of the robot, or 26 with the measurement frame's"),
@@ -418,44 +372,19 @@ MISTAKES = [
     ({"names": ["a3"]}, "names: unknown parameter 'a3', expected one of base.x, base.y, base.z, base.yaw, base.pitch, "
      "base.roll, theta1, d1, a1, alpha1, theta2, d2, ..."),
     ({"names": []}, "names: nothing to estimate, expected at least one parameter"),
-    ({"model": "pose"},
-     "measurements: no columns qx, qy, qz, qw or roll, pitch, yaw, expected measured orientations for model pose"),
-    ({"model": "distance-rotation"},
-     "measurements: no columns qx, qy, qz, qw or roll, pitch, yaw, expected orientations for model distance-rotation"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_a_mistake_is_named_in_one_line(arguments, message):
     with pytest.raises(InputError) as caught:
-        fit_least_squares(ROBOT, planar_measurements(np.zeros(4)), **{"model": "position"} | arguments)
+        fit_least_squares(ROBOT, planar_measurements(np.zeros(4)), model="position", **arguments)
     assert str(caught.value) == message
 
 
-NO_POSITIONS = "no columns x, y, z, expected measured positions for model "
-
-
-def test_what_measurements_lack_is_named():
+def test_no_train_row_and_no_noise_are_named():
     whole = planar_measurements(np.zeros(4))
-    cases = [
-        (replace(whole, position=None), "position", False, NO_POSITIONS + "position"),
-        (replace(whole, position=None), "distance", False, NO_POSITIONS + "distance"),
-        (replace(whole, sigma_position=None), "position", True,
-         "no sigma for position, expected noise.position or a column sigma_position"),
-        (replace(whole, test=np.ones(4, bool)), "position", False,
-         "no row left to fit, expected train rows for model position"),
-        (replace(whole, test=np.ones(4, bool)), "distance", False,
-         "no row left to fit, expected train rows for model distance"),
-    ]  # fmt: skip
-    for measurements, model, weighted, message in cases:
-        with pytest.raises(InputError) as caught:
-            fit_least_squares(ROBOT, measurements, model=model, weighted=weighted)
-        assert str(caught.value) == f"measurements: {message}"
-    with pytest.raises(InputError) as caught:
-        fit_least_squares(ROBOT, replace(whole, sigma_position=None), model="distance", weighted=True)
-    assert str(caught.value) == (
-        "pairs from measurements: no sigma for distance, expected noise.position or a column sigma_position"
-    )
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError, match="no row left to fit, expected train rows for model position"):
+        fit_least_squares(ROBOT, replace(whole, test=np.ones(4, bool)), model="position")
+    with pytest.raises(InputError, match="noise: a row without any, expected noise in every row, to weight by"):
         fit_least_squares(ROBOT, replace(whole, sigma_position=np.zeros((4, 3))), model="position", weighted=True)
-    assert str(caught.value) == "noise: a row without any, expected noise in every row, to weight by"

@@ -139,7 +139,7 @@ def test_the_last_step_is_taken_although_the_cost_no_longer_shows_it(shift):
         problem = build_problem(robot, m, model="position", frame="unknown", gauge="keep")
         solution = solve(problem)
         names = [p.name for p in problem.estimated]
-        plain = fit_least_squares(robot, m, model="position", frame="unknown", names=names, start=problem.start)
+        plain = fit_least_squares(robot, problem.data, names=names, start=problem.start)
         sigma = np.sqrt(np.diag(spread_of(solution).named()))
         apart = (plain.robot.nominal - solution.parameters[:-6])[[robot.index(name) for name in names]] / sigma
         assert np.abs(apart).max() < 3e-7  # 1e-5 when the cost had the last word

@@ -51,7 +51,7 @@ def snippets(page):
     return re.findall(r"^```(\w*)\n(.*?)^```$", PAGES[page].read_text(), flags=re.S | re.M)
 
 
-# --- what a page shows, beside what is printed ------------------------------------------------------------------------
+# --- what a page shows, compared with what is printed ---------------------------------------------------
 
 FIGURE = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.])")
 
@@ -201,7 +201,7 @@ def are_run(text, folder, fg_calib):
 
 
 def is_printed(text, folder, fg_calib):
-    """A command beside the bundled example, and what it prints."""
+    """A command next to the bundled example, and what it prints."""
     assert fg_calib("example", "space-robot", "--out", "demo").code == 0
     Path("robot.yaml").write_bytes(Path("demo/robot_nominal.yaml").read_bytes())
     command, shown = text.split("\n", 1)
@@ -379,7 +379,7 @@ def missed(robot, readings, targets):
 
 
 def errors_at_targets():
-    """Of the tutorial's true arm at 20 targets, in mm: as drawn, with joint zeros alone, and corrected.
+    """Of the tutorial's true arm at 20 targets, in mm: nominal, with joint zeros alone, and corrected.
 
     Its base was never seen, so the best rigid fit of the targets is taken away.
     """

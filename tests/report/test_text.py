@@ -71,7 +71,7 @@ solver              N iterations, T s, cost 34.5646 -> 5.40874
 
 Goodness of fit (1 sigma of a row)
               specified  observed  ratio  p-value
-position  mm     1.0000    0.8452  0.845     0.78  as stated
+position  mm     1.0000    0.8452  0.845     0.78  as specified
   no row (|studentised residual| above 3.53) and no configuration is suspicious
 
 Prediction of the test rows
