@@ -259,7 +259,7 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
     """The content of `fg-calib inspect --json`: SI, null for what is unknown or infinite.
 
     { "schema": "fg-calib/inspection/1", "version", "robot", "ready", "findings", "cautions", "evaluated",
-      "tables": [the fields of `TableSurvey`], "joints": [the fields of `JointSurvey`],
+      "tables": [the fields of `TableSurvey`], "joints": [the fields of `JointRange`, with "share" and "still"],
       "residuals": [{"table", "kind", "unit", "size", "expected", "excess", "n"}],
       "explanations": [{"table", "mistakes"}],
       "disagreements": {"found": [the fields of `Disagreement`], "n", "of"},
@@ -269,13 +269,19 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "inputs": {path: sha256} }
     """
     counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
-    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "joints", "expected_error", *counts)
+    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "expected_error", *counts)
+    keys_of_residuals = ("kind", "unit", "size", "expected", "excess", "n")
     document: dict[str, Any] = plain(
         {
             "schema": "fg-calib/inspection/1",
             "version": __version__,
             **{key: getattr(found, key) for key in keys},
-            "residuals": [{"table": check.table} | plain(one) for check in found.setups for one in check.residuals],
+            "joints": [plain(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
+            "residuals": [
+                {"table": check.table, **{key: getattr(one, key) for key in keys_of_residuals}}
+                for check in found.setups
+                for one in check.residuals
+            ],
             "explanations": [
                 {"table": check.table, "mistakes": one.mistakes} for check in found.setups for one in check.explanations
             ],
