@@ -14,7 +14,7 @@ import logging
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from fg_calib._lazy import attach
+import lazy_loader  # type: ignore[import-untyped]
 
 if TYPE_CHECKING:
     from fg_calib.assessment import Assessment, assess
@@ -43,32 +43,32 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_import, __dir__ = attach(
+_import, __dir__, _ = lazy_loader.attach(
     __name__,
-    {
-        "fg_calib.assessment": "Assessment assess",
-        "fg_calib.baseline.comparison": "compare",
-        "fg_calib.batch": "calibrate_jobs",
-        "fg_calib.calibration": "Calibration calibrate calibrate_job",
-        "fg_calib.designs.design": "Design design",
-        "fg_calib.errors": "CalibrationError InputError ProblemError SolverError",
-        "fg_calib.exports.export": "export",
-        "fg_calib.graph.build": "build_problem",
-        "fg_calib.graph.factors": "DistanceFactor RotationAngleFactor",
-        "fg_calib.graph.problem": "Problem",
-        "fg_calib.graph.solver": "Solution SolverOptions solve",
-        "fg_calib.io.job": "read_job",
-        "fg_calib.io.result": "Result",
-        "fg_calib.io.robot_file": "read_robot",
-        "fg_calib.job": "Job",
-        "fg_calib.measurements.dataset": "Measurements Noise",
-        "fg_calib.measurements.table": "KnownPoint CustomMeasurements Table",
-        "fg_calib.observability.identifiability": "observe_configurations observe_structure",
-        "fg_calib.options": "Limits Options Pairing",
-        "fg_calib.predictions": "correct predict",
-        "fg_calib.robot.model": "Robot",
-        "fg_calib.simulation.scenario": "Scenario",
-        "fg_calib.simulation.simulator": "simulate",
+    submod_attrs={
+        "assessment": ["Assessment", "assess"],
+        "baseline.comparison": ["compare"],
+        "batch": ["calibrate_jobs"],
+        "calibration": ["Calibration", "calibrate", "calibrate_job"],
+        "designs.design": ["Design", "design"],
+        "errors": ["CalibrationError", "InputError", "ProblemError", "SolverError"],
+        "exports.export": ["export"],
+        "graph.build": ["build_problem"],
+        "graph.factors": ["DistanceFactor", "RotationAngleFactor"],
+        "graph.problem": ["Problem"],
+        "graph.solver": ["Solution", "SolverOptions", "solve"],
+        "io.job": ["read_job"],
+        "io.result": ["Result"],
+        "io.robot_file": ["read_robot"],
+        "job": ["Job"],
+        "measurements.dataset": ["Measurements", "Noise"],
+        "measurements.table": ["KnownPoint", "CustomMeasurements", "Table"],
+        "observability.identifiability": ["observe_configurations", "observe_structure"],
+        "options": ["Limits", "Options", "Pairing"],
+        "predictions": ["correct", "predict"],
+        "robot.model": ["Robot"],
+        "simulation.scenario": ["Scenario"],
+        "simulation.simulator": ["simulate"],
     },
 )
 

@@ -10,30 +10,35 @@ from numpy.typing import ArrayLike
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Floats, FrozenArrays, as_figures
+from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.diagnostics.setup_check import check_setup
-from fg_calib.diagnostics.verdict import LIKE_NOISE, MOST_ESTIMATED, Verdict, judge
 from fg_calib.errors import InputError, SolverError, escaped
-from fg_calib.graph.build import problem_of
-from fg_calib.graph.problem import Problem, check_graph
-from fg_calib.graph.solver import Solution, solve
+from fg_calib.graph import Problem, Solution, check_graph, problem_of, solve
 from fg_calib.job import Job
-from fg_calib.monitoring.prior_information import at_nominal
-from fg_calib.observability.identifiability import Identifiability, identifiability_of
-from fg_calib.observability.indices import Observability
+from fg_calib.monitoring import at_nominal
+from fg_calib.observability import Identifiability, Observability, identifiability_of
 from fg_calib.parallel import one_blas_thread, single_threaded
-from fg_calib.prediction.tool_pose import ExpectedError, expected_error
-from fg_calib.robot.kinematics import without_rigid_motion
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.acceptance import Acceptance, accept
-from fg_calib.statistics.covariance import Spread, spread_of, with_left_out
-from fg_calib.statistics.cross_validation import CrossValidation
-from fg_calib.statistics.estimates import Estimates, estimates_at
-from fg_calib.statistics.goodness_of_fit import Fit, chi_square, judge_fit
-from fg_calib.statistics.outliers import judge_without_outliers
-from fg_calib.statistics.priors import estimate_tolerances, judge_priors
-from fg_calib.statistics.residual_table import HeldOut, residual_table
-from fg_calib.statistics.variance_components import estimate_noise
+from fg_calib.prediction import ExpectedError, expected_error
+from fg_calib.robot import Robot, without_rigid_motion
+from fg_calib.statistics import (
+    Acceptance,
+    CrossValidation,
+    Estimates,
+    Fit,
+    HeldOut,
+    Spread,
+    accept,
+    chi_square,
+    estimate_noise,
+    estimate_tolerances,
+    estimates_at,
+    judge_fit,
+    judge_priors,
+    judge_without_outliers,
+    spread_of,
+    with_left_out,
+)
+from fg_calib.statistics.residual_table import residual_table
 
 
 @dataclass(frozen=True)

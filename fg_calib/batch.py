@@ -20,9 +20,7 @@ from typing import Any, Literal
 from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.errors import InputError, escaped, shown
-from fg_calib.io.atomic import fill_folder, require_writable, write_text
-from fg_calib.io.job import read_job
-from fg_calib.io.saved import require_no_input
+from fg_calib.io import fill_folder, read_job, require_no_input, require_writable, write_text
 from fg_calib.job import Job
 from fg_calib.parallel import Failure, map_jobs
 

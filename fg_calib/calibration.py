@@ -26,42 +26,46 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import Floats, as_floats, shape_of
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.errors import InputError, SolverError, shown
-from fg_calib.graph.knowledge import SIZE, Knowledge
-from fg_calib.graph.problem import tables_of
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.variables import build_variables, frame_of
-from fg_calib.io.atomic import fill_folder, is_folder, noting_reads, write_text
-from fg_calib.io.job import UNSTATED, read_job, read_table_like
-from fg_calib.io.result import Knowledge as SavedKnowledge
-from fg_calib.io.result import Result, Run, read_result
-from fg_calib.io.saved import (
+from fg_calib.graph import SIZE, Knowledge, Solution, build_variables, frame_of, tables_of
+from fg_calib.io import (
     RESULT_FILES,
+    UNSTATED,
     ResidualFile,
+    Result,
+    Run,
     configuration_frame,
+    fill_folder,
+    is_folder,
     joint_frame,
+    noting_reads,
     read_calibrated_robot,
+    read_job,
+    read_result,
     read_table,
+    read_table_like,
     residual_frame,
     write_calibration,
+    write_text,
 )
+from fg_calib.io import Knowledge as SavedKnowledge
 from fg_calib.job import Job
-from fg_calib.measurements.checks import check_readings
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import Table
-from fg_calib.monitoring.check import Check, check_rows
-from fg_calib.monitoring.fingerprints import counted_before
-from fg_calib.monitoring.new_data import Calibrated, Rows
-from fg_calib.monitoring.update import predicted_before, updated
+from fg_calib.measurements import Measurements, Table, check_readings
+from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
 from fg_calib.options import Options, check, check_flag, check_names, listed
 from fg_calib.parallel import single_threaded, tell
-from fg_calib.prediction.tool_pose import predict_poses
-from fg_calib.report.figures import Drawn
-from fg_calib.report.html import build_page, draw_figures, parameter_table_html
-from fg_calib.report.text import format_result, judged, notes_of, summary
-from fg_calib.robot.model import Robot, names_of
-from fg_calib.statistics.covariance import TangentCovariance
-from fg_calib.statistics.cross_validation import cross_validate
-from fg_calib.statistics.estimates import FrameEstimate, ParameterEstimate
+from fg_calib.prediction import predict_poses
+from fg_calib.report import (
+    Drawn,
+    build_page,
+    draw_figures,
+    format_result,
+    judged,
+    notes_of,
+    parameter_table_html,
+    summary,
+)
+from fg_calib.robot import Robot, names_of
+from fg_calib.statistics import FrameEstimate, ParameterEstimate, TangentCovariance, cross_validate
 
 if TYPE_CHECKING:
     import polars as pl

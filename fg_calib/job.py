@@ -8,10 +8,9 @@ from typing import Any
 
 from fg_calib.arguments import check_fields
 from fg_calib.arrays import Brief
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import Measurements, Table
 from fg_calib.options import Options
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 
 @dataclass(frozen=True)

@@ -11,26 +11,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import as_floats
+from fg_calib.arrays import Floats, as_floats
 from fg_calib.calibration import Calibration
 from fg_calib.errors import InputError
-from fg_calib.io.atomic import fill_folder, require_own, require_writable, write_text
-from fg_calib.io.units import Units
-from fg_calib.measurements.checks import check_readings
+from fg_calib.io import Units, fill_folder, require_own, require_writable, write_text
+from fg_calib.measurements import check_readings
 from fg_calib.options import check_number
 from fg_calib.parallel import single_threaded
-from fg_calib.prediction.correction import Correction, correct_targets
-from fg_calib.prediction.tool_pose import ToolPoseUncertainty
-from fg_calib.prediction.workspace import PredictedErrors, predict_errors
-from fg_calib.report.charts import write_charts
-from fg_calib.report.figures import error_slices
-from fg_calib.report.predict import prediction_document, write_prediction_table
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.prediction import Correction, PredictedErrors, ToolPoseUncertainty, correct_targets, predict_errors
+from fg_calib.report import error_slices, prediction_document, write_charts, write_prediction_table
+from fg_calib.robot import Robot
 
 
 @checked

@@ -1,11 +1,5 @@
 """Plain least squares, and the comparison with it."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.baseline.comparison": "Comparison compare real_errors",
-        "fg_calib.baseline.least_squares": "LeastSquares fit_least_squares",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

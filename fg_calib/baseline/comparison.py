@@ -28,26 +28,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.errors import CalibrationError, ProblemError
-from fg_calib.graph.build import problem_of
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.variables import corrections_of
+from fg_calib.graph import Problem, Solution, corrections_of, problem_of
 from fg_calib.job import Job
 from fg_calib.parallel import single_threaded
-from fg_calib.prediction.tool_pose import PoseRms, errors_at, judged_configurations, pose_rms
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
-from fg_calib.robot.rotations import rotation_vector
+from fg_calib.prediction import PoseRms, errors_at, judged_configurations, pose_rms
+from fg_calib.robot import Robot, build_chain, forward, rotation_vector
 from fg_calib.statistics.residual_table import residual_table
-
-Floats = NDArray[np.float64]
 
 ResidualRms = dict[str, dict[str, dict[str, float]]]
 """RMS by split, kind, and before or after: see `residual_table.ResidualTable.rms`."""

@@ -32,24 +32,25 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Booleans, Brief, Floats, Integers
 from fg_calib.errors import InputError
-from fg_calib.measurements import residuals
-from fg_calib.measurements.build import Dataset
-from fg_calib.measurements.kinds.pair import usable_pairs
-from fg_calib.measurements.residuals import Block, unit_whitening
+from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.options import check, check_names, check_number
 from fg_calib.parallel import single_threaded
-from fg_calib.robot.kinematics import Chain, build_chain
-from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot, names_of
-from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from fg_calib.robot import (
+    AXIS_OF_KIND,
+    FRAME_KINDS,
+    Chain,
+    Element,
+    Parameter,
+    Robot,
+    build_chain,
+    names_of,
+    rotation_of,
+    yaw_pitch_roll,
+)
 
 Method = Literal["gauss-newton", "scipy"]
 

@@ -10,8 +10,7 @@ from fg_calib.cli.output import BaseLink, Json, TipLink, argument, names_in, opt
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from fg_calib.importers.recording import JointStream, PoseStream
-    from fg_calib.importers.standstill import Stops
+    from fg_calib.importers import JointStream, PoseStream, Stops
 
 
 def bag(
@@ -38,10 +37,8 @@ def bag(
     as_json: Json = False,
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""
-    from fg_calib.importers.bag import read_bag
-    from fg_calib.importers.standstill import TABLE_BEGINNING, average_stops, write_stops
-    from fg_calib.io.columns import require_own_csv
-    from fg_calib.io.robot_file import read_robot
+    from fg_calib.importers import TABLE_BEGINNING, average_stops, read_bag, write_stops
+    from fg_calib.io import read_robot, require_own_csv
 
     if out is not None:
         require_own_csv(out, TABLE_BEGINNING)
@@ -59,8 +56,8 @@ def bag(
 
 def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> dict[str, Any]:
     """The content of the recording for programs: [m], [rad], [s]."""
-    from fg_calib.importers.recording import period
-    from fg_calib.report.tables import plain
+    from fg_calib.importers import period
+    from fg_calib.report import plain
 
     topics = {
         what: {
@@ -96,8 +93,8 @@ def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> 
     """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
     from rich.console import Group
 
-    from fg_calib.importers.recording import period
-    from fg_calib.report.tables import indented, line, section, table_of
+    from fg_calib.importers import period
+    from fg_calib.report import indented, line, section, table_of
 
     n, skipped = len(stops.ids), len(stops.skipped)
     streams = [

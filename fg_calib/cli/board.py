@@ -13,7 +13,7 @@ from fg_calib.cli.output import Angle, Json, Length, argument, end, option, say,
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from fg_calib.importers.board_tables import BoardTables
+    from fg_calib.importers import BoardTables
 
 
 def board(
@@ -36,18 +36,18 @@ def board(
     if (camera is None) != estimate_camera:
         say("error: one of --camera and --estimate-camera is needed, and only one")
         raise typer.Exit(2)
-    from fg_calib.importers.board import image_files, read_calibration_board, read_corners
-    from fg_calib.importers.board_tables import (
+    from fg_calib.importers import (
         BoardTables,
+        fit_board,
+        image_files,
+        read_calibration_board,
+        read_corners,
         read_readings,
         require_no_input_of_board,
         write_board_tables,
     )
     from fg_calib.importers.opencv import opencv
-    from fg_calib.importers.views import fit_board
-    from fg_calib.io.atomic import read_bytes, require_writable
-    from fg_calib.io.job import read_camera, read_camera_of_images
-    from fg_calib.io.units import Units
+    from fg_calib.io import Units, read_bytes, read_camera, read_camera_of_images, require_writable
 
     opencv()
     require_writable(out)
@@ -76,8 +76,8 @@ def _report(tables: BoardTables) -> RenderableType:
     import numpy as np
     from rich.console import Group
 
-    from fg_calib.importers.views import INTRINSICS
-    from fg_calib.report.tables import figure, indented, line, section, table_of
+    from fg_calib.importers import INTRINSICS
+    from fg_calib.report import figure, indented, line, section, table_of
 
     fit, board = tables.fit, tables.fit.board
     n_images = len(fit.views) + len(fit.without_pose) + len(tables.without)
@@ -107,7 +107,7 @@ def _report(tables: BoardTables) -> RenderableType:
 def _notes(tables: BoardTables) -> Iterator[str]:
     import numpy as np
 
-    from fg_calib.report.tables import shortened
+    from fg_calib.report import shortened
 
     fit, units = tables.fit, tables.units
 

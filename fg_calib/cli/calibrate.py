@@ -45,7 +45,7 @@ def calibrate(
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
     from fg_calib.batch import Order, job_names
-    from fg_calib.io.atomic import require_writable
+    from fg_calib.io import require_writable
 
     if out is None and (report or figures):
         hint = "--report" if report else "--figures"
@@ -80,7 +80,7 @@ def _executor(workers: int | None, scheduler: str | None) -> AbstractContextMana
 
 def show_calibration(found: Calibration, as_json: bool) -> None:
     """Print a calibration, and end with 3 where it is not to be trusted or not accepted."""
-    from fg_calib.report.text import build_report
+    from fg_calib.report import build_report
 
     show_result(as_json, found.result.document, lambda: build_report(found))
     end(found.findings, not_accepted=found.not_accepted)
@@ -106,7 +106,7 @@ def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
     """Many jobs for the terminal: a line of each, then how many are good; `seconds` is the duration of all together."""
     from rich.console import Group
 
-    from fg_calib.report.tables import SHOWN, figure, in_order, line, table_of
+    from fg_calib.report import SHOWN, figure, in_order, line, table_of
 
     units = {kind: unit for job in jobs for kind, unit in job.units.items()}
     kinds, rows = in_order(units), []

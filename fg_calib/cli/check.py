@@ -25,7 +25,7 @@ def check(
 ) -> None:
     """Say whether a calibration is still good by new rows, and what changed if it is not."""
     from fg_calib.calibration import Calibration
-    from fg_calib.report.monitor import build_check_report, check_document
+    from fg_calib.report import build_check_report, check_document
 
     limits = {
         "limit": read_quantity(limit, "m", "--limit"),

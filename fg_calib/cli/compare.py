@@ -16,8 +16,7 @@ def compare(
 ) -> None:
     """Compare the factor graph with plain least squares on the same job, or a new result with an old one."""
     from fg_calib.baseline import comparison
-    from fg_calib.io.job import read_job
-    from fg_calib.io.result import read_result
+    from fg_calib.io import read_job, read_result
     from fg_calib.report import compare as report
 
     if new is not None:

@@ -22,10 +22,9 @@ def correct(
 ) -> None:
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
     from fg_calib.calibration import Calibration
-    from fg_calib.io.tables import read_targets
-    from fg_calib.io.units import Units
+    from fg_calib.io import Units, read_targets
     from fg_calib.predictions import correct as correct_targets
-    from fg_calib.report.predict import build_correction_report, correction_document, require_commands, write_commands
+    from fg_calib.report import build_correction_report, correction_document, require_commands, write_commands
 
     if out is not None:
         require_commands(out)

@@ -10,10 +10,10 @@ import typer
 from fg_calib.cli.output import Json, Seed, argument, end, option, read_quantity, say, show_result
 
 if TYPE_CHECKING:
-    from fg_calib.io.units import Units
+    from fg_calib.io import Units
     from fg_calib.job import Job
-    from fg_calib.robot.model import Robot
-    from fg_calib.simulation.scenario import Scenario
+    from fg_calib.robot import Robot
+    from fg_calib.simulation import Scenario
 
 
 def design(
@@ -51,8 +51,8 @@ def design(
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
     from fg_calib.designs.design import design as designed
-    from fg_calib.io.atomic import require_writable
-    from fg_calib.report.design import build_design_report, design_document, write_design
+    from fg_calib.io import require_writable
+    from fg_calib.report import build_design_report, design_document, write_design
 
     if n is not None and target is not None:
         say("error: --n and --target: one of the two")
@@ -81,9 +81,8 @@ def design(
 def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
     """What is to be designed, the units of its tables, and the arm."""
     from fg_calib.errors import InputError
-    from fg_calib.io.job import is_job, read_job, units_of
-    from fg_calib.io.units import Units
-    from fg_calib.simulation.scenario import read_scenario
+    from fg_calib.io import Units, is_job, read_job, units_of
+    from fg_calib.simulation import read_scenario
 
     if is_job(of):
         job = read_job(of)
@@ -95,14 +94,14 @@ def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
 
 
 def _readings(path: Path, robot: Robot, units: Units) -> Any:
-    from fg_calib.io.tables import read_measurements
+    from fg_calib.io import read_measurements
 
     return read_measurements(path, robot, units=units).readings
 
 
 def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
     """Where the candidates come from."""
-    from fg_calib.simulation.scenario import GivenReadings, read_scenario
+    from fg_calib.simulation import GivenReadings, read_scenario
 
     if given is None:
         return {}

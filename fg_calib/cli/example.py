@@ -15,7 +15,7 @@ def example(
     out: Annotated[Path, option("--out", "DIR", "Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
-    from fg_calib.io.atomic import fill_folder, require_absent
+    from fg_calib.io import fill_folder, require_absent
 
     known = sorted(folder.name for folder in EXAMPLES.iterdir() if folder.is_dir())
     if name not in known:

@@ -44,10 +44,9 @@ def export(
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""
     from fg_calib.calibration import Calibration
+    from fg_calib.exports import measured_configurations
     from fg_calib.exports.export import export as export_arm
-    from fg_calib.exports.export import measured_configurations
-    from fg_calib.io.atomic import is_folder, require_absent
-    from fg_calib.io.robot_file import read_robot
+    from fg_calib.io import is_folder, read_robot, require_absent
 
     is_result = is_folder(arm) or arm.suffix.lower() == ".json"
     if is_result and (base_link or tip_link):

@@ -7,8 +7,8 @@ from fg_calib.cli.output import Json, ResultFolder, show_result
 
 def history(result: ResultFolder, as_json: Json = False) -> None:
     """Show the runs that a calibration came from."""
-    from fg_calib.io.result import read_result
-    from fg_calib.report.compare import build_history, history_document
+    from fg_calib.io import read_result
+    from fg_calib.report import build_history, history_document
 
     found = read_result(result)
     runs = (*found.history, found.run)

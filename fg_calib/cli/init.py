@@ -14,8 +14,8 @@ def init(
     out: Annotated[Path, option("--out", "JOB", "The job to write.")] = Path("calibration.yaml"),
 ) -> None:
     """Write a commented job for a robot and its tables, recognised by their headers; nothing is overwritten."""
-    from fg_calib.importers.draft import draft_job
-    from fg_calib.io.atomic import require_absent, write_text
+    from fg_calib.importers import draft_job
+    from fg_calib.io import require_absent, write_text
 
     require_absent(out.parent, [out.name])
     text = draft_job(files, out)

@@ -10,9 +10,9 @@ from fg_calib.cli.output import Json, argument, end, show_result
 
 def inspect(job: Annotated[Path, argument("JOB", "The job, such as calibration.yaml.")], as_json: Json = False) -> None:
     """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
-    from fg_calib.diagnostics.inspection import inspect_job
-    from fg_calib.io.job import read_job
-    from fg_calib.report.inspect import build_inspection_report, inspection_document
+    from fg_calib.diagnostics import inspect_job
+    from fg_calib.io import read_job
+    from fg_calib.report import build_inspection_report, inspection_document
 
     given = read_job(job)
     found = inspect_job(given)

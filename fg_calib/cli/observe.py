@@ -56,13 +56,11 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
-    from fg_calib.io.robot_file import read_robot
-    from fg_calib.io.tables import read_measurements
-    from fg_calib.io.units import Units
-    from fg_calib.measurements.dataset import Noise
-    from fg_calib.observability.identifiability import observe_configurations, observe_structure
+    from fg_calib.io import Units, read_measurements, read_robot
+    from fg_calib.measurements import Noise
+    from fg_calib.observability import observe_configurations, observe_structure
     from fg_calib.options import Pairing
-    from fg_calib.report.inspect import build_identifiability_report, observability_document, write_observability
+    from fg_calib.report import build_identifiability_report, observability_document, write_observability
 
     _refuse_options_without_effect(context, model, structural=configurations is None)
     for name, sigma in (("position", position_noise), ("orientation", orientation_noise), ("joint", joint_noise)):

@@ -99,7 +99,7 @@ def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: C
         return
     from rich.console import Console
 
-    from fg_calib.report.tables import WIDTH, width_for
+    from fg_calib.report import WIDTH, width_for
 
     shown = report()
     _hide_progress()
@@ -113,7 +113,7 @@ def read_quantity(text: str | None, unit: Literal["m", "rad"], option_name: str)
     Raises:
         InputError: It has no unit, or is no number.
     """
-    from fg_calib.io.units import quantity
+    from fg_calib.io import quantity
 
     return None if text is None else quantity(text, unit, None, option_name)
 

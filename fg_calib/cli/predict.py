@@ -21,11 +21,10 @@ def predict(
 ) -> None:
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
     from fg_calib.calibration import Calibration
-    from fg_calib.io.tables import read_joint_table
-    from fg_calib.io.units import Units
+    from fg_calib.io import Units, read_joint_table
     from fg_calib.predictions import measured_of, require_prediction, write_prediction
     from fg_calib.predictions import predict as predict_tool
-    from fg_calib.report.predict import build_prediction_report, prediction_document
+    from fg_calib.report import build_prediction_report, prediction_document
 
     most, units = read_quantity(limit, "m", "--limit"), Units(length, angle)
     if out is not None:

@@ -16,9 +16,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate a calibration job: the true robot, and what is measured of it, with noise."""
-    from fg_calib.simulation import simulator
-    from fg_calib.simulation.scenario import read_scenario
-    from fg_calib.simulation.write import write_simulation
+    from fg_calib.simulation import read_scenario, simulator, write_simulation
 
     simulation = simulator.simulate(read_scenario(scenario), seed)
     names = write_simulation(out, simulation)

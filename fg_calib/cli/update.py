@@ -11,7 +11,7 @@ from fg_calib.cli.check import Like, NewTable, Pairs
 from fg_calib.cli.output import Json, ResultFolder, option
 
 if TYPE_CHECKING:
-    from fg_calib.robot.model import Robot
+    from fg_calib.robot import Robot
 
 
 def update(
@@ -36,8 +36,7 @@ def update(
     """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
     from fg_calib.calibration import Calibration
     from fg_calib.errors import InputError
-    from fg_calib.io.atomic import require_writable
-    from fg_calib.io.saved import require_no_input
+    from fg_calib.io import require_no_input, require_writable
 
     if out.resolve() == (result.parent if result.is_file() else result).resolve():
         raise InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
@@ -64,8 +63,8 @@ def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
         InputError: One is not `NAME=FIGURE` with a unit.
     """
     from fg_calib.errors import InputError
-    from fg_calib.io.units import quantity
-    from fg_calib.robot.model import tolerance_kind
+    from fg_calib.io import quantity
+    from fg_calib.robot import tolerance_kind
 
     units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}
     found = {}

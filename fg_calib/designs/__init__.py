@@ -1,11 +1,5 @@
 """Which configurations to measure."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.designs.criteria": "Criterion",
-        "fg_calib.designs.design": "Design",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

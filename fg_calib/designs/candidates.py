@@ -17,22 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats, Integers
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.errors import InputError
-from fg_calib.graph.build import places_of, true_problem
-from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.problem import Problem, square_root
-from fg_calib.graph.variables import Variables, unknown_prior_rows
-from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.landmarks import Landmarks
-from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
+from fg_calib.measurements import KnownPoint, Landmarks, Noise, Table
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
-from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import (
+from fg_calib.robot import Robot
+from fg_calib.simulation import (
     NOISE_KINDS,
     BoardCamera,
     BoardViews,
+    Candidates,
     Configurations,
     Errors,
     GivenReadings,
@@ -40,14 +36,12 @@ from fg_calib.simulation.scenario import (
     PairGauge,
     Placement,
     Scenario,
+    Simulation,
     Tracker,
+    draw_candidates,
     override_noise,
+    simulate,
 )
-from fg_calib.simulation.simulator import Simulation, simulate
-from fg_calib.simulation.views import Candidates, draw_candidates
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 REFERENCE, NONE = -1, -2
 """Instead of the number of a pose: the reference of a star, and a configuration at which nothing is fitted."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import FrozenArrays, as_floats
+from fg_calib.arrays import Floats, FrozenArrays, Integers, as_floats
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_for_more_rows, pool_of_rows, solve_for_design
@@ -26,17 +26,13 @@ from fg_calib.designs.information import N_TASK, Posterior, Task, build_system, 
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.errors import InputError, ProblemError
 from fg_calib.job import Job
-from fg_calib.measurements.table import Table
-from fg_calib.observability.indices import Observability
+from fg_calib.measurements import Table
+from fg_calib.observability import Observability
 from fg_calib.options import Pairing, check, check_flag, check_number
 from fg_calib.parallel import single_threaded, tell
-from fg_calib.prediction.tool_pose import PoseRms
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import MOST_DRAWN, Configurations, Scenario
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.prediction import PoseRms
+from fg_calib.robot import Robot, random_readings
+from fg_calib.simulation import MOST_DRAWN, Configurations, Scenario
 
 N_POSES = 30
 """Default number of poses of a design."""

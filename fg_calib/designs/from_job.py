@@ -12,25 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.assessment import solve_job
 from fg_calib.designs.candidates import NONE, REFERENCE, Pool, build_pool, draw_groups
 from fg_calib.designs.information import gather_rows
 from fg_calib.errors import InputError
-from fg_calib.graph.build import places_of
-from fg_calib.graph.problem import Problem, relinearized_at
-from fg_calib.graph.variables import pose_of
+from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import Noise, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
-from fg_calib.robot.kinematics import pose
-from fg_calib.simulation.scenario import (
+from fg_calib.robot import pose
+from fg_calib.simulation import (
     BoardCamera,
     BoardPoints,
     BoardViews,
+    Candidates,
     Configurations,
     Errors,
     Indicator,
@@ -44,9 +42,6 @@ from fg_calib.simulation.scenario import (
     Spot,
     Tracker,
 )
-from fg_calib.simulation.views import Candidates
-
-Floats = NDArray[np.float64]
 
 MIN_CONE_RAD = np.deg2rad(60.0)
 """Angle between a board's normal and the direction to the camera that new views may have at least."""

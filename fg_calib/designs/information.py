@@ -19,22 +19,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief, FrozenArrays
+from fg_calib.arrays import Brief, Floats, FrozenArrays, Integers
 from fg_calib.errors import InputError
-from fg_calib.graph.error_states import WhitenedBlock
-from fg_calib.graph.normal_system import SIGNAL_FLOOR, eliminate
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.variables import prior_rows, unknown_prior_rows
-from fg_calib.observability.indices import Observability, observability_of_rows
-from fg_calib.observability.observed_quantities import ObservedQuantities
-from fg_calib.prediction.tool_pose import PoseRms, errors_at
-from fg_calib.robot.kinematics import forward, without_rigid_motion
-from fg_calib.statistics.covariance import TangentCovariance, covariance_of_rows
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.graph import SIGNAL_FLOOR, Problem, WhitenedBlock, eliminate, prior_rows, unknown_prior_rows
+from fg_calib.observability import Observability, ObservedQuantities, observability_of_rows
+from fg_calib.prediction import PoseRms, errors_at
+from fg_calib.robot import forward, without_rigid_motion
+from fg_calib.statistics import TangentCovariance, covariance_of_rows
 
 N_TASK = 500
 """Number of random configurations within the joint limits that are the default task."""

@@ -15,15 +15,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.designs.criteria import Criterion, Measure
 from fg_calib.designs.information import System
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.robot import Robot
 
 MAX_SWEEPS = 10
 """Largest number of sweeps of an exchange."""

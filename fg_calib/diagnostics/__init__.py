@@ -1,11 +1,5 @@
 """What is wrong with a set-up, a model or a solution, and the verdict on it."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.diagnostics.inspection": "Inspection inspect_job",
-        "fg_calib.diagnostics.setup_check": "SetupCheck check_setup",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

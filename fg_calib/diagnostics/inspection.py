@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields, replace
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fg_calib.arguments import checked
@@ -22,23 +21,14 @@ from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreeme
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.diagnostics.verdict import Statement, listed
-from fg_calib.graph.build import problem_of
-from fg_calib.graph.problem import Problem, linear_system, tables_of
-from fg_calib.graph.solver import Solution, unsolved
+from fg_calib.graph import Problem, Solution, linear_system, problem_of, tables_of, unsolved
 from fg_calib.job import Job
-from fg_calib.measurements.build import find_copies
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.limits import outside_limits
-from fg_calib.measurements.table import Table
-from fg_calib.observability.identifiability import Identifiability, identifiability_of
-from fg_calib.observability.reasons import NOT_EXCITED
+from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
+from fg_calib.observability import NOT_EXCITED, Identifiability, identifiability_of
 from fg_calib.parallel import single_threaded
-from fg_calib.prediction.tool_pose import ExpectedError, expected_error
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.covariance import spread_of, with_left_out
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.prediction import ExpectedError, expected_error
+from fg_calib.robot import Robot
+from fg_calib.statistics import spread_of, with_left_out
 
 AMBIGUOUS_SHARE = 0.05
 """Share of pairs of ambiguous sign, from which it is reported."""

@@ -14,16 +14,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import SolverError
-from fg_calib.graph.problem import Problem, at_parameters, linear_system, noises_at, subsampled
-from fg_calib.graph.solver import Solution
-from fg_calib.robot.kinematics import forward
-from fg_calib.statistics.covariance import Spread
-
-Floats = NDArray[np.float64]
+from fg_calib.graph import Problem, Solution, at_parameters, linear_system, noises_at, subsampled
+from fg_calib.robot import forward
+from fg_calib.statistics import Spread
 
 MAX_ROWS = 5_000
 """Residuals that suffice: of more, so many are drawn evenly where that is possible."""

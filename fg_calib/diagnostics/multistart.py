@@ -16,19 +16,24 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
+from fg_calib.arrays import Floats
 from fg_calib.errors import CalibrationError
-from fg_calib.graph.normal_system import SIGNAL_FLOOR
-from fg_calib.graph.problem import Problem, at_parameters, directions, with_factors
-from fg_calib.graph.solver import Solution, SolverOptions, solve
-from fg_calib.measurements.kind import Kind
+from fg_calib.graph import (
+    SIGNAL_FLOOR,
+    Problem,
+    Solution,
+    SolverOptions,
+    at_parameters,
+    directions,
+    solve,
+    with_factors,
+)
+from fg_calib.measurements import Kind
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot.kinematics import forward
-from fg_calib.statistics.covariance import spread_of
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import forward
+from fg_calib.statistics import spread_of
 
 WEAK_SIGNAL_TO_NOISE = 2.0
 """A direction of a smaller signal-to-noise ratio, priors included, is weak: its sigma is above half its prior sigma."""

@@ -21,21 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import InputError, ProblemError, SolverError
-from fg_calib.graph.build import problem_of_tables
-from fg_calib.graph.noise_models import RowNoise
-from fg_calib.graph.problem import Problem, noises_at, reduced_graph, tables_of
-from fg_calib.graph.solver import levenberg_marquardt_params
-from fg_calib.graph.variables import build_variables
-from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import INSTRUMENTS, Instrument
-from fg_calib.measurements.table import Table
+from fg_calib.graph import (
+    Problem,
+    RowNoise,
+    build_variables,
+    levenberg_marquardt_params,
+    noises_at,
+    problem_of_tables,
+    reduced_graph,
+    tables_of,
+)
+from fg_calib.measurements import INSTRUMENTS, Measurements, Table, residuals
+from fg_calib.measurements.kinds import Instrument
 from fg_calib.options import Options, Pairing
-from fg_calib.robot.kinematics import Poses, forward
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import Poses, Robot, forward
 
 USUAL_LENGTH, USUAL_ANGLE = 2e-3, 5e-3
 """1 sigma of true minus nominal where a parameter has no prior: 2 mm and 5 mrad (0.3 degrees)."""

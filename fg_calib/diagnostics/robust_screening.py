@@ -20,18 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from fg_calib.arrays import Floats
 from fg_calib.diagnostics.nominal_residuals import evenly, fit_landmarks, nominal_problem, with_arm_errors
 from fg_calib.errors import InputError, ProblemError, SolverError
-from fg_calib.graph.noise_models import RowNoise, whitening_of
-from fg_calib.graph.problem import Problem, relinearized_at
-from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.measurements.table import Table
+from fg_calib.graph import Problem, RowNoise, relinearized_at, whitening_of
+from fg_calib.measurements import INSTRUMENTS, Table
 from fg_calib.options import Options
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.residual_table import MAX_OUTLIER_SHARE
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import Robot
+from fg_calib.statistics import MAX_OUTLIER_SHARE
 
 MAX_ROWS = 5000
 """Rows of a table up to which all are screened; of more, so many that are evenly spaced."""

@@ -17,20 +17,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats
 from fg_calib.diagnostics.nominal_residuals import Setup, TypicalResidual, nominal_residuals, residuals_at, setup_of
 from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypotheses, still_joints
-from fg_calib.graph.problem import Problem
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import Table
+from fg_calib.graph import Problem
+from fg_calib.measurements import Measurements, Table
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import Robot
 
 FAR = 5.0
 """Excess above which residuals before a calibration are not what noise and prior sigmas predict."""

@@ -10,14 +10,11 @@ from itertools import chain, combinations, permutations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Booleans, Floats
 from fg_calib.diagnostics.nominal_residuals import Setup, nominal_residuals
-from fg_calib.robot.model import CONVENTIONS
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
+from fg_calib.robot import CONVENTIONS
 
 MAX_REACH, MIN_REACH = 50.0, 0.02
 """Reach of an arm beyond which its own lengths are taken for the mistake, [m]."""

@@ -32,21 +32,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.graph.error_states import State
-from fg_calib.graph.problem import Problem, at_parameters
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.variables import build_variables, prior_rows, unknown_prior_rows
-from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import LANDMARKS
-from fg_calib.measurements.residuals import Block
-from fg_calib.observability.parallel_axes import MissingMotion, end_of_link
-from fg_calib.robot.kinematics import Chain, pose
-from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Element, Parameter, Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.arrays import Floats
+from fg_calib.graph import Problem, Solution, State, at_parameters, build_variables, prior_rows, unknown_prior_rows
+from fg_calib.measurements import LANDMARKS, Block, residuals
+from fg_calib.observability import MissingMotion, end_of_link
+from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Chain, Element, Parameter, Robot, pose
 
 MAX_ROWS = 10_000
 """Rows up to which residuals are tested: more would take long, and are seldom needed."""

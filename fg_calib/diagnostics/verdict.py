@@ -13,32 +13,29 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.diagnostics.nominal_residuals import residuals_at
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
-from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.solver import Solution
-from fg_calib.measurements.kinds.pair import missing_values
-from fg_calib.observability.parallel_axes import MissingMotion
-from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.goodness_of_fit import (
+from fg_calib.graph import JOINT_NOISE, Problem, Solution
+from fg_calib.measurements import missing_values
+from fg_calib.observability import MissingMotion
+from fg_calib.statistics import (
     CONFIDENCE,
     FACTOR,
+    LEAST_REDUNDANCY,
     OUTLIER_WEIGHT,
     ChiSquare,
     Fit,
     GrossErrors,
     PredictedFit,
+    PriorFit,
+    Spread,
+    has_joint_noise,
 )
-from fg_calib.statistics.priors import PriorFit
-from fg_calib.statistics.variance_components import LEAST_REDUNDANCY, has_joint_noise
 
-Floats = NDArray[np.float64]
 Severity = Literal["error", "warning", "note"]
 
 LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6

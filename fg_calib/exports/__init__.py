@@ -1,10 +1,5 @@
 """The calibrated arm as others read it: one module a format, and the door to all of them."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.exports.export": "Export",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

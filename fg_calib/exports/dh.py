@@ -55,17 +55,26 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import InputError, shown
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import Poses, build_chain, forward, pose
-from fg_calib.robot.model import AXIS_OF_KIND, CONVENTIONS, Axis, Element, Robot, RobotBuilder, frame_values
-from fg_calib.robot.rotations import inverse_right_jacobian
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import (
+    AXIS_OF_KIND,
+    CONVENTIONS,
+    Axis,
+    Element,
+    Poses,
+    Robot,
+    RobotBuilder,
+    build_chain,
+    forward,
+    frame_values,
+    inverse_right_jacobian,
+    pose,
+    random_readings,
+)
 
 TableConvention = Literal["dh", "mdh", "dh-hayati"]
 

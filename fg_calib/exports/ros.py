@@ -27,15 +27,13 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import InputError
 from fg_calib.exports.dh import in_table, row_transform, transform
 from fg_calib.exports.urdf import frame_matrix, urdf_joints
-from fg_calib.robot.model import FRAME_KINDS, Robot, frame_values
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import FRAME_KINDS, Robot, frame_values
 
 UrBase = Literal["base", "base_link"]
 

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import InputError
 from fg_calib.exports.dh import Links, inverse, links_of, rigid, transform
-from fg_calib.io.urdf import ROUNDING, urdf_text
-from fg_calib.robot.model import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
-
-Floats = NDArray[np.float64]
+from fg_calib.io import ROUNDING, urdf_text
+from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
 
 FARTHEST_SLIDE = 1000.0
 """Limit of a slide without one, [m]: URDF knows no slide without limits."""

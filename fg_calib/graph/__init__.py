@@ -1,13 +1,5 @@
 """The factor graph: variables, factors, whitening, start, problem and solver."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.graph.build": "build_problem problem_of",
-        "fg_calib.graph.factors": "DistanceFactor RotationAngleFactor",
-        "fg_calib.graph.problem": "Problem",
-        "fg_calib.graph.solver": "Solution SolverOptions levenberg_marquardt_params solve",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
+from fg_calib.arrays import Floats
 from fg_calib.errors import ProblemError
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.normal_system import determined, identifiable_subset
@@ -25,12 +25,17 @@ from fg_calib.graph.problem import (
 )
 from fg_calib.graph.variables import Variables, preference, prior_rows
 from fg_calib.job import Job
-from fg_calib.measurements.build import Dataset, build_dataset, warn_of_copies
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import INSTRUMENTS, Frames, check_derivatives, check_start, is_ours
-from fg_calib.measurements.kinds.pair import missing_values
-from fg_calib.measurements.predictions import predict_measurements
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import (
+    INSTRUMENTS,
+    Dataset,
+    Measurements,
+    Table,
+    build_dataset,
+    missing_values,
+    predict_measurements,
+    warn_of_copies,
+)
+from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
 from fg_calib.options import (
     FrameKnowledge,
     Gauge,
@@ -42,13 +47,10 @@ from fg_calib.options import (
     check_names,
 )
 from fg_calib.parallel import single_threaded
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward
-from fg_calib.robot.model import Robot, names_of
+from fg_calib.robot import Robot, forward, names_of, random_readings
 
 _log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
 Places = Mapping[tuple[str, str], Floats]
 """Coordinates of landmarks, and unknown frames as X, by letter and name."""
 

@@ -22,20 +22,15 @@ from typing import Literal
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Booleans, Brief, Floats, Integers
 from fg_calib.errors import SolverError
 from fg_calib.graph.noise_models import NoiseSource, RowNoise, whitening_of
-from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import Block, pack, unpack
-from fg_calib.robot.kinematics import SPAN, Chain, over_spans
+from fg_calib.measurements import Block, pack, residuals, unpack
+from fg_calib.robot import SPAN, Chain, over_spans
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 Sparse = scipy.sparse.csr_array
 
 MAX_DENSE = 2000

@@ -18,19 +18,16 @@ from numbers import Real
 import gtsam
 import numpy as np
 import scipy.sparse
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from fg_calib.arrays import as_floats
+from fg_calib.arrays import Floats, Integers, as_floats
 from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError, shown
 from fg_calib.graph.error_states import State, WhitenedBlock, WhitenedSeries
 from fg_calib.graph.variables import Variable, Variables, prior_rows
+from fg_calib.measurements import Block, Distance, RotationAngle, unpack
 from fg_calib.measurements.kinds import Kind
-from fg_calib.measurements.kinds.pair import Distance, RotationAngle
-from fg_calib.measurements.residuals import Block, unpack
 from fg_calib.options import check_number
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Sparse = scipy.sparse.csr_array
 Linearise = Callable[[gtsam.Values], tuple[Floats, Floats]]
 

@@ -21,17 +21,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph.factors import CheckedFactor
 from fg_calib.graph.normal_system import determined, eliminate
 from fg_calib.graph.variables import Variables, build_variables, pose_of
-from fg_calib.measurements.kinds import LANDMARKS
-from fg_calib.measurements.landmarks import Landmarks
+from fg_calib.measurements import LANDMARKS, Landmarks
 from fg_calib.options import FrameKnowledge, Model
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.robot import Robot
 
 STAYING = tuple(letter for letter, kind in LANDMARKS.items() if kind.stays)
 """Letters of the unknowns that may stay where they are: targets on the tool, anchors beside the arm."""

@@ -16,22 +16,30 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.errors import InputError
-from fg_calib.measurements import residuals
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.moments import Moments, angle_moments, length_moments
-from fg_calib.measurements.residuals import Block, unit_whitening
-from fg_calib.measurements.table import MeasurementBlock
-from fg_calib.robot import kernels
-from fg_calib.robot.kernels import whiten_small
-from fg_calib.robot.kinematics import SPAN, Chain, Poses, forward, over_spans
-from fg_calib.robot.rotations import nearest_rotation, rotation_angle
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from fg_calib.measurements import (
+    Block,
+    MeasurementBlock,
+    Measurements,
+    Moments,
+    angle_moments,
+    length_moments,
+    residuals,
+    unit_whitening,
+)
+from fg_calib.robot import (
+    SPAN,
+    Chain,
+    Poses,
+    forward,
+    kernels,
+    nearest_rotation,
+    over_spans,
+    rotation_angle,
+    whiten_small,
+)
 
 NoiseName = tuple[int, str]
 """Noise that is known up to a factor: its table and kind, or `JOINT_NOISE`."""

@@ -25,14 +25,10 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Booleans, Brief, Floats, Integers
 from fg_calib.graph.error_states import SchurComplement
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 Sparse = scipy.sparse.csr_array
 
 RANK_TOLERANCE = 1e-10

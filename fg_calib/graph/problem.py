@@ -14,9 +14,8 @@ from typing import Any
 import gtsam
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Booleans, Floats, FrozenArrays, Integers
 from fg_calib.errors import ProblemError, SolverError, shown
 from fg_calib.graph.error_states import (
     ErrorStates,
@@ -40,17 +39,10 @@ from fg_calib.graph.noise_models import JOINT_NOISE, NoiseState, RowNoise, Table
 from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSystem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
-from fg_calib.initialization.hand_eye import Frame
-from fg_calib.measurements.build import Dataset, start_frames
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import MeasurementBlock, Table, by_station
+from fg_calib.initialization import Frame
+from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, by_station, start_frames
 from fg_calib.options import Options
-from fg_calib.robot.kinematics import Chain, forward
-from fg_calib.robot.model import Parameter, Robot
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from fg_calib.robot import Chain, Parameter, Robot, forward
 
 
 @dataclass(frozen=True)

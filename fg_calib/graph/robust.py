@@ -39,9 +39,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from fg_calib.arrays import Floats
 from fg_calib.options import Loss
-
-Floats = NDArray[np.float64]
 
 EFFICIENCY = 0.95
 """Of the estimate from clean Gaussian measurements, for the losses that do not reject."""

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import FrozenArrays
+from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.errors import CalibrationError, SolverError
 from fg_calib.graph.factors import measurement_factors
 from fg_calib.graph.noise_models import NoiseState, RowNoise
@@ -48,9 +48,7 @@ from fg_calib.graph.robust import Weighting, constants, cost
 from fg_calib.graph.variables import Variables
 from fg_calib.options import Options, check_number
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import Robot
 
 FAIR_SHARE = 0.25
 """Share of the promised decrease of the cost that an undamped step must bring."""

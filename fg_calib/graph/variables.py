@@ -32,14 +32,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats
 from fg_calib.graph.error_states import State
-from fg_calib.measurements.landmarks import Landmarks
-from fg_calib.robot.kinematics import Chain, build_chain
-from fg_calib.robot.model import FRAME_KINDS, Parameter, Robot, names_of
-from fg_calib.robot.rotations import QUARTER_TURN, yaw_pitch_roll
-
-Floats = NDArray[np.float64]
+from fg_calib.measurements import Landmarks
+from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Parameter, Robot, build_chain, names_of, yaw_pitch_roll
 
 KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
 """Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""

@@ -22,7 +22,7 @@ from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE, Floats
 from fg_calib.errors import CalibrationError, InputError
 from fg_calib.importers.recording import JointStream, PoseStream, Source
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 JOINT_TYPE = "sensor_msgs/msg/JointState"
 

@@ -18,6 +18,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import InputError
 from fg_calib.importers.opencv import (
     CalibrationBoard,
@@ -27,10 +28,7 @@ from fg_calib.importers.opencv import (
     find_corners,
 )
 from fg_calib.importers.views import Corners
-from fg_calib.io.atomic import read_bytes
-from fg_calib.io.units import Units, UnitsOfFile
-from fg_calib.io.yaml import Count, Positive, Schema, read_yaml, shown, validate
-from fg_calib.measurements.dataset import Floats
+from fg_calib.io import Count, Positive, Schema, Units, UnitsOfFile, read_bytes, read_yaml, shown, validate
 from fg_calib.options import did_you_mean
 from fg_calib.parallel import tell
 

@@ -14,10 +14,8 @@ import yaml
 from fg_calib import __version__
 from fg_calib.errors import InputError
 from fg_calib.importers.views import INTRINSICS, BoardFit, View
-from fg_calib.io.atomic import fill_folder, require_own, write_text
-from fg_calib.io.columns import KNOWN, Table, write_csv
-from fg_calib.io.units import Units
-from fg_calib.measurements.kinds.board import COVARIANCE
+from fg_calib.io import KNOWN, Table, Units, fill_folder, require_own, write_csv, write_text
+from fg_calib.measurements import COVARIANCE
 
 BOARD_FILES = {
     "board.json": b'{\n "schema": "fg-calib/board/',

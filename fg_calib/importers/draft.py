@@ -16,14 +16,10 @@ import numpy as np
 import yaml
 
 from fg_calib.errors import InputError, printable
-from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Table, names_of
-from fg_calib.io.robot_file import read_robot
-from fg_calib.io.units import ANGLES, LENGTHS
-from fg_calib.io.yaml import read_yaml
-from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.measurements.kinds.board import COVARIANCE
+from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_CONFIGURATIONS, OF_PAIRS, Table, names_of, read_robot, read_yaml
+from fg_calib.measurements import COVARIANCE, INSTRUMENTS
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 _TABLES = (".csv", ".parquet", ".pq")
 

@@ -18,8 +18,7 @@ from scipy.linalg import toeplitz
 from scipy.optimize import brute
 
 from fg_calib.arrays import Floats, FrozenArrays
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot, build_chain, forward
 
 MIN_SIGMA = 1e-6
 """1 sigma of a mean, at least, [m] or [rad]: poses without any scatter are not exact either."""

@@ -32,10 +32,9 @@ from fg_calib.importers.recording import (
     period,
     sigmas_of_means,
 )
-from fg_calib.io.columns import require_own_csv, write_csv
-from fg_calib.io.tables import joint_columns
+from fg_calib.io import joint_columns, require_own_csv, write_csv
 from fg_calib.options import check_number
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 MIN_SAMPLES = 8
 """Poses, and joint readings, of which a mean is taken."""

@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats, Integers
 from fg_calib.errors import InputError
 from fg_calib.importers.opencv import CalibrationBoard, both_poses, camera_derivatives, first_camera
-from fg_calib.measurements.dataset import Floats, Integers
-from fg_calib.measurements.kind import Frames
+from fg_calib.measurements import Frames, RoomPixel
 from fg_calib.measurements.kinds import Camera
-from fg_calib.measurements.kinds.pixel import RoomPixel
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """A camera's parameters, in the order of its covariance."""

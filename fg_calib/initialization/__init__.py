@@ -1,1 +1,5 @@
 """Closed-form and linear starts of frames, landmarks and boards."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

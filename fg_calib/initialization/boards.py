@@ -14,15 +14,12 @@ References:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Booleans, Floats
 from fg_calib.initialization.camera import Camera
 from fg_calib.initialization.hand_eye import Frame
-from fg_calib.robot.rotations import left_jacobian
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
+from fg_calib.robot import left_jacobian
 
 LEAST_CORNERS = 4
 """Points of a board that an image must show."""

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import as_floats
+from fg_calib.arrays import Floats, as_floats
 from fg_calib.errors import InputError
-
-Floats = NDArray[np.float64]
 
 MOST_PIXELS = 1e6
 """No camera has more, nor a focal length of more, nor a larger coefficient of distortion."""

@@ -20,10 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.robot.rotations import nearest_rotation, rotation_angle
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
+from fg_calib.arrays import Booleans, Floats
+from fg_calib.robot import nearest_rotation, rotation_angle
 
 LEAST_TURN = 1e-6
 """Turns of the tool that show nothing of where its point is, [rad]: rounding would put that 1e12 m away."""

@@ -9,13 +9,10 @@ References:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Floats, Integers
 from fg_calib.initialization.hand_eye import Frame, align_points
-from fg_calib.robot.rotations import nearest_rotation
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.robot import nearest_rotation
 
 
 def targets_from_positions(

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.initialization import hand_eye
 from fg_calib.initialization.hand_eye import Frame, Unknown
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 
 WORLD = Frame(np.eye(3), np.zeros(3))
 

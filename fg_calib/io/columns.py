@@ -17,12 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
-from fg_calib.arrays import NOTHING, as_figures, as_frame, check_different
+from fg_calib.arrays import NOTHING, Booleans, Floats, Integers, as_figures, as_frame, check_different
 from fg_calib.errors import InputError
 from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
 from fg_calib.io.yaml import number_hint, shown
-from fg_calib.measurements.dataset import Booleans, Floats, Integers
-from fg_calib.measurements.kinds import INSTRUMENTS
+from fg_calib.measurements import INSTRUMENTS
 from fg_calib.measurements.kinds import Column as ColumnSet
 from fg_calib.options import Model, check_names, did_you_mean
 from fg_calib.parallel import require_polars

@@ -32,9 +32,8 @@ from fg_calib.io.yaml import (
     validate,
 )
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.kinds import GENERIC_COLUMNS, Camera
-from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
+from fg_calib.measurements.kinds import Camera
 from fg_calib.options import (
     LIMITED,
     POSE_MODELS,
@@ -51,7 +50,7 @@ from fg_calib.options import (
     check_names,
     did_you_mean,
 )
-from fg_calib.robot.model import Robot, names_of
+from fg_calib.robot import Robot, names_of
 
 _log = logging.getLogger(__name__)
 

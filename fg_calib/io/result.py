@@ -31,26 +31,30 @@ from fg_calib import __version__
 from fg_calib.arguments import checked
 from fg_calib.arrays import NORM_TOLERANCE, Figure, Floats
 from fg_calib.assessment import Assessment
-from fg_calib.diagnostics.setup_check import SetupCheck
+from fg_calib.diagnostics import SetupCheck
 from fg_calib.errors import InputError
-from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.solver import Solution, ToleranceScale
+from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale
 from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import Table
+from fg_calib.monitoring import knowledge_of
 from fg_calib.monitoring.fingerprints import fingerprints
-from fg_calib.monitoring.prior_information import knowledge_of
-from fg_calib.observability.identifiability import Identifiability
+from fg_calib.observability import Identifiability
 from fg_calib.options import FrameKnowledge, Model, Options
-from fg_calib.prediction.tool_pose import ExpectedError
-from fg_calib.statistics.acceptance import Acceptance
-from fg_calib.statistics.covariance import TangentCovariance
-from fg_calib.statistics.cross_validation import CrossValidation
-from fg_calib.statistics.estimates import FrameEstimate, JointErrors, LandmarkEstimate, ParameterEstimate
-from fg_calib.statistics.goodness_of_fit import KindFit, PredictedFit
-from fg_calib.statistics.priors import PriorFit
-from fg_calib.statistics.residual_table import ResidualTable
+from fg_calib.prediction import ExpectedError
+from fg_calib.statistics import (
+    Acceptance,
+    CrossValidation,
+    FrameEstimate,
+    JointErrors,
+    KindFit,
+    LandmarkEstimate,
+    ParameterEstimate,
+    PredictedFit,
+    PriorFit,
+    ResidualTable,
+    TangentCovariance,
+)
 
 SCHEMA = "fg-calib/result/2"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"

@@ -39,7 +39,7 @@ from fg_calib.io.yaml import (
     shown,
     validate,
 )
-from fg_calib.robot.model import (
+from fg_calib.robot import (
     AXIS_OF_KIND,
     CONVENTIONS,
     FRAME_KINDS,

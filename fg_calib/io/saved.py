@@ -18,15 +18,13 @@ import numpy as np
 
 from fg_calib.assessment import Assessment
 from fg_calib.errors import InputError
-from fg_calib.graph.solver import Solution
+from fg_calib.graph import Solution
 from fg_calib.io.atomic import digest_of, exists, fill_folder, read_bytes, require_own, write_text
 from fg_calib.io.result import Result
 from fg_calib.io.robot_file import read_robot, write_robot
 from fg_calib.io.urdf import write_urdf
-from fg_calib.robot.kinematics import SPAN, pose
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.estimates import JointErrors
-from fg_calib.statistics.goodness_of_fit import FLAGS
+from fg_calib.robot import SPAN, Robot, pose
+from fg_calib.statistics import FLAGS, JointErrors
 
 if TYPE_CHECKING:
     import polars as pl

@@ -16,27 +16,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE, FrozenArrays, once
+from fg_calib.arrays import NORM_TOLERANCE, Booleans, Floats, FrozenArrays, Integers, once
 from fg_calib.errors import InputError
 from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of
 from fg_calib.io.units import Units
 from fg_calib.io.yaml import shown
-from fg_calib.measurements.checks import ANGLE_SLACK, covariances
-from fg_calib.measurements.dataset import (
-    Booleans,
-    Floats,
+from fg_calib.measurements import (
+    ANGLE_SLACK,
+    INSTRUMENTS,
     Groups,
-    Integers,
     Labels,
     Measurements,
     Noise,
     Pairs,
+    covariances,
+    limit_hint,
     no_pairs,
+    outside_limits,
 )
-from fg_calib.measurements.kinds import INSTRUMENTS, Instrument
-from fg_calib.measurements.limits import limit_hint, outside_limits
+from fg_calib.measurements.kinds import Instrument
 from fg_calib.options import Model, check_number
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl

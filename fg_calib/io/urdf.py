@@ -22,7 +22,7 @@ from fg_calib.errors import InputError
 from fg_calib.io.atomic import decoded, read_bytes, replacing
 from fg_calib.io.yaml import shown, shown_word
 from fg_calib.options import NEAR, did_you_mean, known_names
-from fg_calib.robot.model import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
+from fg_calib.robot import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element

@@ -1,12 +1,5 @@
 """What was measured, in memory: configurations, kinds of measurement, how pairs are formed."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.measurements.dataset": "Measurements Noise",
-        "fg_calib.initialization.camera": "Camera",
-        "fg_calib.measurements.table": "CustomMeasurements KnownPoint Table",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Booleans, Brief, Floats, Integers
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.initialization.hand_eye import Frame
-from fg_calib.initialization.start import FrameStart
+from fg_calib.initialization import Frame, FrameStart
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Kind, is_ours
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
@@ -23,14 +21,10 @@ from fg_calib.measurements.kinds.custom import custom_block
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.options import NEAR, did_you_mean
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot, build_chain, forward
 
 _log = logging.getLogger(__name__)
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 SAME_READING = 1e-8
 """How far readings of one configuration in two tables may be apart, [rad] or [m]: what nine digits in degrees leave."""

@@ -15,7 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib.arguments import LEAST_SIZE, ORDINARY
 from fg_calib.arrays import (
     NORM_TOLERANCE,
+    Booleans,
     Floats,
+    Integers,
     as_array,
     as_columns,
     as_floats,
@@ -27,12 +29,10 @@ from fg_calib.arrays import (
 from fg_calib.errors import InputError
 from fg_calib.measurements.limits import limit_hint, outside_limits
 from fg_calib.options import check_names
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 _log = logging.getLogger(__name__)
 
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 ANGLE_SLACK = 1e-5
 """How far a rotation angle may exceed pi, [rad]: half a turn, rounded to six figures."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import FrozenArrays, as_floats, once
+from fg_calib.arrays import Booleans, Floats, FrozenArrays, Integers, as_floats, once
 from fg_calib.errors import InputError
 from fg_calib.measurements.checks import (
     checked_covariance,
@@ -26,15 +26,10 @@ from fg_calib.measurements.checks import (
     checked_sigma,
 )
 from fg_calib.options import Pairing, check_number, listed
-from fg_calib.robot.kinematics import over_spans
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib.robot import over_spans, rotation_angle
 
 MOST_PAIRS = 10_000_000
 """The largest number of pairs that are formed from poses."""
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,9 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import as_array, as_figures, require
+from fg_calib.arrays import Floats, Integers, as_array, as_figures, require
 from fg_calib.errors import InputError, shown
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 
 class Frames(NamedTuple):

@@ -7,12 +7,9 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Floats, Integers
 from fg_calib.errors import ProblemError
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 Estimate = tuple[Floats, Floats, tuple[str, ...]]
 """Values as reports show them, their covariance, and their units."""

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
+from fg_calib.arrays import Booleans, Floats
+from fg_calib.robot import Robot
 
 LIMIT_SLACK = 1e-3
 """How far a reading may be beyond its joint's limits, [rad] or [m]: encoders say so of a joint that stands at one."""

@@ -35,10 +35,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-Floats = NDArray[np.float64]
+from fg_calib.arrays import Floats
 
 FAR = 8.5
 """Distance from a kink, in sigma, beyond which the exponentials are rounding."""

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Floats
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import Robot, build_chain, forward
 
 ASSUMED_SIGMA = 1e-3
 """1 sigma of what none is specified for, [m] and [rad]."""

@@ -20,17 +20,12 @@ from dataclasses import dataclass, field, fields, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats, Integers
 from fg_calib.measurements.kind import Frames, Kind, checked_rows
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot.kernels import LANES, fill
-from fg_calib.robot.kinematics import Chain, forward, over_spans, turning_of_base
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.robot import LANES, Chain, fill, forward, over_spans, turning_of_base
 
 CHUNK = 512
 """Measurements in one panel; a multiple of `LANES`."""

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import LEAST_SIZE, ORDINARY, check_fields
-from fg_calib.arrays import Brief, FrozenArrays, as_figures, as_floats, check_sizes, require
+from fg_calib.arrays import Booleans, Brief, Floats, FrozenArrays, Integers, as_figures, as_floats, check_sizes, require
 from fg_calib.errors import InputError, ProblemError, shown
-from fg_calib.initialization.camera import Camera
+from fg_calib.initialization import Camera
 from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
 from fg_calib.measurements.kind import Kind, check_kind
 from fg_calib.options import (
@@ -26,10 +25,6 @@ from fg_calib.options import (
     listed,
     set_checked,
 )
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,5 @@
 """Whether a calibration still holds by new data, what has changed, and its update."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.monitoring.check": "Check Explanation",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

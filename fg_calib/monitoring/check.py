@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from fg_calib.diagnostics.setup_check import check_tables, reporting
+from fg_calib.diagnostics import check_tables, reporting
 from fg_calib.monitoring.discriminating_design import Advice, advise_configurations
 from fg_calib.monitoring.hypotheses import (
     CERTAIN,
@@ -37,8 +37,7 @@ from fg_calib.monitoring.hypotheses import (
 )
 from fg_calib.monitoring.new_data import Calibrated, Linear, Rows, linearise_new_data, place_new_data
 from fg_calib.options import LIMITED, Limits
-from fg_calib.statistics.acceptance import LEAST
-from fg_calib.statistics.goodness_of_fit import FACTOR
+from fg_calib.statistics import FACTOR, LEAST
 from fg_calib.statistics.residual_table import residual_table
 
 Verdict = Literal["pass", "fail", "not_evaluated"]

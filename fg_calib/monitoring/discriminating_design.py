@@ -17,13 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
-from fg_calib.graph.problem import Problem, problem_at
-from fg_calib.measurements.build import build_dataset
-from fg_calib.measurements.dataset import Measurements
+from fg_calib.graph import Problem, problem_at
+from fg_calib.measurements import Measurements, build_dataset
 from fg_calib.monitoring.hypotheses import HypothesisTest, columns_of, motion, quantile
 from fg_calib.monitoring.new_data import Calibrated, Linear, linearised
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
-from fg_calib.robot.inverse import random_readings
+from fg_calib.robot import random_readings
 
 N_CANDIDATES = 200
 """Configurations to choose from."""

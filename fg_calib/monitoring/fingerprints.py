@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arrays import Floats
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import LANDMARKS
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import LANDMARKS, Measurements, Table
 
 Words = NDArray[np.uint64]
 

@@ -30,13 +30,10 @@ from scipy import special
 
 from fg_calib.arrays import Floats, Integers
 from fg_calib.errors import CalibrationError
-from fg_calib.graph.error_states import WhitenedBlock
-from fg_calib.graph.variables import build_variables
+from fg_calib.graph import WhitenedBlock, build_variables
 from fg_calib.monitoring.new_data import Calibrated, Linear, Placed, Rows, linearise_new_data, place_new_data
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import forward
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.goodness_of_fit import FACTOR
+from fg_calib.robot import Robot, forward, random_readings
+from fg_calib.statistics import FACTOR
 
 WRONG = 0.01
 """Probability with which the true change is at most called distinguished from another."""

@@ -16,21 +16,31 @@ from functools import cached_property
 import numpy as np
 
 from fg_calib.arrays import Floats, Integers
-from fg_calib.diagnostics.unmodelled_effects import basis_of
+from fg_calib.diagnostics import basis_of
 from fg_calib.errors import ProblemError
-from fg_calib.graph.error_states import State, WhitenedBlock
-from fg_calib.graph.knowledge import Knowledge, coordinates_of
-from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, NoiseState
-from fg_calib.graph.problem import Problem, at_parameters, problem_at, start_of, tables_of, variables_of, with_factors
-from fg_calib.graph.solver import Solution, solve
-from fg_calib.graph.variables import unknown_prior_rows
-from fg_calib.measurements import residuals
-from fg_calib.measurements.build import build_dataset
-from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib.graph import (
+    JOINT_NOISE,
+    Knowledge,
+    NoiseName,
+    NoiseState,
+    Problem,
+    Solution,
+    State,
+    WhitenedBlock,
+    at_parameters,
+    coordinates_of,
+    problem_at,
+    solve,
+    start_of,
+    tables_of,
+    unknown_prior_rows,
+    variables_of,
+    with_factors,
+)
+from fg_calib.measurements import INSTRUMENTS, KnownPoint, Table, build_dataset, residuals
 from fg_calib.monitoring.prior_information import with_tolerances
 from fg_calib.options import Options
-from fg_calib.robot.model import Robot, names_of
+from fg_calib.robot import Robot, names_of
 
 _NOTHING = 1e-9
 """Part of a column's length that counts as nothing."""

@@ -7,14 +7,21 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
-from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import Problem, row_triangles
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.variables import prior_rows, unknown_prior_rows
-from fg_calib.observability.observed_quantities import ObservedQuantities
-
-Floats = NDArray[np.float64]
+from fg_calib.arrays import Floats
+from fg_calib.graph import (
+    SIZE,
+    STAYING,
+    Knowledge,
+    Name,
+    Problem,
+    Solution,
+    coordinates_of,
+    eliminate,
+    prior_rows,
+    row_triangles,
+    unknown_prior_rows,
+)
+from fg_calib.observability import ObservedQuantities
 
 
 def knowledge_of(solution: Solution) -> Knowledge | None:

@@ -17,18 +17,25 @@ import numpy as np
 
 from fg_calib.arrays import Floats
 from fg_calib.errors import InputError, ProblemError
-from fg_calib.graph.build import kept_of
-from fg_calib.graph.knowledge import Knowledge, coordinates_of
-from fg_calib.graph.problem import Problem, at_parameters, problem_at, variables_of, with_factors
-from fg_calib.graph.solver import Solution, solve
-from fg_calib.measurements.build import build_dataset
-from fg_calib.measurements.kinds.pose import TARGET
+from fg_calib.graph import (
+    Knowledge,
+    Problem,
+    Solution,
+    at_parameters,
+    coordinates_of,
+    kept_of,
+    problem_at,
+    solve,
+    variables_of,
+    with_factors,
+)
+from fg_calib.measurements import TARGET, build_dataset
 from fg_calib.monitoring.hypotheses import motions, zero_names
 from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, place_new_data
 from fg_calib.options import NEAR, did_you_mean, known_names
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.model import Robot, names_of, tolerance_kind
-from fg_calib.statistics.residual_table import HeldOut, residual_table
+from fg_calib.robot import Robot, names_of, random_readings, tolerance_kind
+from fg_calib.statistics import HeldOut
+from fg_calib.statistics.residual_table import residual_table
 
 
 def updated(

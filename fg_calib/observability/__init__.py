@@ -1,10 +1,5 @@
 """Which parameters measurements determine, and why not the others."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.observability.identifiability": "Identifiability observe_configurations observe_structure",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

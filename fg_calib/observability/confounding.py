@@ -9,14 +9,10 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.graph.normal_system import eliminate
-from fg_calib.graph.problem import Problem, square_root
-from fg_calib.measurements.kinds import LANDMARKS
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
+from fg_calib.arrays import Floats, Integers
+from fg_calib.graph import Problem, eliminate, square_root
+from fg_calib.measurements import LANDMARKS
 
 NOT_SEEN = 1e-6
 """Length of a direction's rows over that of what its members do one by one, up to which it is not seen."""

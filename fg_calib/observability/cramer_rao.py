@@ -29,22 +29,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Booleans, Brief, Floats
 from fg_calib.errors import InputError, shown
-from fg_calib.graph.build import predicted_problem, true_problem
-from fg_calib.graph.problem import correlation, named_triangle
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import Table
+from fg_calib.graph import correlation, named_triangle, predicted_problem, true_problem
+from fg_calib.measurements import Measurements, Table
 from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing, check, check_flag, check_names
 from fg_calib.parallel import single_threaded
-from fg_calib.robot.kinematics import build_chain, forward, without_rigid_motion
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
+from fg_calib.robot import Robot, build_chain, forward, without_rigid_motion
 
 RCOND = 1e-10
 """Singular values below this share of the largest belong to directions that nothing determines."""

@@ -23,15 +23,8 @@ from pydantic import computed_field
 from scipy.sparse.csgraph import connected_components
 
 from fg_calib.arrays import Figure, Floats, FrozenArrays
-from fg_calib.graph.normal_system import (
-    RANK_TOLERANCE,
-    SIGNAL_FLOOR,
-    SUPPORT_TOLERANCE,
-    determined,
-    first_independent,
-)
-from fg_calib.graph.variables import preference
-from fg_calib.robot.model import Parameter, names_of
+from fg_calib.graph import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined, first_independent, preference
+from fg_calib.robot import Parameter, names_of
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from fg_calib.graph.problem import Problem
-from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.measurements.table import Table
+from fg_calib.graph import Problem
+from fg_calib.measurements import INSTRUMENTS, Table
 from fg_calib.options import FrameKnowledge, Model
 
 

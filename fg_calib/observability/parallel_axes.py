@@ -15,12 +15,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import CONVENTIONS, Axis, Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.arrays import Floats
+from fg_calib.robot import CONVENTIONS, Axis, Robot, pose
 
 PARALLEL_RAD = np.deg2rad(3.0)
 """Angle of two axes below which parameters would have to change by 20 times the tilt that they follow, or more."""

@@ -9,20 +9,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.graph.build import Places, places_of
-from fg_calib.graph.problem import Problem, problem_at, start_of, variables_of
-from fg_calib.measurements.build import build_dataset
-from fg_calib.measurements.dataset import Labels, Measurements
-from fg_calib.measurements.kinds import INSTRUMENTS
-from fg_calib.measurements.table import Table
+from fg_calib.arrays import Floats
+from fg_calib.graph import Places, Problem, places_of, problem_at, start_of, variables_of
+from fg_calib.measurements import INSTRUMENTS, Labels, Measurements, Table, build_dataset
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Options, Pairing
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.robot import Robot, build_chain, forward, random_readings
 
 LEAST = 60
 """Random configurations of a table at least, where there are many tables."""

@@ -12,20 +12,15 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.graph.normal_system import SUPPORT_TOLERANCE
-from fg_calib.graph.problem import Problem, named_triangle
+from fg_calib.arrays import Booleans, Floats
+from fg_calib.graph import SUPPORT_TOLERANCE, Problem, named_triangle
 from fg_calib.observability.confounding import Confounding
 from fg_calib.observability.indices import Observability
 from fg_calib.observability.observed_quantities import ObservedQuantities
 from fg_calib.observability.random_configurations import at_random_configurations
 from fg_calib.parallel import single_threaded
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import build_chain, forward
-
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
+from fg_calib.robot import build_chain, forward, random_readings
 
 NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"

@@ -15,21 +15,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from fg_calib.arrays import Floats, FrozenArrays, as_floats, as_rotations
+from fg_calib.arrays import Booleans, Floats, FrozenArrays, Integers, as_floats, as_rotations
 from fg_calib.errors import InputError
-from fg_calib.measurements.checks import check_readings
+from fg_calib.measurements import check_readings
 from fg_calib.parallel import tell
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
-from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, solve_inverse
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
-from fg_calib.robot.rotations import rotation_vector
-from fg_calib.statistics.covariance import TangentCovariance
-
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
+from fg_calib.robot import N_STARTS, REACHED, Inverse, Robot, build_chain, forward, rotation_vector, solve_inverse
+from fg_calib.statistics import TangentCovariance
 
 LARGE_CHANGE = 0.1
 """Change of a joint, [rad] (prismatic: [m]), beyond which it is near a singularity or on another branch."""

@@ -19,17 +19,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import Floats, FrozenArrays
-from fg_calib.graph.problem import Problem
-from fg_calib.graph.variables import build_variables
-from fg_calib.measurements.build import Dataset
-from fg_calib.observability.observed_quantities import ObservedQuantities
-from fg_calib.robot.kinematics import Chain, forward, without_rigid_motion
-from fg_calib.statistics.covariance import TangentCovariance
-
-Integers = NDArray[np.int64]
+from fg_calib.arrays import Floats, FrozenArrays, Integers
+from fg_calib.graph import Problem, build_variables
+from fg_calib.measurements import Dataset
+from fg_calib.observability import ObservedQuantities
+from fg_calib.robot import Chain, forward, without_rigid_motion
+from fg_calib.statistics import TangentCovariance
 
 MAX_CONFIGURATIONS = 1000
 """Configurations up to which all are looked at; of more, as many evenly spaced."""

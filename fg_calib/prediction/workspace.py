@@ -13,16 +13,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fg_calib.arrays import Floats, FrozenArrays
+from fg_calib.arrays import Booleans, Floats, FrozenArrays
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
-from fg_calib.robot.inverse import random_readings
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Joint, Robot
-
-Booleans = NDArray[np.bool_]
+from fg_calib.robot import Joint, Robot, pose, random_readings
 
 QUANTILES: Mapping[str, float] = {"median": 0.5, "p95": 0.95, "largest": 1.0}
 """Statistics by which errors are summarised."""

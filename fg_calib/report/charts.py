@@ -16,7 +16,7 @@ import numpy as np
 
 from fg_calib.arrays import Floats
 from fg_calib.errors import escaped
-from fg_calib.io.atomic import write_text
+from fg_calib.io import write_text
 
 WIDTH, HEIGHT = 360.0, 230.0
 """Size of an ordinary chart, in its own units; the page stretches it."""

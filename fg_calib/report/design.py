@@ -15,22 +15,26 @@ import yaml
 from rich.console import Group, RenderableType
 
 from fg_calib.arrays import Floats
-from fg_calib.designs.design import Design
+from fg_calib.designs import Design
 from fg_calib.errors import InputError
-from fg_calib.io.atomic import exists, fill_folder, read_bytes, read_text, write_text
-from fg_calib.io.columns import write_csv
-from fg_calib.io.robot_file import write_robot
-from fg_calib.io.units import Units
-from fg_calib.io.urdf import write_urdf
-from fg_calib.measurements.table import Table
-from fg_calib.observability.parallel_axes import missing_motions
-from fg_calib.prediction.tool_pose import PoseRms
+from fg_calib.io import (
+    Units,
+    exists,
+    fill_folder,
+    read_bytes,
+    read_text,
+    write_csv,
+    write_robot,
+    write_text,
+    write_urdf,
+)
+from fg_calib.measurements import Table
+from fg_calib.observability import missing_motions
+from fg_calib.prediction import PoseRms
 from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
 from fg_calib.report.tables import SHOWN, indented, json_text, line, plain, rounded, section, table_of
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import RandomReadings
-from fg_calib.simulation.write import instrument_keys, is_filled_in, table_columns, to_fill_in
+from fg_calib.robot import Robot, pose
+from fg_calib.simulation import RandomReadings, instrument_keys, is_filled_in, table_columns, to_fill_in
 
 SCHEMA = "fg-calib/design/1"
 

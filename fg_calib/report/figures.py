@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fg_calib.arrays import Booleans, Floats
-from fg_calib.io.result import Result
-from fg_calib.observability.identifiability import Identifiability
-from fg_calib.prediction.tool_pose import ToolPoseUncertainty
-from fg_calib.prediction.workspace import PredictedErrors, predict_errors
+from fg_calib.io import Result
+from fg_calib.observability import Identifiability
+from fg_calib.prediction import PredictedErrors, ToolPoseUncertainty, predict_errors
 from fg_calib.report.charts import (
     BOTTOM,
     LEFT,
@@ -32,9 +31,9 @@ from fg_calib.report.charts import (
     whiskers,
 )
 from fg_calib.report.tables import SHOWN, in_words
-from fg_calib.robot.model import Robot
-from fg_calib.simulation.obstacles import link_points
-from fg_calib.statistics.covariance import TangentCovariance
+from fg_calib.robot import Robot
+from fg_calib.simulation import link_points
+from fg_calib.statistics import TangentCovariance
 
 if TYPE_CHECKING:
     import polars as pl

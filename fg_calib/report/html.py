@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fg_calib.errors import escaped
-from fg_calib.io.result import Result
-from fg_calib.prediction.workspace import PredictedErrors
+from fg_calib.io import Result
+from fg_calib.prediction import PredictedErrors
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import Drawn, arm_scene, figures_of
 from fg_calib.report.predict import percentages, size_table

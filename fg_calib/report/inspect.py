@@ -14,17 +14,12 @@ from rich.table import Table
 
 from fg_calib import __version__
 from fg_calib.arguments import checked
-from fg_calib.diagnostics.inspection import Inspection
-from fg_calib.diagnostics.linearity import NEAR_SIGMAS
-from fg_calib.diagnostics.nominal_residuals import MAX_ROWS
-from fg_calib.diagnostics.robust_screening import Disagreements
-from fg_calib.diagnostics.setup_check import SetupCheck
-from fg_calib.io.atomic import fill_folder, write_text
-from fg_calib.io.result import Observability as Document
-from fg_calib.io.result import in_words as table_in_words
+from fg_calib.diagnostics import MAX_ROWS, NEAR_SIGMAS, Disagreements, Inspection, SetupCheck
+from fg_calib.io import Observability as Document
+from fg_calib.io import fill_folder, write_text
+from fg_calib.io import in_words as table_in_words
 from fg_calib.job import Job
-from fg_calib.observability.identifiability import Identifiability
-from fg_calib.observability.indices import CORRELATED, Observability
+from fg_calib.observability import CORRELATED, Identifiability, Observability
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import draw_observability
 from fg_calib.report.tables import (

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from rich.console import Group, RenderableType
 
-from fg_calib.diagnostics.verdict import probability
-from fg_calib.monitoring.check import Check, Explanation
+from fg_calib.diagnostics import probability
+from fg_calib.monitoring import Check, Explanation
 from fg_calib.options import LIMITED
 from fg_calib.report.tables import SHOWN, figure, indented, line, plain, section, table_of
 

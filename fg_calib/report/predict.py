@@ -13,17 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
 from fg_calib.arrays import Floats
-from fg_calib.io.columns import require_own_csv, write_csv
-from fg_calib.io.result import Result
-from fg_calib.io.tables import joint_columns
-from fg_calib.io.units import Units
+from fg_calib.io import Result, Units, joint_columns, require_own_csv, write_csv
 from fg_calib.options import LengthUnit
-from fg_calib.prediction.correction import Correction
-from fg_calib.prediction.tool_pose import ToolErrors
-from fg_calib.prediction.workspace import PredictedErrors, Responsible, WorstConfiguration, summed_up
+from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, WorstConfiguration, summed_up
 from fg_calib.report.tables import SHOWN, figure, indented, line, plain, section, shortened, table_of
 from fg_calib.report.text import verdict_word
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 
 MAX_LISTED = 20
 """Configurations, or targets, that a report lists; the tables have all."""

@@ -16,10 +16,9 @@ from rich.table import Table
 from rich.text import Text
 
 from fg_calib.errors import escaped
-from fg_calib.observability.indices import Observability
-from fg_calib.observability.reasons import LostDirection
+from fg_calib.observability import LostDirection, Observability
 from fg_calib.options import check_number
-from fg_calib.robot.model import AXIS_OF_KIND, Axis
+from fg_calib.robot import AXIS_OF_KIND, Axis
 
 WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"
 """The definition of a weak direction, for headings."""

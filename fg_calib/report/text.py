@@ -15,12 +15,12 @@ from rich.table import Table
 
 from fg_calib.arrays import Floats
 from fg_calib.assessment import Assessment
-from fg_calib.diagnostics.verdict import chi2_in_words, predicted_in_words, probability
-from fg_calib.graph.solver import Solution
-from fg_calib.io.result import Result, key_of
-from fg_calib.measurements.kinds import LANDMARKS
+from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
+from fg_calib.graph import Solution
+from fg_calib.io import Result, key_of
+from fg_calib.measurements import LANDMARKS
 from fg_calib.options import LIMITED
-from fg_calib.prediction.tool_pose import ExpectedError
+from fg_calib.prediction import ExpectedError
 from fg_calib.report.tables import (
     SHOWN,
     WEAK,
@@ -38,10 +38,16 @@ from fg_calib.report.tables import (
     table_of,
     weak_directions,
 )
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.acceptance import Judgement
-from fg_calib.statistics.estimates import LandmarkEstimate, ParameterEstimate
-from fg_calib.statistics.goodness_of_fit import OUTLIER_WEIGHT, PREDICTION_VERDICTS, VERDICTS, KindFit
+from fg_calib.robot import Robot
+from fg_calib.statistics import (
+    OUTLIER_WEIGHT,
+    PREDICTION_VERDICTS,
+    VERDICTS,
+    Judgement,
+    KindFit,
+    LandmarkEstimate,
+    ParameterEstimate,
+)
 
 if TYPE_CHECKING:
     import polars as pl

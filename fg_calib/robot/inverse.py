@@ -18,18 +18,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, as_floats, as_rotations
+from fg_calib.arrays import Booleans, Brief, Floats, Integers, as_floats, as_rotations
 from fg_calib.options import check_number
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.rotations import rotation_vector
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 REACHED = 1e-9
 """A solution misses its pose by less, [m] and [rad]."""

@@ -29,13 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, as_figures, check_sizes
+from fg_calib.arrays import Brief, Floats, Integers, as_figures, check_sizes
 from fg_calib.parallel import processors
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 T = TypeVar("T")
 

@@ -17,10 +17,10 @@ from functools import cached_property
 from typing import ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import as_figures, as_floats, check_sizes, require, shape_of
+from fg_calib.arrays import Floats, as_figures, as_floats, check_sizes, require, shape_of
 from fg_calib.errors import InputError, escaped, shown
 from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
 from fg_calib.robot.rotations import yaw_pitch_roll
@@ -29,8 +29,6 @@ MOST_JOINTS = 200
 """The largest number of moving joints: the work grows with its third power."""
 
 _log = logging.getLogger(__name__)
-
-Floats = NDArray[np.float64]
 
 
 class Axis(IntEnum):

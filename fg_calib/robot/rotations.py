@@ -7,9 +7,8 @@ References:
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from fg_calib.arrays import Floats
 
 UPRIGHT = 1e-14
 """Cosine of a pitch below which roll and yaw rotate about one axis, and the roll counts as a part of the yaw."""

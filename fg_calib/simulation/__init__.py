@@ -1,13 +1,5 @@
 """Robots and measurements to try things on."""
 
-from fg_calib._lazy import attach
+import lazy_loader
 
-__getattr__, __dir__ = attach(
-    __name__,
-    {
-        "fg_calib.simulation.scenario": "BoardCamera BoardPoints BoardViews Box Corners Errors GivenReadings Indicator "
-        "LengthGauge PairGauge Placement Plane RandomReadings Scenario Sockets Spot TargetViews Tracker read_scenario",
-        "fg_calib.simulation.simulator": "Simulation simulate",
-        "fg_calib.simulation.write": "write_simulation",
-    },
-)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

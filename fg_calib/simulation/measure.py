@@ -25,14 +25,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.errors import InputError
-from fg_calib.measurements.dataset import Groups, Labels, Measurements, Noise, Pairs, form_pairs, no_pairs
-from fg_calib.measurements.kinds import INSTRUMENTS, Camera
-from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib.measurements import (
+    INSTRUMENTS,
+    Groups,
+    KnownPoint,
+    Labels,
+    Measurements,
+    Noise,
+    Pairs,
+    Table,
+    form_pairs,
+    no_pairs,
+)
+from fg_calib.measurements.kinds import Camera
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge
-from fg_calib.robot.inverse import N_STARTS, solve_inverse
-from fg_calib.robot.kinematics import Poses, pose
-from fg_calib.robot.model import Robot
+from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import (
     BoardCamera,
     BoardViews,
@@ -49,10 +58,6 @@ from fg_calib.simulation.scenario import (
     Tracker,
     frame_knowledge,
 )
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Booleans = NDArray[np.bool_]
 
 MAX_BASE_M = 5.0
 """How far from the world's origin an unknown frame puts the base, along each axis, [m]."""

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.robot.model import Axis, Robot
+from fg_calib.arrays import Booleans, Floats
+from fg_calib.robot import Axis, Robot
 
 if TYPE_CHECKING:  # pages draw arms without reading scenarios
     from fg_calib.simulation.scenario import Box
 
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
 
 MAX_CONTACT_M = 1e-9
 """How deep something may be in a box and still only touch it, [m]: far above rounding, far below any clearance."""

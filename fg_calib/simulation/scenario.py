@@ -94,29 +94,35 @@ from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, Valida
 from pydantic_core import core_schema
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, as_floats
+from fg_calib.arrays import Brief, Floats, as_floats
 from fg_calib.errors import InputError
-from fg_calib.io.atomic import exists, is_folder
-from fg_calib.io.job import camera_in, check_choices, joint_noise, pairing_of, robot_of
-from fg_calib.io.robot_file import FrameValues, unit_of_key
-from fg_calib.io.tables import read_measurements
-from fg_calib.io.units import Units, UnitsOfFile
-from fg_calib.io.yaml import (
+from fg_calib.io import (
     Bound,
     FilePath,
+    FrameValues,
     NotNegative,
     Number,
     Positive,
     Schema,
+    Units,
+    UnitsOfFile,
+    camera_in,
+    check_choices,
+    exists,
     first_misfit,
+    is_folder,
+    joint_noise,
+    pairing_of,
+    read_measurements,
     read_yaml,
     refuse_unknown_keys,
+    robot_of,
     shown,
+    unit_of_key,
     validate,
 )
-from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.kinds import GENERIC_COLUMNS, Camera
-from fg_calib.measurements.limits import LIMIT_SLACK
+from fg_calib.measurements import GENERIC_COLUMNS, LIMIT_SLACK, Noise
+from fg_calib.measurements.kinds import Camera
 from fg_calib.options import (
     NEAR,
     PAIR_MODELS,
@@ -130,12 +136,11 @@ from fg_calib.options import (
     did_you_mean,
     known_names,
 )
-from fg_calib.robot.model import Robot, names_of, tolerance_kind
+from fg_calib.robot import Robot, names_of, tolerance_kind
 
 MOST_DRAWN = 1_000_000
 """The largest number of configurations that are drawn."""
 
-Floats = NDArray[np.float64]
 Class = TypeVar("Class")
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"

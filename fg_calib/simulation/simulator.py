@@ -12,16 +12,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
+from fg_calib.arrays import Brief, Floats
 from fg_calib.errors import InputError
-from fg_calib.measurements.dataset import Measurements, Noise
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import Measurements, Noise, Table
 from fg_calib.options import check_number
 from fg_calib.parallel import single_threaded
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 from fg_calib.simulation.measure import Scene, Visits, draw_frame, generator_of, measure, merge_truths
 from fg_calib.simulation.scenario import (
     Configurations,
@@ -34,8 +32,6 @@ from fg_calib.simulation.scenario import (
     values_by_name,
 )
 from fg_calib.simulation.views import find_readings
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -14,17 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import FrozenArrays, as_floats
+from fg_calib.arrays import Booleans, Floats, FrozenArrays, as_floats
 from fg_calib.errors import InputError
-from fg_calib.measurements.limits import outside_limits
-from fg_calib.robot.inverse import Inverse, random_readings, solve_inverse
-from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
+from fg_calib.measurements import outside_limits
+from fg_calib.robot import Inverse, Robot, build_chain, forward, random_readings, solve_inverse
 from fg_calib.simulation.obstacles import enters
 from fg_calib.simulation.scenario import BoardViews, Configurations, GivenReadings, RandomReadings, TargetViews
 
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
 Words = NDArray[np.str_]
 
 Draw = Callable[[int], tuple[Floats, Words]]

@@ -12,25 +12,18 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arguments import checked
-from fg_calib.io.atomic import fill_folder, write_text
-from fg_calib.io.columns import write_csv
-from fg_calib.io.robot_file import write_robot
-from fg_calib.io.units import Units
-from fg_calib.io.urdf import write_urdf
-from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.measurements.kinds import GENERIC_COLUMNS
-from fg_calib.measurements.table import Table
+from fg_calib.arrays import Floats
+from fg_calib.io import Units, fill_folder, write_csv, write_robot, write_text, write_urdf
+from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
-from fg_calib.robot.model import Robot
+from fg_calib.robot import Robot
 from fg_calib.simulation.scenario import Placement, Plane, Spot
 from fg_calib.simulation.simulator import Simulation
 
 Columns = Mapping[str, Any]
-Floats = NDArray[np.float64]
 
 _FIRST_WORDS = "# fg-calib simulate "
 """How the job of a simulation begins."""

@@ -23,14 +23,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import FrozenArrays
-from fg_calib.graph.normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined
-from fg_calib.graph.problem import Problem, correlation, linear_system
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.variables import Variables, prior_rows
-from fg_calib.robot.model import Robot
-
-Floats = NDArray[np.float64]
+from fg_calib.arrays import Floats, FrozenArrays
+from fg_calib.graph import (
+    RANK_TOLERANCE,
+    SIGNAL_FLOOR,
+    SUPPORT_TOLERANCE,
+    Problem,
+    Solution,
+    Variables,
+    correlation,
+    determined,
+    linear_system,
+    prior_rows,
+)
+from fg_calib.robot import Robot
 
 NO_ANGLE = 1.0
 """An angle of a pose with a larger sigma is not known, [rad]: near a pitch of a quarter turn yaw and roll are none."""

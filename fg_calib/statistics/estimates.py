@@ -13,10 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.arrays import Floats, FrozenArrays, Integers
-from fg_calib.graph.problem import Problem, at_parameters, linear_system
-from fg_calib.graph.solver import Solution
-from fg_calib.graph.variables import Variables, corrections_of, pose_of
-from fg_calib.observability.indices import IdentifiabilityClass, Observability
+from fg_calib.graph import Problem, Solution, Variables, at_parameters, corrections_of, linear_system, pose_of
+from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level
 

@@ -36,12 +36,9 @@ from pydantic import computed_field
 from scipy import special
 
 from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import Problem, linear_system, mahalanobis_distances
-from fg_calib.graph.robust import effect, tuning, weight
-from fg_calib.graph.solver import Solution
-from fg_calib.measurements.residuals import squares_along
-from fg_calib.robot.kinematics import SPAN
+from fg_calib.graph import JOINT_NOISE, Problem, Solution, effect, linear_system, mahalanobis_distances, tuning, weight
+from fg_calib.measurements import squares_along
+from fg_calib.robot import SPAN
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, RowModel, square_root

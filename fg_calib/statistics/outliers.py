@@ -29,22 +29,16 @@ from dataclasses import replace
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy import special
 
+from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.errors import SolverError
-from fg_calib.graph.noise_models import PRIVATE_SHARE
-from fg_calib.graph.problem import Problem, with_factors
-from fg_calib.graph.solver import Solution, solve
-from fg_calib.graph.variables import prior_rows
+from fg_calib.graph import PRIVATE_SHARE, Problem, Solution, prior_rows, solve, with_factors
 from fg_calib.statistics.covariance import Spread, spread_of
 from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, RowStatistics, chi_square, judge_fit
 from fg_calib.statistics.residual_covariance import RowErrors
 from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table
 
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 Sparse = scipy.sparse.csr_array
 
 MAX_ROWS = 20_000

@@ -57,13 +57,25 @@ from scipy import special
 
 from fg_calib.arguments import checked
 from fg_calib.arrays import Figure, Floats, FrozenArrays, Integers
-from fg_calib.graph.normal_system import RANK_TOLERANCE, eliminate
-from fg_calib.graph.problem import Problem, correlation, linear_system, relinearized_at, with_factors
-from fg_calib.graph.solver import Solution, ToleranceScale, ToleranceScales, solve
-from fg_calib.graph.variables import Variables, prior_rows, unknown_prior_rows
+from fg_calib.graph import (
+    RANK_TOLERANCE,
+    Problem,
+    Solution,
+    ToleranceScale,
+    ToleranceScales,
+    Variables,
+    correlation,
+    eliminate,
+    linear_system,
+    prior_rows,
+    relinearized_at,
+    solve,
+    unknown_prior_rows,
+    with_factors,
+)
 from fg_calib.options import SharedScale
 from fg_calib.parallel import single_threaded
-from fg_calib.robot.model import Parameter, Robot, tolerance_kind
+from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
 
 SETTLED = 1e-3

@@ -13,19 +13,14 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
-from fg_calib.graph.error_states import ErrorStates
-from fg_calib.graph.noise_models import PRIVATE_SHARE, RowNoise
-from fg_calib.graph.problem import Problem, at_parameters, felt, linear_system, says_where
+from fg_calib.arrays import Booleans, Floats, Integers
+from fg_calib.graph import PRIVATE_SHARE, ErrorStates, Problem, RowNoise, at_parameters, felt, linear_system, says_where
 from fg_calib.measurements import residuals
-from fg_calib.robot.kinematics import Chain
+from fg_calib.robot import Chain
 
-Floats = NDArray[np.float64]
-Booleans = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 Sparse = scipy.sparse.csr_array
 
 MANY_ROWS = 16

@@ -11,14 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays
-from fg_calib.graph.problem import noises_at
-from fg_calib.graph.solver import Solution
-from fg_calib.measurements.dataset import Labels
+from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
+from fg_calib.graph import Solution, noises_at
+from fg_calib.measurements import Labels, MeasurementBlock
 from fg_calib.measurements.kinds import checked_figures
-from fg_calib.measurements.table import MeasurementBlock
 
-Integers = NDArray[np.int64]
 Codes = NDArray[np.int16]
 Indices = NDArray[np.int32]
 

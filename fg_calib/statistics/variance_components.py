@@ -36,16 +36,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 
 from fg_calib.arguments import checked
-from fg_calib.graph.error_states import ErrorStates, WhitenedSeries, block_diagonal, whitener_of
-from fg_calib.graph.noise_models import JOINT_NOISE, NoiseName, RowNoise
-from fg_calib.graph.problem import Problem, linear_system, relinearized_at
-from fg_calib.graph.solver import Solution, SolverOptions, solve
+from fg_calib.arrays import Floats
+from fg_calib.graph import (
+    JOINT_NOISE,
+    ErrorStates,
+    NoiseName,
+    Problem,
+    RowNoise,
+    Solution,
+    SolverOptions,
+    WhitenedSeries,
+    block_diagonal,
+    linear_system,
+    relinearized_at,
+    solve,
+    whitener_of,
+)
 from fg_calib.parallel import single_threaded
 
-Floats = NDArray[np.float64]
 Sparse = scipy.sparse.csr_array
 
 SETTLED = 1e-5

@@ -5,7 +5,7 @@
 
 from importlib import import_module
 
-from fg_calib.initialization.camera import Camera
+from fg_calib.initialization import Camera
 from fg_calib.measurements.kind import (
     Frames,
     Kind,

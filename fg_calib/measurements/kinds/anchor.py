@@ -8,15 +8,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import ProblemError
-from fg_calib.initialization.landmarks import anchors_from_lengths, offset_from_lengths
+from fg_calib.initialization import anchors_from_lengths, offset_from_lengths
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
+from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.kinds.contact import Contact
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot.kinematics import Poses
+from fg_calib.robot import Poses
 
 ANCHOR = LandmarkKind(
     "A",

@@ -9,15 +9,15 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.initialization.start import FrameStart
+from fg_calib.arrays import Floats, Integers
+from fg_calib.initialization import FrameStart
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.measurements.kind import Frames, Kind, Rows
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows
 from fg_calib.measurements.kinds.pose import POSE_COLUMNS
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot.kinematics import Poses
-from fg_calib.robot.rotations import cross_matrix, inverse_right_jacobian, left_jacobian
+from fg_calib.robot import Poses, cross_matrix, inverse_right_jacobian, left_jacobian
 
 BOARD = LandmarkKind(
     "B",

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from fg_calib.arrays import Floats
 from fg_calib.errors import ProblemError
 from fg_calib.measurements.dataset import Labels
-from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
+from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 

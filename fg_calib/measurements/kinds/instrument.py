@@ -8,18 +8,16 @@ from dataclasses import replace
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fg_calib.arrays import Floats, Integers
 from fg_calib.errors import ProblemError
-from fg_calib.initialization.start import FrameStart
+from fg_calib.initialization import FrameStart
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kind import Frames, Kind
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot.kinematics import Poses
+from fg_calib.robot import Poses
 
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 Blocks = Sequence[MeasurementBlock]
 Places = Callable[[LandmarkKind, str], Floats]
 """Coordinates of a landmark, by its kind and name."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fg_calib.arrays import once
+from fg_calib.arrays import Booleans, Floats, Integers, once
 from fg_calib.errors import ProblemError, escaped
-from fg_calib.initialization.start import FrameStart
+from fg_calib.initialization import FrameStart
 from fg_calib.measurements.dataset import Pairs, are_same, form_pairs, no_pairs
-from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows, between
+from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.kinds.contact import POINT, contact_blocks
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument
 from fg_calib.measurements.kinds.pose import ANGLES, POSE_COLUMNS
@@ -17,8 +16,6 @@ from fg_calib.measurements.kinds.stacked import stack
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot import kernels
-
-Booleans = NDArray[np.bool_]
 
 _NAMED = 5
 """Columns without a meaning that a warning names."""

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.errors import ProblemError
-from fg_calib.initialization.boards import boards_from_image
-from fg_calib.initialization.camera import Camera
-from fg_calib.initialization.start import FrameStart
+from fg_calib.initialization import Camera, FrameStart, boards_from_image
 from fg_calib.measurements.dataset import Labels, Measurements
-from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.measurements.kind import Frames, Kind, Rows
 from fg_calib.measurements.kinds.board import BOARD_COLUMN, BoardCamera, board_coordinates, start_boards
 from fg_calib.measurements.kinds.instrument import Blocks, Column
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot.rotations import cross_matrix, left_jacobian
-
-Booleans = NDArray[np.bool_]
+from fg_calib.robot import cross_matrix, left_jacobian
 
 MAX_CHOICES = 2
 """Poses of a board that one image may leave, at most."""

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.initialization.landmarks import plane_from_distances
+from fg_calib.arrays import Floats
+from fg_calib.initialization import plane_from_distances
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Floats, Frames, Kind, Rows, between
+from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows
 from fg_calib.measurements.landmarks import Estimate, LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot.kinematics import Poses
+from fg_calib.robot import Poses
 
 
 def normal_and_distance(behind: Floats, through: Floats, covariance: Floats) -> Estimate:

@@ -7,18 +7,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.initialization.hand_eye import Frame
-from fg_calib.initialization.landmarks import targets_from_positions
-from fg_calib.initialization.start import FrameStart
+from fg_calib.arrays import Floats, Integers
+from fg_calib.initialization import Frame, FrameStart, targets_from_positions
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.measurements.kind import Frames, Kind, Rows
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
 from fg_calib.measurements.kinds.stacked import stack
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot import kernels
-from fg_calib.robot.kinematics import Poses
-from fg_calib.robot.rotations import cross_matrix, inverse_right_jacobian
+from fg_calib.robot import Poses, cross_matrix, inverse_right_jacobian, kernels
 
 TARGET = LandmarkKind(
     "P",

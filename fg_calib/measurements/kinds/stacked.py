@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.measurements.kind import Floats, Frames, Integers, Kind, Rows
+from fg_calib.arrays import Floats, Integers
+from fg_calib.measurements.kind import Frames, Kind, Rows
 
 
 class Stacked(Kind):

@@ -1,0 +1,7 @@
+from .criteria import Criterion
+from .design import Design
+
+__all__ = [
+    "Criterion",
+    "Design",
+]

@@ -1,0 +1,6 @@
+from .export import Export, measured_configurations
+
+__all__ = [
+    "Export",
+    "measured_configurations",
+]

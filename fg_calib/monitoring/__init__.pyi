@@ -1,0 +1,18 @@
+from .check import Check, Explanation, check_rows
+from .fingerprints import counted_before
+from .new_data import Calibrated, Rows
+from .prior_information import at_nominal, knowledge_of
+from .update import predicted_before, updated
+
+__all__ = [
+    "Calibrated",
+    "Check",
+    "Explanation",
+    "Rows",
+    "at_nominal",
+    "check_rows",
+    "counted_before",
+    "knowledge_of",
+    "predicted_before",
+    "updated",
+]

@@ -1,0 +1,22 @@
+from .identifiability import Identifiability, identifiability_of, observe_configurations, observe_structure
+from .indices import CORRELATED, IdentifiabilityClass, Observability, observability_of_rows
+from .observed_quantities import ObservedQuantities
+from .parallel_axes import MissingMotion, end_of_link, missing_motions
+from .reasons import NOT_EXCITED, LostDirection
+
+__all__ = [
+    "CORRELATED",
+    "NOT_EXCITED",
+    "Identifiability",
+    "IdentifiabilityClass",
+    "LostDirection",
+    "MissingMotion",
+    "Observability",
+    "ObservedQuantities",
+    "end_of_link",
+    "identifiability_of",
+    "missing_motions",
+    "observability_of_rows",
+    "observe_configurations",
+    "observe_structure",
+]
