@@ -18,7 +18,6 @@ from fg_calib import (
     simulate,
     solve,
 )
-from fg_calib.baseline import fit_least_squares
 from fg_calib.diagnostics import check_setup
 from fg_calib.errors import InputError
 from fg_calib.io import Units, read_measurements
@@ -36,10 +35,6 @@ def problem(**options):
 
 def bound(**options):
     return cramer_rao(ROBOT, TABLE, **{"model": "distance"} | options)
-
-
-def plain(**options):
-    return fit_least_squares(ROBOT, TABLE, **{"model": "distance"} | options)
 
 
 def structure(model="distance", **options):
@@ -61,8 +56,8 @@ def scenario(**changes):
 
 BOARD = Placement(np.eye(3), np.zeros(3))
 WORDS = {
-    "model": (options.Model, (problem, bound, plain, structure, practical)),
-    "frame": (options.FrameKnowledge, (problem, bound, plain, structure, practical)),
+    "model": (options.Model, (problem, bound, structure, practical)),
+    "frame": (options.FrameKnowledge, (problem, bound, structure, practical)),
     "gauge": (options.Gauge, (problem,)),
     "pair_errors": (options.PairErrors, (problem, bound)),
     "encoder": (options.EncoderNoise, (problem,)),
@@ -102,7 +97,7 @@ MISTAKES = {
     ),
     **{f"a bare strategy {f.__name__}": (
         lambda f=f: f(pairing="chain"), "pairing: found 'chain', expected a Pairing, such as Pairing('chain')"
-    ) for f in (problem, bound, plain, practical)},
+    ) for f in (problem, bound, practical)},
     "a bare noise": (lambda: read_measurements("poses.csv", ROBOT, noise=1e-3), "noise: found 0.001, expected a Noise, "
                      "such as Noise(position=1e-3)"),
     "a bare unit": (lambda: read_measurements("poses.csv", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
