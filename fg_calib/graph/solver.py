@@ -387,7 +387,8 @@ class _Descent:
         at, cost = problem.variables.at(problem.start), np.inf
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                self.here = _Point(problem, problem.start)
+                start = problem.variables.values(problem.start)  # what is held is at nominal, wherever the start has it
+                self.here = _Point(problem, problem.variables.parameters(start))
                 cost = self.here.cost
             except SolverError:
                 cost = sum(rows.squared_norm(at) for rows in problem.rows)

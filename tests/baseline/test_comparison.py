@@ -113,7 +113,6 @@ def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
     assert weighted.predicted_rms == pytest.approx(np.sqrt(total / len(readings)), rel=1e-6)
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize("prefer", [(), ("theta4", "d4")])
 def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
     """What is held of an unknown tool stays at nominal, not where the closed form would start it."""
