@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from oracle import central_differences, tool_pose
-from reported import format_report, result_document
+from reported import result_document
 from scipy.optimize import least_squares, minimize
 from scipy.stats import chi2
 from simulated import small_arm, true_robot
