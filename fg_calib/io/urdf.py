@@ -37,6 +37,9 @@ ROUNDING = 1e-13
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.ASCII | re.IGNORECASE)
 
+_CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
+"""Elements of a joint."""
+
 _NO_ENTITIES = "a URDF without entities: they are not expanded"
 
 
@@ -117,14 +120,25 @@ def read_urdf(
 _XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
 
 
+def _check_children(joint: _UrdfJoint, place: str) -> None:
+    """Raise for a misspelt or doubled element, which a default or the first one would take the place of."""
+    tags = [child.tag for child in joint.element if isinstance(child.tag, str)]
+    for tag in tags:
+        if tag in _CHILDREN and tags.count(tag) > 1:
+            raise InputError(place, f"two elements <{tag}>", "one")
+        if tag not in _CHILDREN and (hint := did_you_mean(tag, _CHILDREN)):
+            raise InputError(place, f"element <{tag}>", hint=hint)
+
+
 def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:
     """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
     n_joints = 0
     for joint, backwards in chain:
+        here = f"{place}: joint {joint.name!r}"
+        _check_children(joint, here)
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
-        here = f"{place}: joint {joint.name!r}"
         builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
         n_joints += 1
     return n_joints
