@@ -136,7 +136,7 @@ def _read_only(value: object) -> object:
 
 
 def as_floats(name: str, given: object, shape: str, *, missing: bool = False) -> Floats:
-    """Numbers from outside as an array, a copy wherever somebody else could change it.
+    """Numbers from outside as an array, a copy wherever the caller could change it.
 
     Args:
         name: What they are, for messages.

@@ -500,7 +500,7 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     W = np.empty(covariance.shape)
     C, mask = (np.require(given, requirements=["C", "W"]) for given in (covariance, used))  # as the kernel takes them
     if not all(over_spans(lambda start, stop: whiten_small(C, mask, start, stop, W), len(used))):
-        found = "lost in rounding beside what errors of the joint readings do"
+        found = "lost in rounding next to what errors of the joint readings do"
         hint = "is noise.joint or a length of the arm or of a table far too large, or other noise far too small?"
         raise InputError("noise", found, "figures nearer to each other", hint)
     return W

@@ -223,7 +223,7 @@ class Problem(FrozenArrays):
 
     @property
     def n_added(self) -> int:
-        """Scalar rows of the factors that somebody added."""
+        """Scalar rows of added factors."""
         return sum(factor.dim() for factor in self.added)
 
     @cached_property

@@ -557,7 +557,7 @@ def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
 
 @contextmanager
 def _in_one_line(variables: Variables) -> Iterator[None]:
-    """What GTSAM, LAPACK or a factor that somebody added raises in the block becomes a `SolverError`."""
+    """What GTSAM, LAPACK or an added factor raises in the block becomes a `SolverError`."""
     try:
         yield
     except CalibrationError:

@@ -9,7 +9,7 @@
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
 | `N(i)` | an unknown of a kind of measurement of one's own, a vector |
 
-The last two, and variables that somebody adds to the graph, are *nuisance* variables: they are estimated too, but not
+The last two, and variables that a user adds to the graph, are *nuisance* variables: they are estimated too, but not
 what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
 before anything is said of the core.
 
@@ -49,7 +49,7 @@ class Variable:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
         kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
-            as a touched point, or somebody's own: of any of GTSAM's types, its parameters are tangent coordinates at
+            as a touched point, or a user's: of any of GTSAM's types, its parameters are tangent coordinates at
             its start.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
@@ -105,7 +105,7 @@ class Variables(Brief):
         nuisance: The nuisance variables; their columns follow those of the core.
         coordinates: Of the measurements' unknown coordinates, where each stands in the parameter vector; -1 for those
             that are not estimated.
-        own: Start of the variables that somebody added.
+        own: Start of added variables.
     """
 
     robot: Robot
@@ -304,11 +304,11 @@ class Variables(Brief):
         return State(chains, values, columns, self.n_columns, self.n_nuisance)
 
     def without_own(self) -> Variables:
-        """The same without somebody's own variables."""
+        """The variables without added ones."""
         return replace(self, nuisance=tuple(v for v in self.nuisance if v.kind != "own"), own=gtsam.Values())
 
     def with_own(self, start: gtsam.Values) -> Variables:
-        """The same with somebody's own variables, of any type, by their start."""
+        """The variables with added ones, of any type, by their start."""
         variables = self
         for key in list(start.keys()):
             n, place, symbol = only_key(start, key).dim(), variables.nuisance_span.stop, str(gtsam.Symbol(key)).strip()

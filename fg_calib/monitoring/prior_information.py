@@ -32,7 +32,7 @@ def knowledge_of(solution: Solution) -> Knowledge | None:
     the posterior that is saved.
 
     Returns:
-        None where the arm was evaluated only, or somebody's own factors take part.
+        None where the arm was evaluated only, or added factors take part.
     """
     problem = solution.problem
     if problem.evaluated or problem.added or not problem.variables.n_robot_columns:
