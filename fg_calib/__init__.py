@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from fg_calib.batch import calibrate_jobs
     from fg_calib.calibration import Calibration, calibrate, calibrate_job
     from fg_calib.designs.design import Design, design
-    from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.exports.export import export
     from fg_calib.graph.build import build_problem
     from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
     from fg_calib.graph.problem import Problem
     from fg_calib.graph.solver import Solution, SolverOptions, solve
+    from fg_calib.inputs import CalibrationError, InputError, ProblemError, SolverError
     from fg_calib.io.job import read_job
     from fg_calib.io.result import Result
     from fg_calib.io.robot_file import read_robot
@@ -51,7 +51,7 @@ _import, __dir__, _ = lazy_loader.attach(
         "batch": ["calibrate_jobs"],
         "calibration": ["Calibration", "calibrate", "calibrate_job"],
         "designs.design": ["Design", "design"],
-        "errors": ["CalibrationError", "InputError", "ProblemError", "SolverError"],
+        "inputs.errors": ["CalibrationError", "InputError", "ProblemError", "SolverError"],
         "exports.export": ["export"],
         "graph.build": ["build_problem"],
         "graph.factors": ["DistanceFactor", "RotationAngleFactor"],

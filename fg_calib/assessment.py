@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, FrozenArrays, as_figures
 from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.errors import InputError, SolverError, escaped
 from fg_calib.graph import Problem, Solution, check_graph, problem_of, solve
+from fg_calib.inputs import Floats, FrozenArrays, InputError, SolverError, as_figures, checked, escaped
 from fg_calib.job import Job
 from fg_calib.monitoring import at_nominal
 from fg_calib.observability import Identifiability, Observability, identifiability_of

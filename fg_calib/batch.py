@@ -17,9 +17,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from fg_calib.arguments import checked
 from fg_calib.calibration import Calibration, calibrate_job
-from fg_calib.errors import InputError, escaped, shown
+from fg_calib.inputs import InputError, checked, escaped, shown
 from fg_calib.io import fill_folder, read_job, require_no_input, require_writable, write_text
 from fg_calib.job import Job
 from fg_calib.parallel import Failure, map_jobs

@@ -22,11 +22,21 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, as_floats, shape_of
 from fg_calib.assessment import Assessment, assess, solve_job
-from fg_calib.errors import InputError, SolverError, shown
 from fg_calib.graph import SIZE, Knowledge, Solution, build_variables, frame_of, tables_of
+from fg_calib.inputs import (
+    Floats,
+    InputError,
+    SolverError,
+    as_floats,
+    check,
+    check_flag,
+    check_names,
+    checked,
+    listed,
+    shape_of,
+    shown,
+)
 from fg_calib.io import (
     RESULT_FILES,
     UNSTATED,
@@ -51,7 +61,7 @@ from fg_calib.io import Knowledge as SavedKnowledge
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
-from fg_calib.options import Options, check, check_flag, check_names, listed
+from fg_calib.options import Options
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import predict_poses
 from fg_calib.report import (

@@ -1,16 +1,22 @@
-"""Every choice of a calibration, and the checks of it; light enough for the command line's help."""
+"""Every choice of a calibration; light enough for the command line's help."""
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
-from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY, as_hinted
-from fg_calib.errors import InputError, shown
+from fg_calib.inputs import (
+    InputError,
+    as_hinted,
+    check,
+    check_flag,
+    check_names,
+    check_number,
+    listed,
+    set_checked,
+    shown,
+)
 
 MODELS: dict[str, str] = {
     "pose": "pose",
@@ -54,148 +60,6 @@ SharedScale = Literal["kind", "joint"]
 
 LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
-
-
-def check(key: str, value: object, possible: Any) -> Any:
-    """The option that was given, one of those possible.
-
-    Args:
-        key: Its name, for the message.
-        value: What was given.
-        possible: A `Literal`, or the values themselves.
-
-    Raises:
-        InputError: It is none of them.
-    """
-    options = get_args(possible) or tuple(possible)
-    for option in options:
-        if value is option or (isinstance(value, type(option)) and value == option):  # numpy's text is text too
-            return option
-    words = ", ".join(map(str, options))
-    raise InputError(key, f"found {shown(value)}", f"one of {words}", did_you_mean(value, options))
-
-
-def set_checked(of: object, place: str = "", **possible: Any) -> None:
-    """Check choices among the fields of a frozen dataclass, and set each to the option that it is.
-
-    Args:
-        of: The object.
-        place: What stands before a field's name in messages.
-        possible: A `Literal` for each field.
-
-    Raises:
-        InputError: One is none of those possible.
-    """
-    for key, options in possible.items():
-        object.__setattr__(of, key, check(f"{place}{key}", getattr(of, key), options))
-
-
-def check_flag(key: str, value: object) -> None:
-    """Check that a switch is True or False, and no word that happens to count as True.
-
-    Raises:
-        InputError: It is neither.
-    """
-    if type(value).__name__ not in ("bool", "bool_"):  # Python's and numpy's
-        raise InputError(key, f"found {shown(value)}", "True or False")
-
-
-def check_number(
-    key: str,
-    value: object,
-    *,
-    least: float = 0.0,
-    above: bool = False,
-    whole: bool = False,
-    finite: bool = True,
-    most: int | None = None,
-) -> None:
-    """Check that an option is a number of the right kind and size.
-
-    Args:
-        key: Its name, for the message.
-        value: What was given.
-        least: The smallest number possible.
-        above: Whether it must be above that.
-        whole: Whether it must be a whole number.
-        finite: Whether it must be finite.
-        most: The largest number possible.
-
-    Raises:
-        InputError: It is no number, nan, or not of this kind and size.
-    """
-    good = isinstance(value, Real) and not isinstance(value, bool)
-    if good:
-        try:
-            x = float(value)  # type: ignore[arg-type]
-        except OverflowError:  # a whole number beyond any float
-            x = math.inf
-        good = (x > least if above else x >= least) and (math.isfinite(x) or not finite)
-        good = good and not (whole and not isinstance(value, Integral))
-        if good and math.isfinite(x) and (x > MOST_SIZE or (above and x < LEAST_SIZE)):
-            raise InputError(key, f"found {shown(value)}", ORDINARY)
-        if good and most is not None and x > most:
-            raise InputError(key, f"found {shown(value)}", f"at most {most}")
-    if not good:
-        kind = "a whole number" if whole else "a finite number" if finite else "a number"
-        raise InputError(key, f"found {shown(value)}", f"{kind} {'above' if above else 'not below'} {least:g}")
-
-
-def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str = "parameter") -> None:
-    """Check that a list holds known names only.
-
-    Args:
-        key: The list's name, for the message.
-        names: The names given.
-        known: Those possible.
-        what: What they are names of.
-
-    Raises:
-        InputError: It is one word instead of a list, or a name is not known.
-    """
-    if isinstance(names, str) or not isinstance(names, Iterable) or not getattr(names, "ndim", 1):
-        raise InputError(key, f"found {shown(names)}", "a list of names")
-    for name in names:
-        if not isinstance(name, str) or name not in known:
-            raise InputError(key, f"unknown {what} {shown(name)}", known_names(known), did_you_mean(name, known, NEAR))
-
-
-NEAR = 0.87
-"""Likeness of names (see `difflib`) that is a slip of the pen: tool.w is as like tool.x as it is like tool.z."""
-
-
-def did_you_mean(value: object, options: Iterable[object], likeness: float = 0.6) -> str:
-    """`did you mean shared?` where an option reads nearly like what was given, whatever its case; else nothing.
-
-    The first letter must be the same: whoever writes grad does not mean rad.
-    """
-    if not isinstance(value, str) or not value:
-        return ""
-    given = value.lower()
-    words = {option.lower(): option for option in options if isinstance(option, str)}
-    close = difflib.get_close_matches(given, [w for w in words if w[:1] == given[0]], 1, likeness)
-    return f"did you mean {words[close[0]]}?" if close else ""
-
-
-def listed(key: str, names: Iterable[Any], expected: str = "a list of names") -> tuple[Any, ...]:
-    """Names as a tuple: what can be gone through only once would be empty the second time.
-
-    Raises:
-        InputError: They are nothing to go through.
-    """
-    if isinstance(names, str):
-        return (names,)
-    try:
-        return tuple(names)
-    except TypeError:
-        raise InputError(key, f"found {shown(names)}", expected) from None
-
-
-def known_names(names: Iterable[str], limit: int = 12) -> str:
-    """`one of a, b, c` for an error message, cut after `limit` names."""
-    listed = list(names)
-    shown = ", ".join(listed[:limit])
-    return f"one of {shown}{', ...' if len(listed) > limit else ''}"
 
 
 @dataclass(frozen=True)

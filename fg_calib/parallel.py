@@ -23,9 +23,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from fg_calib.arguments import checked
-from fg_calib.errors import CalibrationError, InputError, printable, shown
-from fg_calib.options import check_number
+from fg_calib.inputs import CalibrationError, InputError, check_number, checked, printable, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")

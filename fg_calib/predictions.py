@@ -13,13 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, as_floats
 from fg_calib.calibration import Calibration
-from fg_calib.errors import InputError
+from fg_calib.inputs import Floats, InputError, as_floats, check_number, checked
 from fg_calib.io import Units, fill_folder, require_own, require_writable, write_text
 from fg_calib.measurements import check_readings
-from fg_calib.options import check_number
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import Correction, PredictedErrors, ToolPoseUncertainty, correct_targets, predict_errors
 from fg_calib.report import error_slices, prediction_document, write_charts, write_prediction_table

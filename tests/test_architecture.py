@@ -16,11 +16,9 @@ import fg_calib
 
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
-    "errors",
-    "arguments",
+    "inputs",
     "options",
     "parallel",
-    "arrays",
     "robot",
     "initialization",
     "measurements",
@@ -136,7 +134,7 @@ def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
         used |= more
     others = {other for name in used for other in imported(parse(PACKAGE / f"{name}.py"))} - used
     of_folders = {other.partition("/")[0] for other in others}
-    assert of_folders == {"errors", "arguments", "arrays", "options", "robot", "measurements", "parallel"}
+    assert of_folders == {"inputs", "robot", "measurements", "parallel"}
 
 
 @EVERY_MODULE

@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from fg_calib import InputError, Options, Robot
-from fg_calib.arguments import as_hinted, checked
+from fg_calib.inputs import as_hinted, checked
 from fg_calib.robot import solve_inverse
 
 

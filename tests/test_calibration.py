@@ -23,8 +23,8 @@ from fg_calib import (
     read_job,
     solve,
 )
-from fg_calib.arrays import FrozenArrays
 from fg_calib.diagnostics.multistart import multistart
+from fg_calib.inputs import FrozenArrays
 from fg_calib.robot import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 2e-3}

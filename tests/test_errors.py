@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from fg_calib.cli import output
-from fg_calib.errors import InputError, printable
+from fg_calib.inputs import InputError, printable
 
 ENEMY = "\x1b]0;title\x07 \u202eexe\n\ttab \ud800 \u2028 [/red]ü"
 

@@ -29,12 +29,10 @@ from typing import Literal
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, Floats
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
-from fg_calib.errors import CalibrationError, ProblemError
 from fg_calib.graph import Problem, Solution, corrections_of, problem_of
+from fg_calib.inputs import Brief, CalibrationError, Floats, ProblemError, checked
 from fg_calib.job import Job
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import PoseRms, errors_at, judged_configurations, pose_rms

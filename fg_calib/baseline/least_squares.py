@@ -33,11 +33,8 @@ from typing import Literal
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Booleans, Brief, Floats, Integers
-from fg_calib.errors import InputError
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check, check_names, check_number, checked
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
-from fg_calib.options import check, check_names, check_number
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import (
     AXIS_OF_KIND,

@@ -80,7 +80,7 @@ def design(
 
 def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
     """What is to be designed, the units of its tables, and the arm."""
-    from fg_calib.errors import InputError
+    from fg_calib.inputs import InputError
     from fg_calib.io import Units, is_job, read_job, units_of
     from fg_calib.simulation import read_scenario
 

@@ -32,7 +32,7 @@ from fg_calib.cli.predict import predict
 from fg_calib.cli.report import report
 from fg_calib.cli.simulate import simulate
 from fg_calib.cli.update import update
-from fg_calib.errors import CalibrationError, printable
+from fg_calib.inputs import CalibrationError, printable
 
 app = typer.Typer(
     name="fg-calib",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from fg_calib.cli import EXAMPLES
 from fg_calib.cli.output import argument, option, say_next
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 
 
 def example(

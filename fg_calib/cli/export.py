@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, say, show, show_json
-from fg_calib.errors import escaped
+from fg_calib.inputs import escaped
 
 Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
 At = Annotated[

@@ -19,7 +19,8 @@ from fg_calib.cli.output import (
     say,
     show_result,
 )
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model, check_number
+from fg_calib.inputs import check_number
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model
 
 Sigma = Annotated[
     float | None, option("--position-noise", "SIGMA", "1 sigma of a position in TABLE; 1 mm if not given.")

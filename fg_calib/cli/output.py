@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fg_calib.errors import printable
+from fg_calib.inputs import printable
 from fg_calib.options import AngleUnit, LengthUnit
 
 if TYPE_CHECKING:

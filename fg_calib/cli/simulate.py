@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from fg_calib.cli.output import Json, Seed, argument, option, say_next, show, show_json
-from fg_calib.errors import printable
+from fg_calib.inputs import printable
 
 
 def simulate(

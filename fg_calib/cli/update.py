@@ -35,7 +35,7 @@ def update(
 ) -> None:
     """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
     from fg_calib.calibration import Calibration
-    from fg_calib.errors import InputError
+    from fg_calib.inputs import InputError
     from fg_calib.io import require_no_input, require_writable
 
     if out.resolve() == (result.parent if result.is_file() else result).resolve():
@@ -62,7 +62,7 @@ def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
     Raises:
         InputError: One is not `NAME=FIGURE` with a unit.
     """
-    from fg_calib.errors import InputError
+    from fg_calib.inputs import InputError
     from fg_calib.io import quantity
     from fg_calib.robot import tolerance_kind
 

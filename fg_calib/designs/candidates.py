@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief, Floats, Integers
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
-from fg_calib.errors import InputError
 from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
+from fg_calib.inputs import Brief, Floats, InputError, Integers
 from fg_calib.measurements import KnownPoint, Landmarks, Noise, Table
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot import Robot

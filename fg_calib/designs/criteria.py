@@ -44,8 +44,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Floats, Integers
 from fg_calib.designs.information import System
+from fg_calib.inputs import Floats, Integers
 from fg_calib.robot import over_processors
 
 Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]

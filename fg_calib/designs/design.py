@@ -17,18 +17,27 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, FrozenArrays, Integers, as_floats
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_for_more_rows, pool_of_rows, solve_for_design
 from fg_calib.designs.information import N_TASK, Posterior, Task, build_system, needs_fit
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
-from fg_calib.errors import InputError, ProblemError
+from fg_calib.inputs import (
+    Floats,
+    FrozenArrays,
+    InputError,
+    Integers,
+    ProblemError,
+    as_floats,
+    check,
+    check_flag,
+    check_number,
+    checked,
+)
 from fg_calib.job import Job
 from fg_calib.measurements import Table
 from fg_calib.observability import Observability
-from fg_calib.options import Pairing, check, check_flag, check_number
+from fg_calib.options import Pairing
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import PoseRms
 from fg_calib.robot import Robot, random_readings

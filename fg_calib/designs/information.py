@@ -20,9 +20,8 @@ from functools import cached_property
 
 import numpy as np
 
-from fg_calib.arrays import Brief, Floats, FrozenArrays, Integers
-from fg_calib.errors import InputError
 from fg_calib.graph import SIGNAL_FLOOR, Problem, WhitenedBlock, eliminate, prior_rows, unknown_prior_rows
+from fg_calib.inputs import Brief, Floats, FrozenArrays, InputError, Integers
 from fg_calib.observability import Observability, ObservedQuantities, observability_of_rows
 from fg_calib.prediction import PoseRms, errors_at
 from fg_calib.robot import forward, without_rigid_motion

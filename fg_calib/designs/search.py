@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.designs.criteria import Criterion, Measure
 from fg_calib.designs.information import System
+from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.robot import Robot
 
 MAX_SWEEPS = 10

@@ -14,14 +14,13 @@ from itertools import chain
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Brief
 from fg_calib.diagnostics.linearity import find_ambiguous_rows
 from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements
 from fg_calib.diagnostics.setup_check import SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
 from fg_calib.diagnostics.verdict import Statement, listed
 from fg_calib.graph import Problem, Solution, linear_system, problem_of, tables_of, unsolved
+from fg_calib.inputs import Brief, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
 from fg_calib.observability import NOT_EXCITED, Identifiability, identifiability_of

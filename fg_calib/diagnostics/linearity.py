@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import SolverError
 from fg_calib.graph import Problem, Solution, at_parameters, linear_system, noises_at, subsampled
+from fg_calib.inputs import Floats, SolverError
 from fg_calib.robot import forward
 from fg_calib.statistics import Spread
 

@@ -17,9 +17,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats
-from fg_calib.errors import CalibrationError
 from fg_calib.graph import (
     SIGNAL_FLOOR,
     Problem,
@@ -30,6 +27,7 @@ from fg_calib.graph import (
     solve,
     with_factors,
 )
+from fg_calib.inputs import CalibrationError, Floats, checked
 from fg_calib.measurements import Kind
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import forward

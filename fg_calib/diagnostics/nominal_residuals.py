@@ -21,8 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph import (
     Problem,
     RowNoise,
@@ -33,6 +31,7 @@ from fg_calib.graph import (
     reduced_graph,
     tables_of,
 )
+from fg_calib.inputs import Floats, InputError, ProblemError, SolverError
 from fg_calib.measurements import INSTRUMENTS, Measurements, Table, residuals
 from fg_calib.measurements.kinds import Instrument
 from fg_calib.options import Options, Pairing

@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.arrays import Floats
 from fg_calib.diagnostics.nominal_residuals import evenly, fit_landmarks, nominal_problem, with_arm_errors
-from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph import Problem, RowNoise, relinearized_at, whitening_of
+from fg_calib.inputs import Floats, InputError, ProblemError, SolverError
 from fg_calib.measurements import INSTRUMENTS, Table
 from fg_calib.options import Options
 from fg_calib.parallel import one_blas_thread

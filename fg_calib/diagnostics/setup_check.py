@@ -18,11 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, Floats
 from fg_calib.diagnostics.nominal_residuals import Setup, TypicalResidual, nominal_residuals, residuals_at, setup_of
 from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypotheses, still_joints
 from fg_calib.graph import Problem
+from fg_calib.inputs import Brief, Floats, checked
 from fg_calib.measurements import Measurements, Table
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.parallel import one_blas_thread

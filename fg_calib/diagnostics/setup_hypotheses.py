@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Booleans, Floats
 from fg_calib.diagnostics.nominal_residuals import Setup, nominal_residuals
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.robot import CONVENTIONS
 
 MAX_REACH, MIN_REACH = 50.0, 0.02

@@ -34,8 +34,8 @@ import numpy as np
 import scipy.linalg
 from scipy import special
 
-from fg_calib.arrays import Floats
 from fg_calib.graph import Problem, Solution, State, at_parameters, build_variables, prior_rows, unknown_prior_rows
+from fg_calib.inputs import Floats
 from fg_calib.measurements import LANDMARKS, Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
 from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Chain, Element, Parameter, Robot, pose

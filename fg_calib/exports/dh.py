@@ -58,8 +58,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError, shown
+from fg_calib.inputs import Floats, InputError, shown
 from fg_calib.robot import (
     AXIS_OF_KIND,
     CONVENTIONS,

@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib import __version__
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, as_floats
 from fg_calib.calibration import Calibration
-from fg_calib.errors import InputError, printable, shown
 from fg_calib.exports.dh import (
     N_FITTED,
     N_JUDGED,
@@ -29,8 +26,8 @@ from fg_calib.exports.dh import (
 )
 from fg_calib.exports.ros import UrBase, dumped, hash_of, tesseract_text, ur_base_of, ur_kinematics, ur_text
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, calibrated_urdf, new_urdf
+from fg_calib.inputs import Floats, InputError, as_floats, check, check_flag, checked, printable, shown
 from fg_calib.io import Units, encoding_of, replacing, require_absent, robot_text
-from fg_calib.options import check, check_flag
 from fg_calib.robot import CONVENTIONS, Robot, frame_values
 
 ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]

@@ -29,10 +29,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError
 from fg_calib.exports.dh import in_table, row_transform, transform
 from fg_calib.exports.urdf import frame_matrix, urdf_joints
+from fg_calib.inputs import Floats, InputError
 from fg_calib.robot import FRAME_KINDS, Robot, frame_values
 
 UrBase = Literal["base", "base_link"]

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError
 from fg_calib.exports.dh import Links, inverse, links_of, rigid, transform
+from fg_calib.inputs import Floats, InputError
 from fg_calib.io import ROUNDING, urdf_text
 from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
 

@@ -9,9 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats
-from fg_calib.errors import ProblemError
 from fg_calib.graph.knowledge import coordinates_of
 from fg_calib.graph.normal_system import determined, identifiable_subset
 from fg_calib.graph.problem import (
@@ -24,6 +21,7 @@ from fg_calib.graph.problem import (
     variables_of,
 )
 from fg_calib.graph.variables import Variables, preference, prior_rows
+from fg_calib.inputs import Floats, ProblemError, check_names, checked
 from fg_calib.job import Job
 from fg_calib.measurements import (
     INSTRUMENTS,
@@ -36,16 +34,7 @@ from fg_calib.measurements import (
     warn_of_copies,
 )
 from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
-from fg_calib.options import (
-    FrameKnowledge,
-    Gauge,
-    Model,
-    Options,
-    PairErrors,
-    Pairing,
-    as_pairing,
-    check_names,
-)
+from fg_calib.options import FrameKnowledge, Gauge, Model, Options, PairErrors, Pairing, as_pairing
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, forward, names_of, random_readings
 

@@ -25,9 +25,8 @@ import scipy.sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
-from fg_calib.arrays import Booleans, Brief, Floats, Integers
-from fg_calib.errors import SolverError
 from fg_calib.graph.noise_models import NoiseSource, RowNoise, whitening_of
+from fg_calib.inputs import Booleans, Brief, Floats, Integers, SolverError
 from fg_calib.measurements import Block, pack, residuals, unpack
 from fg_calib.robot import SPAN, Chain, over_spans
 

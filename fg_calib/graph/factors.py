@@ -20,13 +20,21 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike
 
-from fg_calib.arrays import Floats, Integers, as_floats
-from fg_calib.errors import CalibrationError, InputError, ProblemError, SolverError, shown
 from fg_calib.graph.error_states import State, WhitenedBlock, WhitenedSeries
 from fg_calib.graph.variables import Variable, Variables, prior_rows
+from fg_calib.inputs import (
+    CalibrationError,
+    Floats,
+    InputError,
+    Integers,
+    ProblemError,
+    SolverError,
+    as_floats,
+    check_number,
+    shown,
+)
 from fg_calib.measurements import Block, Distance, RotationAngle, unpack
 from fg_calib.measurements.kinds import Kind
-from fg_calib.options import check_number
 
 Sparse = scipy.sparse.csr_array
 Linearise = Callable[[gtsam.Values], tuple[Floats, Floats]]

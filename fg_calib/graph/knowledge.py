@@ -21,10 +21,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph.factors import CheckedFactor
 from fg_calib.graph.normal_system import determined, eliminate
 from fg_calib.graph.variables import Variables, build_variables, pose_of
+from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.measurements import LANDMARKS, Landmarks
 from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot import Robot

@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats, Integers
-from fg_calib.errors import InputError
+from fg_calib.inputs import Booleans, Floats, InputError, Integers
 from fg_calib.measurements import (
     Block,
     MeasurementBlock,

@@ -26,8 +26,8 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 
-from fg_calib.arrays import Booleans, Brief, Floats, Integers
 from fg_calib.graph.error_states import SchurComplement
+from fg_calib.inputs import Booleans, Brief, Floats, Integers
 
 Sparse = scipy.sparse.csr_array
 

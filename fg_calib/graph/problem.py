@@ -15,8 +15,6 @@ import gtsam
 import numpy as np
 import scipy.sparse
 
-from fg_calib.arrays import Booleans, Floats, FrozenArrays, Integers
-from fg_calib.errors import ProblemError, SolverError, shown
 from fg_calib.graph.error_states import (
     ErrorStates,
     SchurComplement,
@@ -40,6 +38,7 @@ from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSyste
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, Integers, ProblemError, SolverError, shown
 from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, by_station, start_frames
 from fg_calib.options import Options
 from fg_calib.robot import Chain, Parameter, Robot, forward

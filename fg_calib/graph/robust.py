@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 from fg_calib.options import Loss
 
 EFFICIENCY = 0.95

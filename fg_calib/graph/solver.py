@@ -26,9 +26,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, FrozenArrays
-from fg_calib.errors import CalibrationError, SolverError
 from fg_calib.graph.factors import measurement_factors
 from fg_calib.graph.noise_models import NoiseState, RowNoise
 from fg_calib.graph.problem import (
@@ -46,7 +43,8 @@ from fg_calib.graph.problem import (
 )
 from fg_calib.graph.robust import Weighting, constants, cost
 from fg_calib.graph.variables import Variables
-from fg_calib.options import Options, check_number
+from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, SolverError, check_number, checked
+from fg_calib.options import Options
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 

@@ -32,8 +32,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Brief, Floats
 from fg_calib.graph.error_states import State
+from fg_calib.inputs import Brief, Floats
 from fg_calib.measurements import Landmarks
 from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Parameter, Robot, build_chain, names_of, yaw_pitch_roll
 

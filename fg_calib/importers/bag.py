@@ -18,10 +18,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE, Floats
-from fg_calib.errors import CalibrationError, InputError
 from fg_calib.importers.recording import JointStream, PoseStream, Source
+from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, InputError, checked
 from fg_calib.robot import Robot
 
 JOINT_TYPE = "sensor_msgs/msg/JointState"

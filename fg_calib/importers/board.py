@@ -18,8 +18,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field, StrictBool
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError
 from fg_calib.importers.opencv import (
     CalibrationBoard,
     charuco_board,
@@ -28,8 +26,8 @@ from fg_calib.importers.opencv import (
     find_corners,
 )
 from fg_calib.importers.views import Corners
+from fg_calib.inputs import Floats, InputError, did_you_mean
 from fg_calib.io import Count, Positive, Schema, Units, UnitsOfFile, read_bytes, read_yaml, shown, validate
-from fg_calib.options import did_you_mean
 from fg_calib.parallel import tell
 
 MAX_COUNT = 1000

@@ -12,8 +12,8 @@ import numpy as np
 import yaml
 
 from fg_calib import __version__
-from fg_calib.errors import InputError
 from fg_calib.importers.views import INTRINSICS, BoardFit, View
+from fg_calib.inputs import InputError
 from fg_calib.io import KNOWN, Table, Units, fill_folder, require_own, write_csv, write_text
 from fg_calib.measurements import COVARIANCE
 

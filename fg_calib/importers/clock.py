@@ -18,9 +18,8 @@ import numpy as np
 from scipy.signal import correlate, correlation_lags, find_peaks
 from scipy.special import ndtr, stdtrit
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError
 from fg_calib.importers.recording import PoseStream, period
+from fg_calib.inputs import Floats, InputError
 
 MIN_CORRELATION = 0.7
 """Below it the poses are not those of the arm's tool."""

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
-from fg_calib.arrays import Floats, Integers
-from fg_calib.errors import InputError
+from fg_calib.inputs import Floats, InputError, Integers
 from fg_calib.measurements.kinds import Camera
 
 Image = NDArray[np.uint8]

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import toeplitz
 from scipy.optimize import brute
 
-from fg_calib.arrays import Floats, FrozenArrays
+from fg_calib.inputs import Floats, FrozenArrays
 from fg_calib.robot import Robot, build_chain, forward
 
 MIN_SIGMA = 1e-6

@@ -19,9 +19,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, FrozenArrays
-from fg_calib.errors import InputError
 from fg_calib.importers.clock import ClockOffset, estimate_offset
 from fg_calib.importers.recording import (
     MIN_SIGMA,
@@ -32,8 +29,8 @@ from fg_calib.importers.recording import (
     period,
     sigmas_of_means,
 )
+from fg_calib.inputs import Floats, FrozenArrays, InputError, check_number, checked
 from fg_calib.io import joint_columns, require_own_csv, write_csv
-from fg_calib.options import check_number
 from fg_calib.robot import Robot
 
 MIN_SAMPLES = 8

@@ -15,9 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats, Integers
-from fg_calib.errors import InputError
 from fg_calib.importers.opencv import CalibrationBoard, both_poses, camera_derivatives, first_camera
+from fg_calib.inputs import Floats, InputError, Integers
 from fg_calib.measurements import Frames, RoomPixel
 from fg_calib.measurements.kinds import Camera
 

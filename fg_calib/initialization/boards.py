@@ -16,9 +16,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Booleans, Floats
 from fg_calib.initialization.camera import Camera
 from fg_calib.initialization.hand_eye import Frame
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.robot import left_jacobian
 
 LEAST_CORNERS = 4

@@ -6,8 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from fg_calib.arrays import Floats, as_floats
-from fg_calib.errors import InputError
+from fg_calib.inputs import Floats, InputError, as_floats
 
 MOST_PIXELS = 1e6
 """No camera has more, nor a focal length of more, nor a larger coefficient of distortion."""

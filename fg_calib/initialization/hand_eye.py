@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.robot import nearest_rotation, rotation_angle
 
 LEAST_TURN = 1e-6

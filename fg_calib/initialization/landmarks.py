@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers
 from fg_calib.initialization.hand_eye import Frame, align_points
+from fg_calib.inputs import Floats, Integers
 from fg_calib.robot import nearest_rotation
 
 

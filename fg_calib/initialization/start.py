@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.initialization import hand_eye
 from fg_calib.initialization.hand_eye import Frame, Unknown
+from fg_calib.inputs import Booleans, Floats, Integers
 
 WORLD = Frame(np.eye(3), np.zeros(3))
 

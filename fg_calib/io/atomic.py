@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 
 _noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
 

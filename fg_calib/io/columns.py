@@ -16,14 +16,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
-from fg_calib.arrays import NOTHING, Booleans, Floats, Integers, as_figures, as_frame, check_different
-from fg_calib.errors import InputError
+from fg_calib.inputs import (
+    LEAST_SIZE,
+    MOST_SIZE,
+    NOTHING,
+    ORDINARY,
+    Booleans,
+    Floats,
+    InputError,
+    Integers,
+    as_figures,
+    as_frame,
+    check_different,
+    check_names,
+    did_you_mean,
+)
 from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
 from fg_calib.io.yaml import number_hint, shown
 from fg_calib.measurements import INSTRUMENTS
 from fg_calib.measurements.kinds import Column as ColumnSet
-from fg_calib.options import Model, check_names, did_you_mean
+from fg_calib.options import Model
 from fg_calib.parallel import require_polars
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool, create_model
 
-from fg_calib.arguments import checked
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError, check_names, checked, did_you_mean
 from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.columns import Column
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
@@ -47,8 +46,6 @@ from fg_calib.options import (
     PairErrors,
     Pairing,
     SharedScale,
-    check_names,
-    did_you_mean,
 )
 from fg_calib.robot import Robot, names_of
 

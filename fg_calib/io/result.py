@@ -28,12 +28,10 @@ from pydantic import (
 )
 
 from fg_calib import __version__
-from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE, Figure, Floats
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import SetupCheck
-from fg_calib.errors import InputError
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale
+from fg_calib.inputs import NORM_TOLERANCE, Figure, Floats, InputError, checked
 from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
 from fg_calib.measurements import Table

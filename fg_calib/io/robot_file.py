@@ -23,8 +23,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import Field
 
-from fg_calib.arguments import checked
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError, checked
 from fg_calib.io.atomic import write_text
 from fg_calib.io.units import Units, UnitsOfFile
 from fg_calib.io.urdf import read_urdf

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from fg_calib.assessment import Assessment
-from fg_calib.errors import InputError
 from fg_calib.graph import Solution
+from fg_calib.inputs import InputError
 from fg_calib.io.atomic import digest_of, exists, fill_folder, read_bytes, require_own, write_text
 from fg_calib.io.result import Result
 from fg_calib.io.robot_file import read_robot, write_robot

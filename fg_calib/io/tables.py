@@ -15,9 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import NORM_TOLERANCE, Booleans, Floats, FrozenArrays, Integers, once
-from fg_calib.errors import InputError
+from fg_calib.inputs import (
+    NORM_TOLERANCE,
+    Booleans,
+    Floats,
+    FrozenArrays,
+    InputError,
+    Integers,
+    check_number,
+    checked,
+    once,
+)
 from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of
 from fg_calib.io.units import Units
 from fg_calib.io.yaml import shown
@@ -35,7 +43,7 @@ from fg_calib.measurements import (
     outside_limits,
 )
 from fg_calib.measurements.kinds import Instrument
-from fg_calib.options import Model, check_number
+from fg_calib.options import Model
 from fg_calib.robot import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it

@@ -17,11 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY, checked
-from fg_calib.errors import InputError
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, ORDINARY, InputError, checked, did_you_mean, known_names
 from fg_calib.io.atomic import decoded, read_bytes, replacing
 from fg_calib.io.yaml import shown, shown_word
-from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it

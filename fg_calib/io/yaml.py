@@ -12,11 +12,9 @@ import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from fg_calib import errors
-from fg_calib.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
-from fg_calib.errors import InputError
+from fg_calib import inputs
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, ORDINARY, InputError, did_you_mean
 from fg_calib.io.atomic import read_text
-from fg_calib.options import did_you_mean
 
 
 def _refuse_bool(value: object) -> object:
@@ -206,7 +204,7 @@ _EXPECTED = {
 
 def shown(value: object) -> str:
     """A found value for a message: its repr, cut to 60 characters."""
-    return "nothing" if value is None else errors.shown(value)
+    return "nothing" if value is None else inputs.shown(value)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Brief, Floats, Integers
-from fg_calib.errors import InputError, ProblemError
 from fg_calib.initialization import Frame, FrameStart
+from fg_calib.inputs import NEAR, Booleans, Brief, Floats, InputError, Integers, ProblemError, did_you_mean
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Kind, is_ours
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
@@ -20,7 +19,6 @@ from fg_calib.measurements.kinds.contact import POINT
 from fg_calib.measurements.kinds.custom import custom_block
 from fg_calib.measurements.landmarks import Landmarks
 from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.options import NEAR, did_you_mean
 from fg_calib.robot import Robot, build_chain, forward
 
 _log = logging.getLogger(__name__)

@@ -12,23 +12,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arguments import LEAST_SIZE, ORDINARY
-from fg_calib.arrays import (
+from fg_calib.inputs import (
+    LEAST_SIZE,
     NORM_TOLERANCE,
+    ORDINARY,
     Booleans,
     Floats,
+    InputError,
     Integers,
     as_array,
     as_columns,
     as_floats,
     as_names,
     as_rotations,
+    check_names,
     require,
     shape_of,
 )
-from fg_calib.errors import InputError
 from fg_calib.measurements.limits import limit_hint, outside_limits
-from fg_calib.options import check_names
 from fg_calib.robot import Robot
 
 _log = logging.getLogger(__name__)

@@ -9,9 +9,18 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Booleans, Floats, FrozenArrays, Integers, as_floats, once
-from fg_calib.errors import InputError
+from fg_calib.inputs import (
+    Booleans,
+    Floats,
+    FrozenArrays,
+    InputError,
+    Integers,
+    as_floats,
+    check_number,
+    checked,
+    listed,
+    once,
+)
 from fg_calib.measurements.checks import (
     checked_covariance,
     checked_ids,
@@ -25,7 +34,7 @@ from fg_calib.measurements.checks import (
     checked_rotation,
     checked_sigma,
 )
-from fg_calib.options import Pairing, check_number, listed
+from fg_calib.options import Pairing
 from fg_calib.robot import over_spans, rotation_angle
 
 MOST_PAIRS = 10_000_000

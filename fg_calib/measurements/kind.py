@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers, as_array, as_figures, require
-from fg_calib.errors import InputError, shown
+from fg_calib.inputs import Floats, InputError, Integers, as_array, as_figures, require, shown
 
 
 class Frames(NamedTuple):

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers
-from fg_calib.errors import ProblemError
+from fg_calib.inputs import Floats, Integers, ProblemError
 
 Estimate = tuple[Floats, Floats, tuple[str, ...]]
 """Values as reports show them, their covariance, and their units."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.robot import Robot
 
 LIMIT_SLACK = 1e-3

@@ -37,7 +37,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 
 FAR = 8.5
 """Distance from a kink, in sigma, beyond which the exponentials are rounding."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kinds import INSTRUMENTS
 from fg_calib.robot import Robot, build_chain, forward

@@ -22,7 +22,7 @@ from functools import cache
 import numpy as np
 from scipy.linalg import lapack
 
-from fg_calib.arrays import Brief, Floats, Integers
+from fg_calib.inputs import Brief, Floats, Integers
 from fg_calib.measurements.kind import Frames, Kind, checked_rows
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import LANES, Chain, fill, forward, over_spans, turning_of_base

@@ -8,23 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.arguments import LEAST_SIZE, ORDINARY, check_fields
-from fg_calib.arrays import Booleans, Brief, Floats, FrozenArrays, Integers, as_figures, as_floats, check_sizes, require
-from fg_calib.errors import InputError, ProblemError, shown
 from fg_calib.initialization import Camera
-from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
-from fg_calib.measurements.kind import Kind, check_kind
-from fg_calib.options import (
-    PAIR_MODELS,
-    POSE_MODELS,
-    FrameKnowledge,
-    Model,
-    Pairing,
+from fg_calib.inputs import (
+    LEAST_SIZE,
+    ORDINARY,
+    Booleans,
+    Brief,
+    Floats,
+    FrozenArrays,
+    InputError,
+    Integers,
+    ProblemError,
+    as_figures,
+    as_floats,
+    check_fields,
     check_flag,
     check_number,
+    check_sizes,
     listed,
+    require,
     set_checked,
+    shown,
 )
+from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
+from fg_calib.measurements.kind import Kind, check_kind
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model, Pairing
 
 
 @dataclass(frozen=True)

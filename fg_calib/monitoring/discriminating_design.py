@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph import Problem, problem_at
+from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.measurements import Measurements, build_dataset
 from fg_calib.monitoring.hypotheses import HypothesisTest, columns_of, motion, quantile
 from fg_calib.monitoring.new_data import Calibrated, Linear, linearised

@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 from fg_calib.measurements import LANDMARKS, Measurements, Table
 
 Words = NDArray[np.uint64]

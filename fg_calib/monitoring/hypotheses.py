@@ -28,9 +28,8 @@ from typing import Literal
 import numpy as np
 from scipy import special
 
-from fg_calib.arrays import Floats, Integers
-from fg_calib.errors import CalibrationError
 from fg_calib.graph import WhitenedBlock, build_variables
+from fg_calib.inputs import CalibrationError, Floats, Integers
 from fg_calib.monitoring.new_data import Calibrated, Linear, Placed, Rows, linearise_new_data, place_new_data
 from fg_calib.robot import Robot, forward, random_readings
 from fg_calib.statistics import FACTOR

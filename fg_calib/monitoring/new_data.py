@@ -15,9 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers
 from fg_calib.diagnostics import basis_of
-from fg_calib.errors import ProblemError
 from fg_calib.graph import (
     JOINT_NOISE,
     Knowledge,
@@ -37,6 +35,7 @@ from fg_calib.graph import (
     variables_of,
     with_factors,
 )
+from fg_calib.inputs import Floats, Integers, ProblemError
 from fg_calib.measurements import INSTRUMENTS, KnownPoint, Table, build_dataset, residuals
 from fg_calib.monitoring.prior_information import with_tolerances
 from fg_calib.options import Options

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arrays import Floats
 from fg_calib.graph import (
     SIZE,
     STAYING,
@@ -21,6 +20,7 @@ from fg_calib.graph import (
     row_triangles,
     unknown_prior_rows,
 )
+from fg_calib.inputs import Floats
 from fg_calib.observability import ObservedQuantities
 
 

@@ -15,8 +15,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph import (
     Knowledge,
     Problem,
@@ -29,10 +27,10 @@ from fg_calib.graph import (
     variables_of,
     with_factors,
 )
+from fg_calib.inputs import NEAR, Floats, InputError, ProblemError, did_you_mean, known_names
 from fg_calib.measurements import TARGET, build_dataset
 from fg_calib.monitoring.hypotheses import motions, zero_names
 from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, place_new_data
-from fg_calib.options import NEAR, did_you_mean, known_names
 from fg_calib.robot import Robot, names_of, random_readings, tolerance_kind
 from fg_calib.statistics import HeldOut
 from fg_calib.statistics.residual_table import residual_table

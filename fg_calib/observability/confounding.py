@@ -10,8 +10,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers
 from fg_calib.graph import Problem, eliminate, square_root
+from fg_calib.inputs import Floats, Integers
 from fg_calib.measurements import LANDMARKS
 
 NOT_SEEN = 1e-6

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy.sparse.csgraph import connected_components
 
-from fg_calib.arrays import Figure, Floats, FrozenArrays
 from fg_calib.graph import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined, first_independent, preference
+from fg_calib.inputs import Figure, Floats, FrozenArrays
 from fg_calib.robot import Parameter, names_of
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 from fg_calib.robot import CONVENTIONS, Axis, Robot, pose
 
 PARALLEL_RAD = np.deg2rad(3.0)

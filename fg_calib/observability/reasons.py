@@ -13,8 +13,8 @@ from functools import cache
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats
 from fg_calib.graph import SUPPORT_TOLERANCE, Problem, named_triangle
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.observability.confounding import Confounding
 from fg_calib.observability.indices import Observability
 from fg_calib.observability.observed_quantities import ObservedQuantities

@@ -17,8 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arrays import Booleans, Floats, FrozenArrays, Integers, as_floats, as_rotations
-from fg_calib.errors import InputError
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations
 from fg_calib.measurements import check_readings
 from fg_calib.parallel import tell
 from fg_calib.prediction.tool_pose import errors_at, predict_poses

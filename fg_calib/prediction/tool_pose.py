@@ -20,8 +20,8 @@ from typing import Literal
 
 import numpy as np
 
-from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph import Problem, build_variables
+from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.measurements import Dataset
 from fg_calib.observability import ObservedQuantities
 from fg_calib.robot import Chain, forward, without_rigid_motion

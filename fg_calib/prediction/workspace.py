@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fg_calib.arrays import Booleans, Floats, FrozenArrays
+from fg_calib.inputs import Booleans, Floats, FrozenArrays
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
 from fg_calib.robot import Joint, Robot, pose, random_readings
 

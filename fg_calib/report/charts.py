@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import escaped
+from fg_calib.inputs import Floats, escaped
 from fg_calib.io import write_text
 
 WIDTH, HEIGHT = 360.0, 230.0

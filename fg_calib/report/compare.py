@@ -12,11 +12,10 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from fg_calib import __version__
-from fg_calib.arguments import checked
 from fg_calib.baseline import ESTIMATORS as DESCRIPTIONS
 from fg_calib.baseline import Comparison, Estimate, RealErrors
 from fg_calib.diagnostics import probability
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError, checked
 from fg_calib.io import Result, Run, fill_folder, write_text
 from fg_calib.report.tables import (
     SHOWN,

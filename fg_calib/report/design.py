@@ -14,9 +14,8 @@ import numpy as np
 import yaml
 from rich.console import Group, RenderableType
 
-from fg_calib.arrays import Floats
 from fg_calib.designs import Design
-from fg_calib.errors import InputError
+from fg_calib.inputs import Floats, InputError
 from fg_calib.io import (
     Units,
     exists,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.io import Result
 from fg_calib.observability import Identifiability
 from fg_calib.prediction import PredictedErrors, ToolPoseUncertainty, predict_errors

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fg_calib.errors import escaped
+from fg_calib.inputs import escaped
 from fg_calib.io import Result
 from fg_calib.prediction import PredictedErrors
 from fg_calib.report.charts import RAMP, resource, standalone

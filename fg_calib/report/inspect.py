@@ -13,8 +13,8 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from fg_calib import __version__
-from fg_calib.arguments import checked
 from fg_calib.diagnostics import MAX_ROWS, NEAR_SIGMAS, Disagreements, Inspection, SetupCheck
+from fg_calib.inputs import checked
 from fg_calib.io import Observability as Document
 from fg_calib.io import fill_folder, write_text
 from fg_calib.io import in_words as table_in_words

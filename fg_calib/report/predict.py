@@ -12,7 +12,7 @@ from rich.console import Group, RenderableType
 from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 from fg_calib.io import Result, Units, joint_columns, require_own_csv, write_csv
 from fg_calib.options import LengthUnit
 from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, WorstConfiguration, summed_up

@@ -15,9 +15,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from fg_calib.errors import escaped
+from fg_calib.inputs import check_number, escaped
 from fg_calib.observability import LostDirection, Observability
-from fg_calib.options import check_number
 from fg_calib.robot import AXIS_OF_KIND, Axis
 
 WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"

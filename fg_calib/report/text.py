@@ -13,10 +13,10 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from fg_calib.arrays import Floats
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph import Solution
+from fg_calib.inputs import Floats
 from fg_calib.io import Result, key_of
 from fg_calib.measurements import LANDMARKS
 from fg_calib.options import LIMITED

@@ -12,7 +12,7 @@ import numba
 from numba.core import config, event
 from numba.core.runtime import rtsys as runtime
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 
 logger = logging.getLogger("fg_calib.robot.kernels")
 

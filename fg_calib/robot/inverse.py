@@ -20,9 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Booleans, Brief, Floats, Integers, as_floats, as_rotations
-from fg_calib.options import check_number
+from fg_calib.inputs import Booleans, Brief, Floats, Integers, as_floats, as_rotations, check_number, checked
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import Robot
 from fg_calib.robot.rotations import rotation_vector

@@ -28,8 +28,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, Floats, Integers, as_figures, check_sizes
+from fg_calib.inputs import Brief, Floats, Integers, as_figures, check_sizes, checked
 from fg_calib.parallel import processors
 from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot

@@ -19,10 +19,25 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats, as_figures, as_floats, check_sizes, require, shape_of
-from fg_calib.errors import InputError, escaped, shown
-from fg_calib.options import NEAR, check, check_names, check_number, did_you_mean, known_names, listed
+from fg_calib.inputs import (
+    NEAR,
+    Floats,
+    InputError,
+    as_figures,
+    as_floats,
+    check,
+    check_names,
+    check_number,
+    check_sizes,
+    checked,
+    did_you_mean,
+    escaped,
+    known_names,
+    listed,
+    require,
+    shape_of,
+    shown,
+)
 from fg_calib.robot.rotations import yaw_pitch_roll
 
 MOST_JOINTS = 200

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats
 
 UPRIGHT = 1e-14
 """Cosine of a pitch below which roll and yaw rotate about one axis, and the roll counts as a part of the yaw."""

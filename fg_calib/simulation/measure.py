@@ -25,8 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Booleans, Floats, Integers
-from fg_calib.errors import InputError
+from fg_calib.inputs import Booleans, Floats, InputError, Integers
 from fg_calib.measurements import (
     INSTRUMENTS,
     Groups,

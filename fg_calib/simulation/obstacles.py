@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.robot import Axis, Robot
 
 if TYPE_CHECKING:  # pages draw arms without reading scenarios

@@ -93,9 +93,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
 from pydantic_core import core_schema
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, Floats, as_floats
-from fg_calib.errors import InputError
+from fg_calib.inputs import NEAR, Brief, Floats, InputError, as_floats, check, checked, did_you_mean, known_names
 from fg_calib.io import (
     Bound,
     FilePath,
@@ -123,19 +121,7 @@ from fg_calib.io import (
 )
 from fg_calib.measurements import GENERIC_COLUMNS, LIMIT_SLACK, Noise
 from fg_calib.measurements.kinds import Camera
-from fg_calib.options import (
-    NEAR,
-    PAIR_MODELS,
-    POSE_MODELS,
-    AngleUnit,
-    FrameKnowledge,
-    LengthUnit,
-    Model,
-    Pairing,
-    check,
-    did_you_mean,
-    known_names,
-)
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, AngleUnit, FrameKnowledge, LengthUnit, Model, Pairing
 from fg_calib.robot import Robot, names_of, tolerance_kind
 
 MOST_DRAWN = 1_000_000

@@ -13,11 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Brief, Floats
-from fg_calib.errors import InputError
+from fg_calib.inputs import Brief, Floats, InputError, check_number, checked
 from fg_calib.measurements import Measurements, Noise, Table
-from fg_calib.options import check_number
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot
 from fg_calib.simulation.measure import Scene, Visits, draw_frame, generator_of, measure, merge_truths

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Booleans, Floats, FrozenArrays, as_floats
-from fg_calib.errors import InputError
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, as_floats
 from fg_calib.measurements import outside_limits
 from fg_calib.robot import Inverse, Robot, build_chain, forward, random_readings, solve_inverse
 from fg_calib.simulation.obstacles import enters

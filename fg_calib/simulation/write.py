@@ -14,8 +14,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats
+from fg_calib.inputs import Floats, checked
 from fg_calib.io import Units, fill_folder, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing

@@ -23,7 +23,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.arrays import Floats, FrozenArrays
 from fg_calib.graph import (
     RANK_TOLERANCE,
     SIGNAL_FLOOR,
@@ -36,6 +35,7 @@ from fg_calib.graph import (
     linear_system,
     prior_rows,
 )
+from fg_calib.inputs import Floats, FrozenArrays
 from fg_calib.robot import Robot
 
 NO_ANGLE = 1.0

@@ -27,13 +27,20 @@ from functools import partial
 import numpy as np
 from scipy import special
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
-from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph import Solution, problem_of
+from fg_calib.inputs import (
+    Booleans,
+    Figure,
+    Floats,
+    FrozenArrays,
+    InputError,
+    Integers,
+    ProblemError,
+    check_number,
+    checked,
+)
 from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Table
-from fg_calib.options import check_number
 from fg_calib.parallel import Failure, map_jobs
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
 

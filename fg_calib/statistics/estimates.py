@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats, FrozenArrays, Integers
 from fg_calib.graph import Problem, Solution, Variables, at_parameters, corrections_of, linear_system, pose_of
+from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level

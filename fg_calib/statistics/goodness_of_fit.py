@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
-from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, effect, linear_system, mahalanobis_distances, tuning, weight
+from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
 from fg_calib.statistics.covariance import Spread

@@ -31,9 +31,8 @@ import scipy.linalg
 import scipy.sparse
 from scipy import special
 
-from fg_calib.arrays import Booleans, Floats, Integers
-from fg_calib.errors import SolverError
 from fg_calib.graph import PRIVATE_SHARE, Problem, Solution, prior_rows, solve, with_factors
+from fg_calib.inputs import Booleans, Floats, Integers, SolverError
 from fg_calib.statistics.covariance import Spread, spread_of
 from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, RowStatistics, chi_square, judge_fit
 from fg_calib.statistics.residual_covariance import RowErrors

@@ -55,8 +55,6 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph import (
     RANK_TOLERANCE,
     Problem,
@@ -73,6 +71,7 @@ from fg_calib.graph import (
     unknown_prior_rows,
     with_factors,
 )
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, checked
 from fg_calib.options import SharedScale
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Parameter, Robot, tolerance_kind

@@ -16,8 +16,8 @@ import scipy.sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
-from fg_calib.arrays import Booleans, Floats, Integers
 from fg_calib.graph import PRIVATE_SHARE, ErrorStates, Problem, RowNoise, at_parameters, felt, linear_system, says_where
+from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
 

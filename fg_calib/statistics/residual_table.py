@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.arrays import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.graph import Solution, noises_at
+from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import Labels, MeasurementBlock
 from fg_calib.measurements.kinds import checked_figures
 

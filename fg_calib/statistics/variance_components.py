@@ -37,8 +37,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse
 
-from fg_calib.arguments import checked
-from fg_calib.arrays import Floats
 from fg_calib.graph import (
     JOINT_NOISE,
     ErrorStates,
@@ -54,6 +52,7 @@ from fg_calib.graph import (
     solve,
     whitener_of,
 )
+from fg_calib.inputs import Floats, checked
 from fg_calib.parallel import single_threaded
 
 Sparse = scipy.sparse.csr_array

@@ -15,8 +15,8 @@ from tolerances import rounding
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
 from fg_calib.baseline.least_squares import fit_least_squares
-from fg_calib.errors import InputError
 from fg_calib.graph.build import problem_of
+from fg_calib.inputs import InputError
 from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot

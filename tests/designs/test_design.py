@@ -8,9 +8,9 @@ from scenarios import INSTRUMENTS, SIGMA, WALL, scenario
 
 from fg_calib import Pairing
 from fg_calib.designs.design import design
-from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import InputError
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Options

@@ -11,10 +11,10 @@ from tolerances import rounding
 from fg_calib import Pairing
 from fg_calib.designs.candidates import build_pool, draw_groups
 from fg_calib.designs.information import gather_rows
-from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem, true_problem
 from fg_calib.graph.problem import square_root
 from fg_calib.graph.variables import prior_rows
+from fg_calib.inputs import InputError
 from fg_calib.simulation.scenario import (
     BoardCamera,
     LengthGauge,

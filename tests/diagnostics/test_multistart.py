@@ -12,10 +12,10 @@ from touches import reach_faces
 from fg_calib import calibrate
 from fg_calib.assessment import assess, solve_job
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.errors import SolverError
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem, problem_of
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import SolverError
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import read_robot
 from fg_calib.measurements.dataset import Measurements

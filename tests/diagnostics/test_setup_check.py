@@ -14,10 +14,10 @@ from sparing import as_case, diagonal
 from fg_calib.assessment import assess, solve_job
 from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
-from fg_calib.errors import SolverError
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import SolverError
 from fg_calib.io.job import read_job
 from fg_calib.options import MODELS, PAIR_MODELS, POSE_MODELS
 

@@ -7,11 +7,11 @@ from simulated import measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib.assessment import assess
-from fg_calib.errors import InputError, ProblemError, SolverError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
 from fg_calib.graph.problem import linear_system, reduced_graph, relinearized_at
 from fg_calib.graph.solver import levenberg_marquardt_params, solve
+from fg_calib.inputs import InputError, ProblemError, SolverError
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import forward
 from fg_calib.robot.rotations import rotation_angle

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib.errors import SolverError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import CheckedFactor, MeasurementFactor, reduced_factor
 from fg_calib.graph.variables import build_variables, frame_of, pose_of, prior_rows
+from fg_calib.inputs import SolverError
 from fg_calib.measurements import residuals
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import forward

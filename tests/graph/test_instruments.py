@@ -13,9 +13,9 @@ from sparing import diagonal
 
 from fg_calib.assessment import assess
 from fg_calib.calibration import calibrate
-from fg_calib.errors import ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.inputs import ProblemError
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.model import FRAME_KINDS

@@ -17,9 +17,9 @@ from touches import corners, touch
 
 from fg_calib import Measurements, Robot, read_job
 from fg_calib.assessment import assess
-from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import InputError, ProblemError
 from fg_calib.io import write_robot
 from fg_calib.io.columns import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs

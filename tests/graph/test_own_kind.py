@@ -13,9 +13,9 @@ from simulated import measure, small_arm, true_robot
 from fg_calib import Calibration, calibrate
 from fg_calib.assessment import assess
 from fg_calib.baseline.comparison import compare
-from fg_calib.errors import InputError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import InputError
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import Kind, Rows

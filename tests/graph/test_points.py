@@ -17,13 +17,13 @@ from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
-from fg_calib.errors import InputError, ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.normal_system import eliminate
 from fg_calib.graph.problem import linear_system, named_triangle
 from fg_calib.graph.robust import tuning, weight
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
+from fg_calib.inputs import InputError, ProblemError
 from fg_calib.io import write_robot
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements import residuals

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
-from fg_calib.errors import ProblemError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import ProblemError
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import build_chain, pose

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib.errors import SolverError
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.graph.variables import prior_rows
+from fg_calib.inputs import SolverError
 from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 

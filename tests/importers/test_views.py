@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 from tolerances import sigmas_apart
 
-from fg_calib.errors import InputError
 from fg_calib.importers.opencv import CalibrationBoard, camera_derivatives
 from fg_calib.importers.views import INTRINSICS, Corners, fit_board
+from fg_calib.inputs import InputError
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.kinds.board import BoardPose

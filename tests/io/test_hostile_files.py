@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from fg_calib import InputError, Robot, read_job
-from fg_calib.arguments import ORDINARY
+from fg_calib.inputs import ORDINARY
 from fg_calib.io import read_measurements
 
 ROWS_OF_DH = [[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0], [0.3, 0.0, 0.1, 0.0]]

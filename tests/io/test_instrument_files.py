@@ -7,7 +7,7 @@ from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
 
 from fg_calib.calibration import calibrate, calibrate_job
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_camera, read_job
 from fg_calib.io.robot_file import write_robot

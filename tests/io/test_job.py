@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.io.job import read_job
 from fg_calib.options import Options, Pairing
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from oracle import dh_joint, frame, tool_pose
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.io.robot_file import read_robot, write_robot
 from fg_calib.io.units import Units
 from fg_calib.robot.model import CONVENTIONS, Axis, Element, Joint, Robot, RobotBuilder

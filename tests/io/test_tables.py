@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from oracle import frame
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.io.columns import Column, write_csv
 from fg_calib.io.tables import read_measurements
 from fg_calib.io.units import Units

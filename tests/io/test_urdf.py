@@ -9,7 +9,7 @@ from lxml import etree
 from oracle import tool_pose
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.io.robot_file import read_robot, write_robot
 from fg_calib.io.urdf import read_urdf, urdf_text, write_urdf
 from fg_calib.robot.model import Joint

@@ -10,7 +10,7 @@ from scipy import stats
 from simulated import true_robot
 
 from fg_calib import Measurements, Robot, Table, calibrate
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.monitoring.hypotheses import zero_names
 from fg_calib.robot import pose

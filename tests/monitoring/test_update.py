@@ -8,7 +8,7 @@ from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
 from fg_calib import Calibration, Measurements, Table, calibrate
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 

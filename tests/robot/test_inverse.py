@@ -6,7 +6,7 @@ from oracle import random_robot, tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.robot.inverse import REACHED, random_readings, solve_inverse
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder

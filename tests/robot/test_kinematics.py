@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from sparing import diagonal
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.robot.kernels import LANES
 from fg_calib.robot.kinematics import SPAN, build_chain, forward, pose
 from fg_calib.robot.model import BASES, CONVENTIONS, Axis, Basis, Element, Joint, Parameter, RobotBuilder

@@ -9,7 +9,7 @@ from simulated import paper_robot
 from tolerances import rounding
 
 from fg_calib import Noise, Pairing, simulate
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.simulation import write_simulation
 from fg_calib.simulation.scenario import (
     BoardViews,

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from simulated import planar_robot
 from tolerances import rounding
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import read_robot
 from fg_calib.measurements.dataset import Noise

@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import ProblemError
 from fg_calib.initialization import anchors_from_lengths, offset_from_lengths
+from fg_calib.inputs import Floats, ProblemError
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.kinds.contact import Contact

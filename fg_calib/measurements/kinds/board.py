@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats, Integers
 from fg_calib.initialization import FrameStart
+from fg_calib.inputs import Floats, Integers
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Frames, Kind, Rows
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows

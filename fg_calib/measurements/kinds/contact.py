@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Floats
-from fg_calib.errors import ProblemError
+from fg_calib.inputs import Floats, ProblemError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks

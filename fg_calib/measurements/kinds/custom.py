@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.errors import InputError
+from fg_calib.inputs import InputError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
 from fg_calib.measurements.table import CustomMeasurements, MeasurementBlock, Table

@@ -9,9 +9,8 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers
-from fg_calib.errors import ProblemError
 from fg_calib.initialization import FrameStart
+from fg_calib.inputs import Floats, Integers, ProblemError
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kind import Frames, Kind
 from fg_calib.measurements.landmarks import LandmarkKind, Landmarks

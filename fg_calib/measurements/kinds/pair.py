@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Booleans, Floats, Integers, once
-from fg_calib.errors import ProblemError, escaped
 from fg_calib.initialization import FrameStart
+from fg_calib.inputs import Booleans, Floats, Integers, ProblemError, escaped, once
 from fg_calib.measurements.dataset import Pairs, are_same, form_pairs, no_pairs
 from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.kinds.contact import POINT, contact_blocks

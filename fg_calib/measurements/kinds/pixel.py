@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Booleans, Floats, Integers
-from fg_calib.errors import ProblemError
 from fg_calib.initialization import Camera, FrameStart, boards_from_image
+from fg_calib.inputs import Booleans, Floats, Integers, ProblemError
 from fg_calib.measurements.dataset import Labels, Measurements
 from fg_calib.measurements.kind import Frames, Kind, Rows
 from fg_calib.measurements.kinds.board import BOARD_COLUMN, BoardCamera, board_coordinates, start_boards

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats
 from fg_calib.initialization import plane_from_distances
+from fg_calib.inputs import Floats
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Frames, Kind, Rows, between
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows

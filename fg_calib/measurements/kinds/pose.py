@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.arrays import Floats, Integers
 from fg_calib.initialization import Frame, FrameStart, targets_from_positions
+from fg_calib.inputs import Floats, Integers
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kind import Frames, Kind, Rows
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows

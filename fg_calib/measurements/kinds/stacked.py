@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.arrays import Floats, Integers
+from fg_calib.inputs import Floats, Integers
 from fg_calib.measurements.kind import Frames, Kind, Rows
 
 

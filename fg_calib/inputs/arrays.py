@@ -12,8 +12,8 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import BeforeValidator, PlainSerializer
 from pydantic_core import CoreSchema, core_schema
 
-from fg_calib.arguments import MOST_SIZE, ORDINARY
-from fg_calib.errors import InputError, shown
+from fg_calib.inputs.arguments import MOST_SIZE, ORDINARY
+from fg_calib.inputs.errors import InputError, shown
 
 
 class _AsLists:

@@ -1,0 +1,281 @@
+"""Checks of arguments: by type hints, of choices, numbers and names.
+
+`checked` compares only the package's classes, generators, executors, sequences of them, text and paths. Numbers, arrays
+and choices are checked where they are used.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import cache, wraps
+from inspect import Parameter, signature
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from fg_calib.inputs.errors import InputError, shown
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+LEAST_SIZE, MOST_SIZE = 1e-30, 1e15
+"""The smallest sigma and the largest number that are accepted: beyond them squares overflow."""
+
+ORDINARY = f"a number no larger than {MOST_SIZE:g}; sigmas and tolerances no less than {LEAST_SIZE:g}"
+"""What is expected, for messages."""
+
+EXAMPLES = {
+    "Generator": "numpy.random.default_rng(0)",
+    "Job": "read_job('job.yaml')",
+    "Measurements": "Measurements.from_arrays(...)",
+    "Noise": "Noise(position=1e-3)",
+    "Options": "Options(model='pose')",
+    "Pairing": "Pairing('chain')",
+    "Robot": "Robot.from_dh(...)",
+    "SolverOptions": "SolverOptions(max_iterations=200)",
+    "Units": "Units(length='mm')",
+}
+"""Where an object of a class comes from, for messages."""
+
+_COMPARED = ("fg_calib.", "concurrent.", "numpy.random.", "pathlib")
+"""Modules whose classes are compared; text and None are too."""
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that raises `InputError` for an argument that does not fit its type hint."""
+
+    @wraps(function)
+    def with_checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        takes, hints = _signature(function), _hints(function)
+        try:
+            given = takes.bind(*args, **kwargs)
+        except TypeError:  # in Python's own words
+            return function(*args, **kwargs)
+        for name in given.arguments.keys() & hints.keys():
+            if takes.parameters[name].kind not in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD):
+                given.arguments[name] = as_hinted(name, given.arguments[name], hints[name])
+        return function(*given.args, **given.kwargs)
+
+    return with_checked
+
+
+def check_fields(of: object, place: str = "") -> None:
+    """Compare the fields of a dataclass with their type hints.
+
+    Args:
+        of: The object.
+        place: What stands before a field's name in messages.
+
+    Raises:
+        InputError: A field does not fit.
+    """
+    hints = _hints(type(of))  # type: ignore[arg-type] # classes are hashable
+    for f in fields(of):  # type: ignore[arg-type] # a dataclass
+        as_hinted(f"{place}: {f.name}" if place else f.name, getattr(of, f.name), hints[f.name])
+
+
+def as_hinted(place: str, value: Any, hint: Any) -> Any:
+    """A value that fits a type hint; a path of another class as a `Path`.
+
+    Raises:
+        InputError: The value does not fit.
+    """
+    kinds = _alternatives(hint)
+    if _fits(value, hint) and not (Path in kinds and isinstance(value, str) and not value):
+        return value
+    if Path in kinds and isinstance(value, os.PathLike):
+        return Path(os.fspath(value))
+    words = [_describe(kind) for kind in kinds if kind is not NoneType and not (kind is str and Path in kinds)]
+    example = next(
+        (f", such as {EXAMPLES[n]}" for n in (getattr(k, "__name__", "") for k in kinds) if n in EXAMPLES), ""
+    )
+    expected = " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
+    raise InputError(place, f"found {shown(value)}", f"{expected}{example}")
+
+
+_signature = cache(signature)
+
+
+@cache
+def _hints(of: Any) -> dict[str, Any]:
+    unknown: dict[str, Any] = {}  # names that a module imports for its hints alone
+    while True:
+        try:
+            return {name: hint for name, hint in get_type_hints(of, localns=unknown).items() if name != "return"}
+        except NameError as missing:
+            unknown[str(missing.name)] = Any
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, one) for one in parts)
+    if origin is Sequence or (origin is tuple and parts[1:] == (...,)):
+        names = str in _alternatives(parts[0]) and Path not in _alternatives(parts[0])  # checked where they are known
+        return names or (isinstance(value, list | tuple) and all(_fits(one, parts[0]) for one in value))
+    if origin in (Mapping, dict):
+        return isinstance(value, Mapping) and all(_fits(one, parts[1]) for one in value.values())
+    if origin is Callable:
+        return callable(value)
+    is_compared = isinstance(hint, type) and origin is None
+    is_compared = is_compared and (hint in (str, NoneType) or hint.__module__.startswith(_COMPARED))
+    return not is_compared or isinstance(value, hint)
+
+
+def _describe(hint: Any) -> str:
+    words = {str: "text", Path: "a path", Mapping: "a mapping", dict: "a mapping", Callable: "a function"}
+    kind = get_origin(hint) or hint
+    if kind in (Sequence, tuple):
+        return f"a list of {getattr(get_args(hint)[0], '__name__', 'them')}"
+    return words.get(kind) or f"a{'n' * (kind.__name__[0] in 'AEIO')} {kind.__name__}"
+
+
+def check(key: str, value: object, possible: Any) -> Any:
+    """The option that was given, one of those possible.
+
+    Args:
+        key: Its name, for the message.
+        value: What was given.
+        possible: A `Literal`, or the values themselves.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    options = get_args(possible) or tuple(possible)
+    for option in options:
+        if value is option or (isinstance(value, type(option)) and value == option):  # numpy's text is text too
+            return option
+    words = ", ".join(map(str, options))
+    raise InputError(key, f"found {shown(value)}", f"one of {words}", did_you_mean(value, options))
+
+
+def set_checked(of: object, place: str = "", **possible: Any) -> None:
+    """Check choices among the fields of a frozen dataclass, and set each to the option that it is.
+
+    Args:
+        of: The object.
+        place: What stands before a field's name in messages.
+        possible: A `Literal` for each field.
+
+    Raises:
+        InputError: One is none of those possible.
+    """
+    for key, options in possible.items():
+        object.__setattr__(of, key, check(f"{place}{key}", getattr(of, key), options))
+
+
+def check_flag(key: str, value: object) -> None:
+    """Check that a switch is True or False, and no word that happens to count as True.
+
+    Raises:
+        InputError: It is neither.
+    """
+    if type(value).__name__ not in ("bool", "bool_"):  # Python's and numpy's
+        raise InputError(key, f"found {shown(value)}", "True or False")
+
+
+def check_number(
+    key: str,
+    value: object,
+    *,
+    least: float = 0.0,
+    above: bool = False,
+    whole: bool = False,
+    finite: bool = True,
+    most: int | None = None,
+) -> None:
+    """Check that an option is a number of the right kind and size.
+
+    Args:
+        key: Its name, for the message.
+        value: What was given.
+        least: The smallest number possible.
+        above: Whether it must be above that.
+        whole: Whether it must be a whole number.
+        finite: Whether it must be finite.
+        most: The largest number possible.
+
+    Raises:
+        InputError: It is no number, nan, or not of this kind and size.
+    """
+    good = isinstance(value, Real) and not isinstance(value, bool)
+    if good:
+        try:
+            x = float(value)  # type: ignore[arg-type]
+        except OverflowError:  # a whole number beyond any float
+            x = math.inf
+        good = (x > least if above else x >= least) and (math.isfinite(x) or not finite)
+        good = good and not (whole and not isinstance(value, Integral))
+        if good and math.isfinite(x) and (x > MOST_SIZE or (above and x < LEAST_SIZE)):
+            raise InputError(key, f"found {shown(value)}", ORDINARY)
+        if good and most is not None and x > most:
+            raise InputError(key, f"found {shown(value)}", f"at most {most}")
+    if not good:
+        kind = "a whole number" if whole else "a finite number" if finite else "a number"
+        raise InputError(key, f"found {shown(value)}", f"{kind} {'above' if above else 'not below'} {least:g}")
+
+
+def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str = "parameter") -> None:
+    """Check that a list holds known names only.
+
+    Args:
+        key: The list's name, for the message.
+        names: The names given.
+        known: Those possible.
+        what: What they are names of.
+
+    Raises:
+        InputError: It is one word instead of a list, or a name is not known.
+    """
+    if isinstance(names, str) or not isinstance(names, Iterable) or not getattr(names, "ndim", 1):
+        raise InputError(key, f"found {shown(names)}", "a list of names")
+    for name in names:
+        if not isinstance(name, str) or name not in known:
+            raise InputError(key, f"unknown {what} {shown(name)}", known_names(known), did_you_mean(name, known, NEAR))
+
+
+NEAR = 0.87
+"""Likeness of names (see `difflib`) that is a slip of the pen: tool.w is as like tool.x as it is like tool.z."""
+
+
+def did_you_mean(value: object, options: Iterable[object], likeness: float = 0.6) -> str:
+    """`did you mean shared?` where an option reads nearly like what was given, whatever its case; else nothing.
+
+    The first letter must be the same: whoever writes grad does not mean rad.
+    """
+    if not isinstance(value, str) or not value:
+        return ""
+    given = value.lower()
+    words = {option.lower(): option for option in options if isinstance(option, str)}
+    close = difflib.get_close_matches(given, [w for w in words if w[:1] == given[0]], 1, likeness)
+    return f"did you mean {words[close[0]]}?" if close else ""
+
+
+def listed(key: str, names: Iterable[Any], expected: str = "a list of names") -> tuple[Any, ...]:
+    """Names as a tuple: what can be gone through only once would be empty the second time.
+
+    Raises:
+        InputError: They are nothing to go through.
+    """
+    if isinstance(names, str):
+        return (names,)
+    try:
+        return tuple(names)
+    except TypeError:
+        raise InputError(key, f"found {shown(names)}", expected) from None
+
+
+def known_names(names: Iterable[str], limit: int = 12) -> str:
+    """`one of a, b, c` for an error message, cut after `limit` names."""
+    listed = list(names)
+    shown = ", ".join(listed[:limit])
+    return f"one of {shown}{', ...' if len(listed) > limit else ''}"
