@@ -248,9 +248,9 @@ def design_from_pool(
     chooser = Chooser(system.select(measurable), criterion, _error_of_formed_pairs(pool, task, measurable))
     tell("choosing")
     wanted = max(1, min((n or N_POSES) - len(pool.references), len(measurable)))
-    found = chooser.thoroughly(wanted, generator) if target is None else chooser.reaching(target, generator)
+    found = chooser.best(wanted, generator) if target is None else chooser.reaching(target)
     tell("working out what to expect")
-    chosen = measurable[found.candidates]
+    chosen = measurable[found]
     ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
     poses = np.concatenate([pool.given, ordered])
     posterior, tables = pool.posterior(poses), pool.select_tables(ordered)

@@ -1,8 +1,8 @@
 """Search for a good set of candidates: greedy choice, exchange, and the order in which to visit them.
 
-Greedy choice and exchange look at all candidates at every step, by updates of rank h (see `criteria`). Exchange takes
-out one of the chosen at a time and puts in the best candidate in its place (Fedorov 1972; Mitchell 1974). It ends where
-a sweep over all chosen gains less than `MIN_GAIN`.
+Exchange takes out one of the chosen at a time and puts in the best candidate in its place (Fedorov 1972; Mitchell
+1974). It ends where a sweep over all chosen gains less than `MIN_GAIN`. It starts from the best of sets that are chosen
+greedily and of random ones.
 
 References:
     Fedorov (1972), Theory of Optimal Experiments. Academic Press.
@@ -18,7 +18,7 @@ import numpy as np
 
 from fg_calib.designs.criteria import Criterion, Measure
 from fg_calib.designs.information import System
-from fg_calib.inputs import Floats, FrozenArrays, Integers
+from fg_calib.inputs import Floats, Integers
 from fg_calib.robot import Robot
 
 MAX_SWEEPS = 10
@@ -27,17 +27,14 @@ MAX_SWEEPS = 10
 MIN_GAIN = 1e-3
 """Share of the criterion that a sweep must gain for another one."""
 
-SHORTLIST = 500
-"""Number of candidates that exchange looks at first: those that would help most."""
-
 _ROUNDING = 1e-12
 """Share of the criterion that an exchange must gain: less may be rounding."""
 
-N_RANDOM = 100
-"""Number of random sets that a design is compared with: exchange starts from one that is better."""
+N_RANDOM, N_RANDOM_EXACT = 100, 20
+"""Number of random sets that a design is compared with; where the error of each takes a posterior of its own."""
 
-SMALL_PROBLEM = 40_000
-"""Poses times candidates up to which exchange starts from random sets too: from all of them at a hundredth."""
+N_STARTS, SMALL_PROBLEM = 2, 5_000
+"""Sets that exchange starts from, and poses times candidates times starts up to which it starts from more."""
 
 MAX_POSES = 500
 """Largest number of poses with which a target is sought."""
@@ -45,27 +42,8 @@ MAX_POSES = 500
 UNKNOWN_SHARE = 1e-9
 """Share of a task that no candidate determines from which its error is unknown."""
 
-N_EXACT = 20
-"""Number of random sets where each takes a posterior of its own."""
-
-MIN_CURVE = 4
-"""Number of poses with which the curve begins."""
-
-N_CURVE = 10
-"""Number of points of the curve, about."""
-
-
-@dataclass(frozen=True)
-class Chosen(FrozenArrays):
-    """Candidates that were chosen.
-
-    Attributes:
-        candidates: In the order in which they were taken, shape (n,).
-        value: The criterion with all of them; smaller is better.
-    """
-
-    candidates: Integers
-    value: float
+MIN_CURVE, N_CURVE = 4, 10
+"""Number of poses with which the curve begins, and about the number of its points."""
 
 
 @dataclass(frozen=True)
@@ -83,91 +61,33 @@ class CurvePoint:
     random: tuple[float, float, float]
 
 
-def choose_greedily(measure: Measure, n: int, start: Integers | None = None) -> Integers:
-    """Choose candidates one after the other, each the best in addition to those before it."""
-    system = measure.system
-    chosen = [] if start is None else start.tolist()
+def choose_greedily(measure: Measure, n: int, start: Integers) -> Integers:
+    """Choose candidates one after the other, each the best in addition to those before it, and to `start`."""
+    system, chosen = measure.system, start.tolist()
     allowed = np.ones(system.n_candidates, dtype=np.bool_)
     allowed[chosen] = False
-    information = system.information(np.array(chosen, dtype=np.int64))
-    while len(chosen) < min(n, system.n_candidates):
-        k, _ = measure.best(information, allowed)
+    while len(chosen) < n:
+        k, _ = measure.best(system.information(np.array(chosen, dtype=np.int64)), allowed)
         chosen.append(k)
         allowed[k] = False
-        information = information + system.rows[k].T @ system.rows[k]
     return np.array(chosen[:n], dtype=np.int64)
 
 
-def exchange(measure: Measure, chosen: Integers, *, quickly: bool = False) -> Chosen:
-    """Exchange candidates for better ones, until none is better.
-
-    Most exchanges are among the few candidates that would help most now: these are tried first, then all.
-
-    Args:
-        measure: The criterion.
-        chosen: The first set.
-        quickly: Whether only these few are tried.
-    """
-    system = measure.system
-    now, value = chosen.copy(), measure.value(system.information(chosen))
-    if len(chosen) >= system.n_candidates:
-        return Chosen(now, value)
-    for _ in range(MAX_SWEEPS):
+def exchange(measure: Measure, chosen: Integers, sweeps: int = MAX_SWEEPS) -> Integers:
+    """Exchange candidates for better ones, until none is better, in a number of sweeps at most."""
+    system, now = measure.system, chosen.copy()
+    value, allowed = measure.value(system.information(chosen)), np.ones(system.n_candidates, dtype=np.bool_)
+    allowed[now] = False
+    for _ in range(sweeps if allowed.any() else 0):
         before = value
-        if system.n_candidates > 2 * SHORTLIST:
-            short = np.union1d(measure.most_helpful(system.information(now), SHORTLIST), now)
-            some = Measure(measure.criterion, system.select(short))
-            for _ in range(MAX_SWEEPS):
-                last = value
-                places, value = _sweep(some, np.searchsorted(short, now), value)
-                now = short[places]
-                if last - value <= MIN_GAIN * abs(last):
-                    break
-            if quickly:
-                break
-        now, value = _sweep(measure, now, value)
+        for place in range(len(now)):
+            k, found = measure.best(system.information(np.delete(now, place)), allowed)
+            if found < value - _ROUNDING * abs(value):
+                allowed[now[place]], allowed[k] = True, False
+                now[place], value = k, found
         if before - value <= MIN_GAIN * abs(before):
             break
-    return Chosen(now, measure.value(system.information(now)))
-
-
-def _sweep(measure: Measure, chosen: Integers, value: float) -> tuple[Integers, float]:
-    """Exchange each of the chosen once for the best candidate in its place, where that is better."""
-    system, now = measure.system, chosen.copy()
-    allowed = np.ones(system.n_candidates, dtype=np.bool_)
-    allowed[now] = False
-    for place in range(len(now)):
-        better = value - _ROUNDING * abs(value)
-        k, found = measure.best(system.information(np.delete(now, place)), allowed, better)
-        if k >= 0:
-            allowed[now[place]], allowed[k] = True, False
-            now[place], value = k, found
-    return now, value
-
-
-def draw_sets(
-    measure: Measure, n: int, generator: np.random.Generator, count: int = N_RANDOM
-) -> tuple[Floats, Integers]:
-    """Draw random sets of n: the criterion, ascending, shape (count,), and the sets, shape (count, n)."""
-    system = measure.system
-    sets = np.array([generator.choice(system.n_candidates, size=n, replace=False) for _ in range(count)])
-    values = np.array([measure.value(system.information(one)) for one in sets])
-    order = np.argsort(values, kind="stable")
-    return values[order], sets[order].astype(np.int64)
-
-
-def improve_by_random_starts(measure: Measure, found: Chosen, generator: np.random.Generator) -> Chosen:
-    """Take what exchange makes of random sets, where that is better.
-
-    Of large pools exchange starts from the best random set alone, and only if that is better. Of small ones, where a
-    set that no single exchange improves may be far from the best, it starts from several.
-    """
-    n, of = len(found.candidates), measure.system.n_candidates
-    values, sets = draw_sets(measure, n, generator)
-    starts = sets[: SMALL_PROBLEM // (n * of)]
-    if not len(starts) and values[0] < found.value:
-        starts = sets[:1]
-    return min((found, *(exchange(measure, one) for one in starts)), key=lambda one: one.value)
+    return now
 
 
 class Chooser:
@@ -183,9 +103,8 @@ class Chooser:
     """
 
     def __init__(self, system: System, criterion: Criterion, error: Callable[[Integers], float] | None = None) -> None:
-        self.system, self.criterion, self._exact = system, criterion, error
-        self.measure = Measure(criterion, system)
-        self._error = Measure("I", system)
+        self.system, self._exact = system, error
+        self.measure, self._error = Measure(criterion, system), Measure("I", system)
         of_all = Measure("D", replace(system, core=np.eye(system.rows.shape[2])))
         self._orders = [(measure, np.zeros(0, dtype=np.int64)) for measure in (self.measure, of_all)]
 
@@ -197,53 +116,46 @@ class Chooser:
             return self._exact(chosen)
         return float(np.sqrt(self._error.value(self.system.information(chosen))))
 
-    def _value(self, candidates: Integers) -> float:
-        return self.measure.value(self.system.information(candidates))
+    def value(self, chosen: Integers) -> float:
+        """The criterion with some candidates."""
+        return self.measure.value(self.system.information(chosen))
 
     def starts(self, n: int) -> list[Integers]:
         """First sets by greedy choice, the best one first."""
         self._orders = [(m, choose_greedily(m, n, order) if len(order) < n else order) for m, order in self._orders]
-        return sorted((order[:n] for _, order in self._orders), key=self._value)
+        return sorted((order[:n] for _, order in self._orders), key=self.value)
 
-    def best(self, n: int) -> Chosen:
-        """The best n that exchange finds."""
-        return min((exchange(self.measure, one) for one in self.starts(n)), key=lambda chosen: chosen.value)
-
-    def thoroughly(self, n: int, generator: np.random.Generator) -> Chosen:
+    def best(self, n: int, generator: np.random.Generator) -> Integers:
         """The best n that exchange finds, never worse than the best of some random sets."""
-        found = improve_by_random_starts(self.measure, self.best(n), generator)
-        if self._exact is None or self.system.unknown > UNKNOWN_SHARE:
-            return found
-        sets = [self._draw(n, generator) for _ in range(N_EXACT)]
-        best = min((found.candidates, *sets), key=self._exact)
-        return Chosen(best, self._value(best))
+        random = [self._draw(n, generator) for _ in range(N_RANDOM)]
+        starts = sorted([*self.starts(n), *random], key=self.value)
+        starts = starts[: max(N_STARTS, SMALL_PROBLEM // (n * self.system.n_candidates))]
+        found = min((exchange(self.measure, one) for one in starts), key=self.value)
+        return found if self._exact is None else min((found, *random[:N_RANDOM_EXACT]), key=self.error)
 
-    def quickly(self, n: int) -> Chosen:
+    def quickly(self, n: int) -> Integers:
         """Nearly as good a set, in a small part of the time."""
-        return exchange(self.measure, self.starts(n)[0], quickly=True)
+        return exchange(self.measure, self.starts(n)[0], sweeps=1)
 
-    def reaching(self, target: float, generator: np.random.Generator) -> Chosen:
+    def reaching(self, target: float) -> Integers:
         """As few as reach a target, [m]; as many as allowed where none do."""
         most = min(MAX_POSES, self.system.n_candidates)
         if self.system.unknown > UNKNOWN_SHARE:  # no number of poses would do
-            return self.best(min(MIN_CURVE, most))
+            return self.quickly(min(MIN_CURVE, most))
         enough = 1
         while min(map(self.error, self.starts(enough))) > target:
             if enough == most:
-                return Chosen(self.starts(most)[0], np.inf)
+                return self.starts(most)[0]
             enough = min(most, enough + max(1, enough // 10))
         chosen = min(self.starts(enough), key=self.error)
-        while len(chosen) > 1:
-            fewer = self.quickly(len(chosen) - 1).candidates
-            if self.error(fewer) > target:
-                break
+        while len(chosen) > 1 and self.error(fewer := self.quickly(len(chosen) - 1)) <= target:
             chosen = fewer
-        return Chosen(chosen, self._value(chosen))
+        return chosen
 
     def _draw(self, n: int, generator: np.random.Generator) -> Integers:
         return generator.choice(self.system.n_candidates, size=n, replace=False).astype(np.int64)
 
-    def curve(self, found: Chosen, generator: np.random.Generator, n_references: int) -> tuple[CurvePoint, ...]:
+    def curve(self, found: Integers, generator: np.random.Generator, n_references: int) -> tuple[CurvePoint, ...]:
         """Expected errors of fewer poses, and of as many.
 
         Args:
@@ -251,24 +163,15 @@ class Chooser:
             generator: Draws random sets.
             n_references: Number of reference poses, which count too.
         """
-        most = len(found.candidates)
+        most, points = len(found), []
         numbers = np.round(np.geomspace(MIN_CURVE, max(most + n_references, MIN_CURVE), N_CURVE)).astype(np.int64)
-        points = []
         for k in sorted({n - n_references for n in numbers.tolist() if 0 < n - n_references < most} | {most}):
-            chosen = found.candidates if k == most else self.quickly(k).candidates
-            points.append(CurvePoint(k + n_references, self.error(chosen), self._band(k, generator)))
+            n_random = N_RANDOM if self._exact is None else N_RANDOM_EXACT
+            random = [self.error(self._draw(k, generator)) for _ in range(n_random)]
+            low, middle, high = np.quantile(random, [0.1, 0.5, 0.9], method="nearest").tolist()
+            designed = self.error(found if k == most else self.quickly(k))
+            points.append(CurvePoint(k + n_references, designed, (low, middle, high)))
         return tuple(points)
-
-    def _band(self, n: int, generator: np.random.Generator) -> tuple[float, float, float]:
-        """Errors that a tenth, half and nine tenths of random sets of n do not exceed."""
-        if self.system.unknown > UNKNOWN_SHARE:
-            return (float("inf"),) * 3
-        if self._exact is None:
-            errors = np.sqrt(draw_sets(self._error, n, generator)[0])
-        else:
-            errors = np.array([self._exact(self._draw(n, generator)) for _ in range(N_EXACT)])
-        low, middle, high = np.quantile(errors, [0.1, 0.5, 0.9], method="nearest").tolist()
-        return low, middle, high
 
 
 # --- the order in which to visit poses ---
