@@ -9,10 +9,9 @@ and over the rows of one kind
 
 It is compared with a chi-square distribution of `nu = (tr A)^2 / tr(A^2)` degrees of freedom, scaled to that mean
 (Satterthwaite 1946). p-values are upper ones: the probability that the specified noise makes a sum as large; near 0 the
-residuals are too large, near 1 too small. Of more than `MAX_INDEPENDENT` rows weighted as independent although they
-share errors the mean is that of all rows, shared among the kinds by leverage, and there is no p-value.
-
-A row with robust weight w counts as w rows. There is no p-value where weights or noise came from the residuals.
+residuals are too large, near 1 too small. A row with robust weight w counts as w rows. There is no p-value where
+weights or noise came from the residuals, nor where rows share errors but are weighted as independent: then the mean is
+that of all rows, shared among the kinds by leverage.
 
 Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off. Each kind is judged by
 the sum of its studentised squares. All of them together are judged by `r^T A^-1 r`, which is sensitive where the arm is
@@ -26,7 +25,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -35,7 +34,7 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
-from fg_calib.graph import JOINT_NOISE, Problem, Solution, effect, linear_system, mahalanobis_distances, tuning, weight
+from fg_calib.graph import JOINT_NOISE, Solution, effect, linear_system, mahalanobis_distances, tuning, weight
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
@@ -46,11 +45,8 @@ from fg_calib.statistics.residual_table import ALARM, MAX_OUTLIER_SHARE, Residua
 
 Codes = NDArray[np.int8]
 
-MAX_INDEPENDENT = 3000
-"""Rows up to which the covariance of residuals is formed where they are weighted as independent but are not."""
-
-MAX_KEPT = 300_000
-"""Rows up to which derivatives and shared errors are kept, to look at parts of them again."""
+MAX_INDEPENDENT, MAX_KEPT = 3000, 300_000
+"""Rows up to which derivatives are kept, to look at parts of them again: without and with shared errors."""
 
 MAX_WHITENED = 1000
 """Predicted rows up to which all are whitened together; of more, so many that are evenly spaced."""
@@ -137,23 +133,21 @@ class KindFit:
             unlikely = min(p, 1.0 - p) < ALARM / 2.0
         if not unlikely or abs(ratio - 1.0) < 0.05:
             return "as stated"
-        if ratio < 1.0:
-            return "too large"
+        return "too large" if ratio < 1.0 else self._why_too_small(ratio)
+
+    def _why_too_small(self, ratio: float) -> str:
+        """The verdict on residuals that are too large."""
+        rest = self.rest
+        if rest is not None and rest.verdict in ("as stated", "too large"):
+            return "outliers" if self.spoilt else "others"
+        if rest is not None and rest.seen_over_stated**2 - 1.0 < LEAST_GAIN * (self.seen_over_stated**2 - 1.0):
+            return "both"
         share = (self.typical**2 - 1.0) / (ratio**2 - 1.0)  # of the excess that rows have in common
-        if self.rest is not None and (without := self._without_gross_errors(self.rest)):
-            return without
         far = self.largest > suspect_level(self.n) * np.sqrt(max(self.typical, 1.0) * ratio)
         if share > 0.65 or not far:
             return "too small"  # the median of few rows varies: perhaps none of them is far from the others
         many = self.n_beyond > MAX_OUTLIER_SHARE * self.n
         return "many" if many else "outliers" if share < 0.35 else "both"
-
-    def _without_gross_errors(self, rest: KindFit) -> str:
-        """What is said where gross errors are known; empty if they are not what is wrong."""
-        if rest.verdict in ("as stated", "too large"):
-            return "outliers" if self.spoilt else "others"
-        gain = (self.seen_over_stated**2 - 1.0) * LEAST_GAIN
-        return "both" if rest.seen_over_stated**2 - 1.0 < gain else ""
 
 
 VERDICTS = {
@@ -356,7 +350,6 @@ class JudgedRows:
         means: Means of these.
         covariance: Of the residuals over sigma; None where that is not known.
         shared: Whether rows share errors of configurations.
-        noise_degrees: Degrees of freedom of the noise that rows were divided by, by kind; infinite where specified.
     """
 
     table: ResidualTable
@@ -365,7 +358,6 @@ class JudgedRows:
     means: Floats
     covariance: ResidualCovariance | None
     shared: bool
-    noise_degrees: dict[int, float] = field(default_factory=dict)
 
     def of_kind(self, code: int) -> Integers:
         """Places among the judged rows of one of the table's groups."""
@@ -380,12 +372,6 @@ class JudgedRows:
         nu = trace**2 / square if square > 0.0 else 1.0
         return nu if self.covariance is not None or not self.shared else min(nu, 3.0)
 
-    def degrees_of_noise(self, chosen: Integers) -> float:
-        """Degrees of freedom of the noise that some rows were divided by."""
-        by_kind = np.bincount(self.table.group[self.rows[chosen]], self.means[chosen], len(self.table.groups))
-        variance = sum(float(by_kind[code]) ** 2 / degrees for code, degrees in self.noise_degrees.items())
-        return float(np.sum(by_kind)) ** 2 / variance if variance > 0.0 else np.inf
-
     def suspect_configurations(self) -> tuple[SuspectConfiguration, ...]:
         """Configurations whose rows are too large together, the least likely first."""
         (place, end), n = self.table.row_ends(self.rows), len(self.table.names)
@@ -395,11 +381,12 @@ class JudgedRows:
         # No effective number of degrees of freedom is below 1, where the tail is heaviest.
         least, found = 2.0 * special.erfcinv(limit) ** 2, []
         for k in np.flatnonzero(known & (chi2 > least * expected)).tolist():
-            nu, ratio = max(1.0, self.degrees(np.unique(place[end == k]))), chi2[k] / expected[k]
-            if upper_probability(ratio, nu) < limit:
-                strength = 0.5 * nu * (ratio - 1.0 - np.log(ratio))  # -log p, nearly; never underflows
-                found.append((strength, SuspectConfiguration(k, int(count[k]), float(chi2[k]), float(expected[k]))))
-        return tuple(one for _, one in sorted(found, key=lambda pair: -pair[0]))
+            ratio = chi2[k] / expected[k]
+            p = upper_probability(ratio, max(1.0, self.degrees(np.unique(place[end == k]))))
+            if p < limit:
+                one = SuspectConfiguration(k, int(count[k]), float(chi2[k]), float(expected[k]))
+                found.append((p, -ratio, k, one))
+        return tuple(one for *_, one in sorted(found))
 
 
 class RowStatistics:
@@ -416,42 +403,33 @@ class RowStatistics:
         weight: See `Goodness`.
         robust: Whether a robust loss weights the rows.
         fitted: The rows fitted.
-        errors: What the fitted rows follow from, over sigma; None where that takes too much memory.
+        errors: What the fitted rows follow from, over sigma; None where that is not known, or takes too much memory.
         predicted: The rows predicted that can be judged.
     """
 
     def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
-        problem = self.problem = solution.problem
-        self.table, self.spread, self.solution, self._noises = table, spread, solution, solution.noises
-        self.robust, self.carried = problem.state.weights is not None, not problem.missing_correlation
+        problem = solution.problem
+        self.solution, self.spread, self.table = solution, spread, table
+        self.robust, self._shared = problem.state.weights is not None, any(noise.sources for noise in solution.noises)
         self.weight: Floats = np.ones(table.n) if self.robust else np.broadcast_to(1.0, table.n)
         for number, weights in enumerate(problem.state.weights or ()):
             mine = table.rows_of(number)
             self.weight[mine] = weights[table.measurement[mine]]
         fitted, test = np.flatnonzero(table.used), np.flatnonzero(table.test & (table.reason_code == 0))
-        self._shared = any(noise.sources for noise in self._noises)
-        most = MAX_KEPT if self.carried and self._shared else MAX_INDEPENDENT
-        keep = np.zeros(table.n, dtype=np.bool_)
-        keep[fitted] = len(fitted) <= most and not self.robust
-        keep[test] = len(test) <= MAX_KEPT
+        known = len(fitted) <= (MAX_KEPT if self._shared else MAX_INDEPENDENT)
+        known &= not (self.robust or problem.missing_correlation)
+        keep = (table.used & known) | (table.test & (len(test) <= MAX_KEPT))
         kept, of_kept = np.flatnonzero(keep), self._read(keep)
         w = self.weight
         variance = np.where(table.used, 1.0 - 2.0 * w, 1.0)  # in place, as of a million rows each array counts
         variance *= self.leverage
         variance += 1.0
-        covariance, self.errors = None, None
-        if keep[fitted].all():
-            self.errors = of_kept.at(np.searchsorted(kept, fitted))
-            if self.carried:
-                covariance = self.errors.fitted(spread.tangent)
-            else:
-                of = table.measurement_number[fitted]
-                covariance = self.errors.fitted_as_independent(spread.tangent, of)
-                variance[fitted] = covariance.diagonal
         with np.errstate(invalid="ignore", divide="ignore"):
             self.studentised: Floats = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
             squares = (table.after / table.sigma) ** 2
         self.studentised[variance < LEAST_VARIANCE] = np.nan
+        self.errors = of_kept.at(np.searchsorted(kept, fitted)) if known else None
+        covariance = None if self.errors is None else self.errors.fitted(spread.tangent)
         chosen = slice(None) if len(fitted) == table.n else fitted
         of_fitted, means = w[chosen] * squares[chosen], w[chosen] * variance[chosen]
         self.fitted = JudgedRows(table, fitted, of_fitted, means, covariance, self._shared)
@@ -459,11 +437,11 @@ class RowStatistics:
 
     def _read(self, keep: Booleans) -> RowErrors:
         """Leverage of every row; what the rows to keep follow from, over sigma."""
-        table, tangent = self.table, self.spread.tangent
-        model = RowModel(self.problem, self.solution.parameters, self._noises)
+        table, tangent, noises = self.table, self.spread.tangent, self.solution.noises
+        model = RowModel(self.solution.problem, self.solution.parameters, noises)
         self.leverage: Floats = np.full(table.n, np.nan)
         kept, root, asked = [model.empty()], square_root(tangent), keep | table.test
-        for number, noise in enumerate(self._noises):
+        for number, noise in enumerate(noises):
             measured, last = noise.series.measured, table.rows_of(number).start
             step = _CHUNK if model.is_plain(number) else _CHUNK_WITH_STATES
             for start in range(0, noise.series.n, step):
@@ -478,23 +456,23 @@ class RowStatistics:
                     continue
                 found = model.errors(number, np.arange(chunk.start, chunk.stop))
                 found = found.at(np.flatnonzero(measured[chunk])).over(table.sigma[rows])
-                leverage, test = np.einsum("ij,ij->i", found.J @ tangent, found.J), table.test[rows]
-                leverage[test] = self.spread.variance(found.J[test])
-                self.leverage[rows] = leverage + np.sum(found.own**2, axis=1) + (found.noise - 1.0)
+                self.leverage[rows] = (
+                    np.einsum("ij,ij->i", found.J @ found.of_all(tangent), found.J) + found.noise - 1.0
+                )
+                lost = table.test[rows] & np.isnan(self.spread.variance(found.J[:, : len(tangent)]))
+                self.leverage[rows][lost] = np.nan
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
         return RowErrors.joined(kept)
 
     def fit_kinds(self) -> tuple[KindFit, ...]:
         """The fit of the fitted rows by kind."""
-        part, excess = self.fitted, np.zeros(len(self.table.groups))
-        if not self.carried and part.covariance is None:
-            leverage = np.nan_to_num(self.weight[part.rows] * self.leverage[part.rows])
-            by_kind = np.bincount(self.table.group[part.rows], leverage, len(excess))
-            excess[:] = self.spread.excess * by_kind / max(float(by_kind.sum()), 1e-300)
+        part, n_groups = self.fitted, len(self.table.groups)
+        leverage = np.nan_to_num(self.weight[part.rows] * self.leverage[part.rows])
+        by_kind: Floats = np.bincount(self.table.group[part.rows], leverage, n_groups).astype(np.float64)
+        excess = self.spread.excess * by_kind / max(float(by_kind.sum()), 1e-300)
         known = not self.robust and self.solution.estimated_noise is None
-        known &= part.covariance is not None or not self._shared
-        return self._fit_kinds(part, excess, known)
+        return self._fit_kinds(part, excess, known and (part.covariance is not None or not self._shared))
 
     def fit_predicted(self, suspects: Integers) -> PredictedFit | None:
         """The fit of the predicted rows; None without any that can be judged.
@@ -503,61 +481,63 @@ class RowStatistics:
             suspects: The rows of the table among them that are too large.
         """
         part, table = self.predicted, self.table
-        test = np.flatnonzero(table.test & (table.reason_code == 0))
+        test, n = np.flatnonzero(table.test & (table.reason_code == 0)), len(part.rows)
         outliers = self._count_outliers(test)
-        if not (len(part.rows) or outliers.test):
+        if not (n or outliers.test):
             return None
-        chosen = np.arange(len(part.rows))
-        if part.covariance is not None and len(chosen):
-            chosen = np.unique(np.linspace(0, len(chosen) - 1, min(len(chosen), MAX_WHITENED)).round().astype(np.int64))
+        chosen = np.arange(n)
+        if part.covariance is not None and n:
+            chosen = np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
             z = np.sign(table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
-            chi2, expected, nu = part.covariance.at(chosen).whitened(z)
+            chi2, expected, nu = part.covariance.whitened(z, chosen)
         else:
-            chi2, expected, nu = float(np.sum(part.squares)), float(np.sum(part.means)), part.degrees(chosen)
-        of_noise = part.degrees_of_noise(np.arange(len(part.rows)))
+            chi2, expected, nu = float(np.sum(part.squares)), float(n), part.degrees(chosen)
+        of_noise = self._degrees_of_noise(np.arange(len(self.fitted.rows)))
         return PredictedFit(
             kinds=self._fit_kinds(part, np.zeros(len(table.groups)), known=True),
-            n_rows=len(part.rows),
+            n_rows=n,
             n=len(chosen),
             outliers=outliers,
             n_unknown=int(np.sum(~np.isfinite(self.leverage[test]))),
             chi2=chi2,
             expected=expected,
-            p_value=upper_probability(chi2 / expected, nu, of_noise) if len(part.rows) else 1.0,
+            p_value=upper_probability(chi2 / expected, nu, of_noise) if n else 1.0,
             suspects=suspects,
             configurations=part.suspect_configurations() if not self.robust else (),
         )
 
+    def _degrees_of_noise(self, fitted: Integers) -> float:
+        """Degrees of freedom by which some fitted rows estimated their noise; infinite where it is specified."""
+        estimated = self.solution.estimated_noise is not None and len(fitted)
+        return max(1.0, self.fitted.degrees(fitted)) if estimated else np.inf
+
     def _fit_kinds(self, part: JudgedRows, excess: Floats, known: bool) -> tuple[KindFit, ...]:
         """The fit of each of the table's groups, whose chi-square has a mean lower by `excess`."""
-        factors, found = self.problem.state.factors, list[KindFit]()
-        for code, (number, family) in enumerate(self.table.groups):
+        factors, table, found = self.solution.problem.state.factors, self.table, list[KindFit]()
+        for code, (number, family) in enumerate(table.groups):
             chosen = part.of_kind(code)
             if not len(chosen):
                 continue
             rows = part.rows[chosen]
             total, mean = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen]))
             expected, degrees, size = mean - excess[code], part.degrees(chosen), np.abs(self.studentised[rows])
-            enough = expected >= 1.0
-            own_factor, total_variance = factors.get((number, family), 1.0), float(np.mean(self.table.sigma[rows] ** 2))
-            joint_variance = float(np.mean(self._joint_variance[rows]))
-            own_variance = max(total_variance - joint_variance, 0.0) / own_factor**2
+            of_noise = np.inf if part is self.fitted else self._degrees_of_noise(self.fitted.of_kind(code))
+            enough, own_factor = expected >= 1.0, factors.get((number, family), 1.0)
+            variance, joint_variance = (float(np.mean(v[rows])) for v in (table.sigma**2, self._joint_variance))
+            own_variance = max(variance - joint_variance, 0.0) / own_factor**2
             specified = own_variance + joint_variance / factors.get(JOINT_NOISE, 1.0) ** 2
-            factor = float(np.sqrt(total_variance / specified)) if joint_variance else own_factor
-            p_value = (
-                upper_probability(total / mean, degrees, part.degrees_of_noise(chosen)) if enough and known else None
-            )
+            factor = float(np.sqrt(variance / specified)) if joint_variance else own_factor
             found.append(
                 KindFit(
                     kind=family,
-                    unit=self.table.unit(family),
+                    unit=table.unit(family),
                     n=len(rows),
-                    stated_sigma_rms=float(np.sqrt(total_variance)) / factor,
+                    stated_sigma_rms=float(np.sqrt(variance)) / factor,
                     factor=factor,
                     seen_over_stated=factor * float(np.sqrt(total / expected)) if enough else np.nan,
                     chi2=total,
                     expected=max(float(expected), 0.0),
-                    p_value=p_value,
+                    p_value=upper_probability(total / mean, degrees, of_noise) if enough and known else None,
                     typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
                     largest=float(np.nanmax(size)) if enough else np.nan,
                     degrees=degrees,
@@ -573,7 +553,7 @@ class RowStatistics:
     def _joint_variance(self) -> Floats:
         """Variance of each row by the noise of the joint readings, shape (n,)."""
         variance = np.zeros(self.table.n)
-        for number, noise in enumerate(self._noises):
+        for number, noise in enumerate(self.solution.noises):
             for source in (source for source in noise.sources if source.name == "joints"):
                 of_rows = np.einsum("nii->ni", source.variance)
                 variance[self.table.rows_of(number)] += of_rows[noise.series.measured]
@@ -593,22 +573,12 @@ class RowStatistics:
         rows, table = test[judged], self.table
         means, covariance = 1.0 + self.leverage[rows], None
         if np.isin(rows, kept).all():
-            found = of_kept.at(np.searchsorted(kept, rows))
-            covariance = found.predicted(self.spread.tangent, self.spread.actual)
-            means = covariance.diagonal
-            covariance = covariance.over(np.sqrt(means))
+            errors, of = of_kept.at(np.searchsorted(kept, rows)), (self.spread.tangent, self.spread.actual)
+            means = errors.predicted(*of).diagonal
+            covariance = errors.over(np.sqrt(means)).predicted(*of)
             with np.errstate(invalid="ignore"):
                 self.studentised[rows] = table.after[rows] / (table.sigma[rows] * np.sqrt(means))
-        estimated, joint = (
-            set(self.solution.estimated_noise or ()),
-            set(table.group[self._joint_variance > 0.0].tolist()),
-        )
-        degrees = {
-            code: max(1.0, self.fitted.degrees(self.fitted.of_kind(code)))
-            for code, group in enumerate(table.groups)
-            if group in estimated or (JOINT_NOISE in estimated and code in joint)
-        }
-        return JudgedRows(table, rows, squares[judged] / means, np.ones(len(rows)), covariance, self._shared, degrees)
+        return JudgedRows(table, rows, squares[judged] / means, np.ones(len(rows)), covariance, self._shared)
 
     def _count_outliers(self, test: Integers) -> OutlierCounts:
         if not self.robust:
@@ -619,15 +589,13 @@ class RowStatistics:
 
     def _robust_weights(self, rows: Integers) -> Floats:
         """The weights that the loss would give to predicted rows, shape (n,)."""
-        out, table, loss = np.ones(len(rows)), self.table, self.problem.options.loss
-        for number, noise in enumerate(self._noises if self.robust else ()):
-            mine = np.flatnonzero(table.series[rows] == number)
-            measurement, (e, residual_dim) = table.measurement[rows[mine]], noise.lengths()
-            n = len(e)
-            count = np.maximum(np.bincount(measurement, minlength=n), 1)
-            more = np.bincount(measurement, np.nan_to_num(self.leverage[rows[mine]]), n) / count
-            c = np.array([tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)])[residual_dim]
-            out[mine] = weight(loss, e / np.sqrt(np.maximum(1.0 + more, LEAST_VARIANCE)), c)[measurement]
+        if not (self.robust and len(rows)):
+            return np.ones(len(rows))
+        table, loss = self.table, self.solution.problem.options.loss
+        variance = table.sigma[rows] ** 2 * np.maximum(1.0 + np.nan_to_num(self.leverage[rows]), LEAST_VARIANCE)
+        _, of, n_rows = np.unique(table.measurement_number[rows], return_inverse=True, return_counts=True)
+        length = np.sqrt(np.bincount(of, table.after[rows] ** 2 / variance))
+        out: Floats = weight(loss, length, np.array([tuning(loss, n) for n in n_rows.tolist()]))[of]
         return out
 
 
@@ -687,33 +655,25 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
     """
     problem = solution.problem
     chi2, n_rows, of_loss = _weighted_chi2(solution)
-    dof = (
-        n_rows
-        + problem.n_priors
-        + problem.n_added
-        + problem.n_known
-        - spread.rank
-        - linear_system(problem, solution.parameters).left.rank
-    )
+    dof = n_rows + problem.n_priors + problem.n_added + problem.n_known - spread.rank
+    dof -= linear_system(problem, solution.parameters).left.rank
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
-    independent = _independent_dof(problem, dof, spread.rank)
-    p_value = _p_value(solution, chi2, expected, independent)
-    return ChiSquare(chi2, dof, expected, chi2_bounds(dof, expected, independent), p_value)
+    known = dof > 0 and problem.state.weights is None and solution.estimated_noise is None
+    p_value = float(special.chdtrc(dof, chi2)) if known and not problem.missing_correlation else None
+    return ChiSquare(chi2, dof, expected, chi2_bounds(dof, expected), p_value)
 
 
-def chi2_bounds(dof: int, expected: float | None = None, independent: int | None = None) -> tuple[float, float]:
+def chi2_bounds(dof: int, expected: float | None = None) -> tuple[float, float]:
     """Interval of the reduced chi-square taken as good: its central `CONFIDENCE`, widened to `FACTOR` either way.
 
     Args:
-        dof: Degrees of freedom that chi-square is divided by.
+        dof: Degrees of freedom.
         expected: Mean of chi-square; `dof` if None.
-        independent: Degrees of freedom of the noise behind it; `dof` if None.
     """
     if dof <= 0:
         return 0.0, np.inf
-    k = max(1, min(dof, independent or dof))
     ratio = 1.0 if expected is None else expected / dof
-    low, high = (2.0 * special.gammaincinv(k / 2.0, p) / k for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
+    low, high = (2.0 * special.gammaincinv(dof / 2.0, p) / dof for p in ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2))
     return ratio * min(float(low), 1.0 / FACTOR), max(1.0, ratio) * max(float(high), FACTOR)
 
 
@@ -736,19 +696,3 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
         expected += kept * effect(problem.options.loss, int(residual_dim.max(initial=1))).chi2
     of_loss = expected / n_kept if n_kept else 1.0
     return max(0.0, chi2), round(problem.n_independent * n_kept / max(n_rows, 1.0)), of_loss
-
-
-def _p_value(solution: Solution, chi2: float, expected: float, independent: int) -> float | None:
-    """Upper p-value of chi-square, scaled to its mean; None where weights or noise came from the residuals."""
-    problem = solution.problem
-    if problem.state.weights is not None or solution.estimated_noise is not None or expected <= 0.0 or independent <= 0:
-        return None
-    return float(special.gammaincc(independent / 2.0, chi2 / expected * independent / 2.0))
-
-
-def _independent_dof(problem: Problem, dof: int, rank: int) -> int:
-    """Degrees of freedom of the noise behind the residuals: pairs hold no more than the poses they come from."""
-    if not (problem.formed and problem.missing_correlation) or len(problem.data.series) > 1:
-        return dof
-    each = 3 * problem.data.series[0].kind.residual_dim
-    return min(dof, each * (problem.n_configurations - 1) + problem.n_priors - rank)

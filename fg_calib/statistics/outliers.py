@@ -23,12 +23,10 @@ References:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy.linalg
-import scipy.sparse
 from scipy import special
 
 from fg_calib.graph import PRIVATE_SHARE, Problem, Solution, prior_rows, solve, with_factors
@@ -38,13 +36,8 @@ from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, RowStatis
 from fg_calib.statistics.residual_covariance import RowErrors
 from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table
 
-Sparse = scipy.sparse.csr_array
-
-MAX_ROWS = 20_000
-"""Rows up to which outliers are looked for: of more, few of them spoil little."""
-
-MAX_SHARED_ROWS = 3000
-"""The same where rows share errors: the inverse of their covariance is dense."""
+MAX_ROWS = 3000
+"""Rows up to which outliers are looked for: the inverse of their covariance is dense."""
 
 MAX_UNIT = 200
 """Rows of one configuration up to which they may be one outlier."""
@@ -68,7 +61,7 @@ def find_outliers(
     tangent: Floats,
     units: Sequence[Integers],
     dof: float,
-    priors: tuple[Floats, Floats] | None = None,
+    priors: tuple[Floats, Floats],
 ) -> Booleans | None:
     """The few measurements that spoil a fit, shape (n,); None if there are none, or not few, or it is not known.
 
@@ -80,99 +73,66 @@ def find_outliers(
         dof: Degrees of freedom of rows and priors.
         priors: Whitened residuals of the core's priors there, and their derivatives.
     """
-    W = _inverse_noise(errors)
     if dof < 1.0:
         return None
-    r_prior, J_prior = priors if priors is not None else (np.zeros(0), np.zeros((0, len(tangent))))
-    P = errors.root(tangent)
-    B, along = W @ P, tangent @ (J_prior.T @ r_prior)
-    # At the optimum of the linearised problem, where priors and rows lead to:
-    e = z - errors.J @ along - P @ (B.T @ z)
-    u = W @ e
-    step = -along - tangent @ (errors.J.T @ (W @ z))
-    search = _Search(W, u, B, units, float(e @ u) + float(np.sum((r_prior + J_prior @ step) ** 2)), dof)
-    while np.any(search.leave_out()):
-        pass
-    return search.best()
+    (r_prior, J_prior), T, J = priors, errors.of_all(tangent), errors.J
+    J_prior = np.pad(J_prior, ((0, 0), (0, len(T) - len(tangent))))
+    d = np.maximum(errors.private, PRIVATE_SHARE * errors.noise)
+    W = np.linalg.inv((errors.L @ errors.L.T).toarray() + np.diag(d))
+    step = -T @ (J.T @ (W @ z) + J_prior.T @ r_prior)  # to the optimum of the linearised problem
+    e, WJ = z + J @ step, W @ J
+    chi2 = float(e @ W @ e + np.sum((r_prior + J_prior @ step) ** 2))
+    by_size = [np.array([unit for unit in units if len(unit) == size]) for size in sorted({len(u) for u in units})]
+    least = [LEAST_INFORMATION * np.diag(W)[rows].mean(axis=1) for rows in by_size]
+    return _search(W @ e, W - WJ @ T @ WJ.T, list(zip(by_size, least, strict=True)), chi2, dof)
 
 
-def _inverse_noise(errors: RowErrors) -> Sparse:
-    """C^-1 of rows by their noise, shape (n, n)."""
-    d, L = np.maximum(errors.private, PRIVATE_SHARE * errors.noise), errors.L
-    if not L.nnz:
-        return Sparse(scipy.sparse.diags_array(1.0 / d))
-    factor = scipy.linalg.cho_factor((L @ L.T).toarray() + np.diag(d))
-    return Sparse(scipy.linalg.cho_solve(factor, np.eye(len(d))))
+def _search(u: Floats, Q: Floats, units: list[tuple[Integers, Floats]], chi2: float, dof: float) -> Booleans | None:
+    """Rows left out, step by step, when the gain was least likely by chance, shape (n,).
 
-
-class _Search:
-    """Units left out of a fit, step by step.
+    None if it may be chance, or if more should be left out than may be.
 
     Args:
-        W: C^-1, shape (n, n).
         u: See the module's head, shape (n,).
-        B: With Q = C^-1 - B B^T, shape (n, m).
-        units: Rows that may be left out together.
+        Q: See there, shape (n, n).
+        units: Rows of units of one size, shape (n_units, size), and their least information, shape (n_units,).
         chi2: Chi-square with all of them.
         dof: Its degrees of freedom.
     """
-
-    def __init__(self, W: Sparse, u: Floats, B: Floats, units: Sequence[Integers], chi2: float, dof: float) -> None:
-        self._W, self._n_units, self._many = W, len(units), False
-        self._steps = [(np.zeros(len(u), dtype=np.bool_), u, B, chi2, dof, 0)]
-        self._units = [
-            np.array([unit for unit in units if len(unit) == size]) for size in sorted({len(unit) for unit in units})
-        ]
-        self._least, self._Q = [], []
-        for rows in self._units:
-            grid = np.broadcast_arrays(rows[:, :, None], rows[:, None, :])
-            block = np.asarray(W[grid[0].ravel(), grid[1].ravel()]).reshape(grid[0].shape)
-            self._least.append(LEAST_INFORMATION * np.einsum("mii->m", block) / rows.shape[1])
-            self._Q.append(block - B[rows] @ np.swapaxes(B[rows], 1, 2))
-
-    def leave_out(self) -> Booleans:
-        """Leave out the worst; the rows that were, none if there is nothing that may be."""
-        out, u, B, chi2, dof, count = self._steps[-1]
-        found = []
-        for rows, Q, least in zip(self._units, self._Q, self._least, strict=True):
-            values, V = np.linalg.eigh(Q)
-            kept = values > least[:, None]
-            squares = np.einsum("mij,mi->mj", V, u[rows]) ** 2 / np.where(kept, values, 1.0)
-            drops, ranks = np.sum(np.where(kept, squares, 0.0), axis=1), kept.sum(axis=1)
-            found += [
-                (log_chance(1.0 - drop / chi2, dof - rank, rank), *unit)
-                for drop, rank, unit in zip(drops.tolist(), ranks.tolist(), rows.tolist(), strict=True)
-                if 0 < rank < dof and drop < chi2
-            ]
+    out, count, given, best, found = np.zeros(len(u), dtype=np.bool_), 0, (chi2, dof), float(np.log(CHANCE)), None
+    n = sum(len(rows) for rows, _ in units)
+    while True:
         new = np.zeros_like(out)
-        for chance, *unit in sorted(found)[: max(1, int(BATCH_SHARE * count))]:
+        for chance, unit in sorted(_chances(u, Q, units, chi2, dof))[: max(1, int(BATCH_SHARE * count))]:
             if chance < 0.0 and not new[unit].any() and not out[unit].all():
                 new[unit], count = True, count + 1
-        self._many = bool(np.sum(out | new) > MAX_OUTLIER_SHARE * len(out))
-        if not new.any() or self._many:
-            return np.zeros_like(out)
+        many = bool(np.sum(out | new) > MAX_OUTLIER_SHARE * len(out))
+        if not new.any() or many:
+            return None if many and found is out else found  # the last step was the best, and more are to follow
         chosen = np.flatnonzero(new & ~out)
-        columns = self._W[:, chosen].toarray() - B @ B[chosen].T
-        values, V = np.linalg.eigh(columns[chosen])
-        kept = values > LEAST_INFORMATION * float(np.trace(columns[chosen])) / len(chosen)
+        values, V = np.linalg.eigh(Q[np.ix_(chosen, chosen)])
+        kept = values > LEAST_INFORMATION * float(np.mean(np.diag(Q)[chosen]))
         half = V[:, kept] / np.sqrt(values[kept])
-        F, step = columns @ half, half.T @ u[chosen]
-        self._Q = [Q - F[of] @ np.swapaxes(F[of], 1, 2) for of, Q in zip(self._units, self._Q, strict=True)]
-        left = max(chi2 - float(step @ step), 1e-12 * chi2)
-        self._steps.append((out | new, u - F @ step, np.hstack([B, F]), left, dof - float(kept.sum()), count))
-        return new
+        F, step, out = Q[:, chosen] @ half, half.T @ u[chosen], out | new
+        u, Q = u - F @ step, Q - F @ F.T
+        chi2, dof = max(chi2 - float(step @ step), 1e-12 * chi2), dof - float(kept.sum())
+        ways = -float(special.betaln(count + 1, n - count + 1) + np.log(n + 1.0))  # log of how many to choose k of n
+        chance = log_chance(chi2 / given[0], dof, given[1] - dof) + ways
+        if chance < best:
+            best, found = chance, out
 
-    def best(self) -> Booleans | None:
-        """What was left out when the gain was least likely by chance; None if it may be, or more should be."""
-        (chi2, dof), n = self._steps[0][3:5], self._n_units
-        chances = [
-            log_chance(left / chi2, now, dof - now) - float(special.betaln(k + 1, n - k + 1) + np.log(n + 1.0))
-            for *_, left, now, k in self._steps[1:]
-        ]  # times the number of ways to choose k of n
-        best = int(np.argmin(chances)) if chances else 0
-        if not chances or chances[best] > np.log(CHANCE) or (self._many and best == len(chances) - 1):
-            return None
-        return self._steps[best + 1][0]
+
+def _chances(
+    u: Floats, Q: Floats, units: list[tuple[Integers, Floats]], chi2: float, dof: float
+) -> Iterator[tuple[float, list[int]]]:
+    """Logarithm of the probability that leaving a unit out gains as much by chance, and its rows, unit by unit."""
+    for of_size, least in units:
+        values, V = np.linalg.eigh(Q[of_size[:, :, None], of_size[:, None, :]])
+        kept = values > least[:, None]
+        squares = np.where(kept, np.einsum("mij,mi->mj", V, u[of_size]) ** 2 / np.where(kept, values, 1.0), 0.0)
+        for drop, rank, unit in zip(squares.sum(axis=1), kept.sum(axis=1).tolist(), of_size.tolist(), strict=True):
+            if 0 < rank < dof and drop < chi2:
+                yield log_chance(1.0 - drop / chi2, dof - rank, rank), unit
 
 
 def log_chance(left: float, dof: float, m: float) -> float:
@@ -205,8 +165,7 @@ def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTa
     robust = solution.problem.state.weights is not None or solution.estimated_noise is not None
     if robust or _is_fine(fit) or solution.problem.evaluated or solution.problem.has_more:
         return fit
-    shared = any(noise.sources for noise in solution.noises)
-    if table.n > MAX_ROWS or (shared and int(np.sum(table.used)) > MAX_SHARED_ROWS):
+    if np.sum(table.used) > MAX_ROWS:
         return replace(fit, searched=False)
     found = _fit_without_outliers(solution, table, (solution, spread, table))
     if found is None or not _is_fine(found[2]):  # the nominal arm is nearer to the truth than a fit that went astray
@@ -228,10 +187,10 @@ def _outlier_rows(state: _State) -> Booleans | None:
     solution, spread, table = state
     problem, statistics = solution.problem, RowStatistics(*state)
     rows, errors = statistics.fitted.rows, statistics.errors
-    if statistics.robust or not statistics.carried or errors is None:
+    if errors is None:
         return None
     dof = problem.n_independent + problem.n_priors + problem.n_added + problem.n_known
-    dof -= spread.rank + errors.own.shape[1]
+    dof -= spread.rank + errors.J.shape[1] - len(spread.tangent)
     z, priors = table.after[rows] / table.sigma[rows], prior_rows(problem.variables, solution.parameters)
     found = find_outliers(z, errors, spread.tangent, _units(table, rows), dof, priors)
     if found is None:

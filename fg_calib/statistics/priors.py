@@ -24,15 +24,14 @@ is the likelihood with u integrated out. The estimate is `u = W a`, its covarian
     dL / dtheta_k           = sum over k of (a_i^2 + C_ii - 1)
     d2L / dtheta_k dtheta_l = 4 a_k^T C_kl a_l + 2 |C_kl|^2 - delta_kl 2 sum over k of (a_i^2 + C_ii)
 
-of which the mean is `-2 |(1 - C)_kl|^2`: a correction that data determine counts 2, one that they do not, nothing.
 `sum over k of (1 - C_ii)` is how many corrections of a group the data determine.
 
 The scales have priors themselves: all may be off by a common factor, 1 sigma of which is 5 (`COMMON_SIGMA`), and each
 group by another of 3 (`GROUP_SIGMA`). So a group that the data do not determine follows the others, and one of a single
-correction that happens to be nil does not collapse. The posterior of theta is taken as normal: its axes are those of
-the curvature at the mode (Laplace), its mean and variance along each are integrated, for it is skew where few
-corrections are determined. The scale taken is the mean. The mean over the posterior, by cubature at points on its axes,
-of `W C W + (W a - u) (W a - u)^T` minus W C W is what unknown scales add to the covariance.
+correction that happens to be nil does not collapse. The posterior of theta is integrated along the axes of its
+curvature at the mode (Laplace), one by one, for it is skew where few corrections are determined. The scale taken is the
+mean. What unknown scales add to the covariance of the corrections is by the law of total variance, with the same
+points: the mean of W C W, minus that at the mean scales, and the covariance of W a.
 
 At each solution the scales are estimated, then everything is solved again with their prior sigmas, until no scale
 moves: two or three rounds where the arm is nearly linear. Elsewhere scales may oscillate, so steps back are shortened.
@@ -54,6 +53,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy import special
+from scipy.optimize import minimize
 
 from fg_calib.graph import (
     RANK_TOLERANCE,
@@ -85,17 +85,17 @@ MAX_ROUNDS = 30
 COMMON_SIGMA, GROUP_SIGMA = float(np.log(5.0)), float(np.log(3.0))
 """Prior sigma of the logarithm of a scale: of all together, and of each group."""
 
-MAX_STEP, MAX_STEPS = 2.0, 100
-"""Longest step of the logarithm of a scale, and number of steps to the mode."""
-
-LEAST_GAIN = 1e-9
-"""Gain of the logarithm of the posterior that a step must promise."""
-
 STARTS = (0.0, float(np.log(0.1)), float(np.log(10.0)))
 """Logarithms of all scales that ascents start from: where few corrections are determined there may be two modes."""
 
 GRID = np.linspace(-6.0, 6.0, 25)
 """Points on an axis over which the posterior is integrated, in sigma."""
+
+LEAST_CURVATURE = 1e-2
+"""Information on the logarithm of a scale, at least: the guess alone holds more."""
+
+GTOL = 1e-6
+"""Largest slope of the logarithm of the posterior at a mode."""
 
 QUANTILE = 1.959963984540054
 """Half width of the 95 % interval, in sigma."""
@@ -190,7 +190,6 @@ class ScalePosterior:
         determined: How many corrections of each group the data determine, shape (n_groups,).
         gradient: Of the logarithm of the posterior, shape (n_groups,).
         hessian: The same, shape (n_groups, n_groups).
-        mean_hessian: Its mean over the data.
     """
 
     def __init__(self, corrections: Corrections, theta: Floats) -> None:
@@ -210,13 +209,6 @@ class ScalePosterior:
         self.hessian: Floats = (
             member @ (4.0 * a[:, None] * C * a + 2.0 * C**2) @ member.T - np.diag(2.0 * square) - prior
         )
-        self.mean_hessian: Floats = -2.0 * member @ (np.eye(len(a)) - C) ** 2 @ member.T - prior
-
-    @property
-    def curvature_covariance(self) -> Floats:
-        """Covariance of the logarithms by the curvature here, or by its mean where that is not concave."""
-        concave = np.linalg.eigvalsh(self.hessian)[-1] < 0.0
-        return np.linalg.inv(-(self.hessian if concave else self.mean_hessian)).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -225,27 +217,19 @@ class EstimatedScales:
 
     Attributes:
         mean: The corrections at the mean of the logarithms.
-        axes: A square root of the covariance of the logarithms, transposed, shape (n_groups, n_groups).
+        sigma: 1 sigma of the logarithms, shape (n_groups,).
+        added_covariance: What unknown scales add to the covariance of the corrections, shape (n, n).
     """
 
     mean: ScalePosterior
-    axes: Floats
+    sigma: Floats
+    added_covariance: Floats
 
     @property
     def interval(self) -> tuple[Floats, Floats]:
         """Lower and upper ends of the 95 % intervals of the logarithms, shape (n_groups,) each."""
-        half = QUANTILE * np.linalg.norm(self.axes, axis=0)
+        half = QUANTILE * self.sigma
         return self.mean.theta - half, self.mean.theta + half
-
-    @property
-    def added_covariance(self) -> Floats:
-        """What unknown scales add to the covariance of the corrections, shape (n, n)."""
-        added = -self.mean.covariance
-        for step in np.sqrt(len(self.axes)) * np.vstack([self.axes, -self.axes]):
-            other = ScalePosterior(self.mean.corrections, self.mean.theta + step)
-            away = other.estimate - self.mean.estimate
-            added = added + (other.covariance + np.outer(away, away)) / (2 * len(self.axes))
-        return added
 
 
 def fit_scales(corrections: Corrections) -> EstimatedScales:
@@ -254,31 +238,27 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
     Args:
         corrections: What the data say of the corrections.
     """
-    modes = (_climb(ScalePosterior(corrections, np.full(len(corrections.member), start))) for start in STARTS)
-    mode = max(modes, key=lambda mode: mode.value)
-    theta = mode.theta
-    axes: Floats = np.linalg.cholesky(mode.curvature_covariance).T.astype(np.float64)
-    for k, axis in enumerate(axes.copy()):
-        density: Floats = np.exp([ScalePosterior(corrections, mode.theta + t * axis).value - mode.value for t in GRID])
-        mean = GRID @ density / density.sum()
-        theta = theta + mean * axis
-        axes[k] = axis * np.sqrt((GRID - mean) ** 2 @ density / density.sum())
-    return EstimatedScales(ScalePosterior(corrections, theta), axes)
 
+    def cost(theta: Floats) -> tuple[float, Floats]:
+        at = ScalePosterior(corrections, theta)
+        return -at.value, -at.gradient
 
-def _climb(point: ScalePosterior) -> ScalePosterior:
-    """The mode above a point, by Newton's steps, or Fisher's where the posterior is not concave."""
-    for _ in range(MAX_STEPS):
-        step = point.curvature_covariance @ point.gradient
-        step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), LEAST_GAIN))
-        if float(point.gradient @ step) < LEAST_GAIN:
-            break
-        following = ScalePosterior(point.corrections, point.theta + step)
-        while following.value < point.value and float(np.abs(step).max()) > LEAST_GAIN:
-            step *= 0.5
-            following = ScalePosterior(point.corrections, point.theta + step)
-        point = following
-    return point
+    n = len(corrections.member)
+    modes = (minimize(cost, np.full(n, start), jac=True, method="BFGS", options={"gtol": GTOL}).x for start in STARTS)
+    mode = max((ScalePosterior(corrections, theta) for theta in modes), key=lambda at: at.value)
+    theta, variance, added = mode.theta, np.zeros(n), mode.covariance
+    curvature, V = np.linalg.eigh(-mode.hessian)
+    for axis in np.linalg.cholesky((V / np.maximum(curvature, LEAST_CURVATURE)) @ V.T).T:
+        points = [ScalePosterior(corrections, mode.theta + t * axis) for t in GRID]
+        density: Floats = np.exp([point.value - mode.value for point in points])
+        w = density / density.sum()
+        mean = float(GRID @ w)
+        theta, variance = theta + mean * axis, variance + axis**2 * ((GRID - mean) ** 2 @ w)
+        estimates, covariance = np.array([point.estimate for point in points]), np.array([p.covariance for p in points])
+        away = estimates - w @ estimates
+        added = added + np.tensordot(w, covariance, 1) - mode.covariance + (w * away.T) @ away
+    at_mean = ScalePosterior(corrections, theta)
+    return EstimatedScales(at_mean, np.sqrt(variance), added - at_mean.covariance)
 
 
 def _corrections(
@@ -426,9 +406,8 @@ def _beyond(names: tuple[str, ...], z: Floats, A: Floats, n_parameters: int) -> 
         found = []
         for name, rows in left.items():
             if np.linalg.norm(rest[rows]) > MIN_CORRECTION:
-                values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
-                square = float(np.sum((V.T @ rest[rows]) ** 2 / np.maximum(values, MIN_SIGMA**2)))
-                found.append((float(special.gammaincc(len(rows) / 2.0, square / 2.0)), -square, name))
+                square = float(rest[rows] @ _inverse(C, rows) @ rest[rows])
+                found.append((float(special.chdtrc(len(rows), square)), -square, name))
         if not found or min(found)[0] >= level:
             return
         name = min(found)[2]
@@ -436,9 +415,15 @@ def _beyond(names: tuple[str, ...], z: Floats, A: Floats, n_parameters: int) -> 
         place = bool(rows[0] >= n_parameters)
         size = float(np.linalg.norm(z[rows])) if place else float(z[rows[0]])
         yield Beyond(name, size, float(np.sqrt(np.maximum(np.mean(np.diag(A)[rows]), 0.0))), place)
-        values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
-        gain = C[:, rows] @ (V / np.maximum(values, MIN_SIGMA**2)) @ V.T
+        gain = C[:, rows] @ _inverse(C, rows)
         rest, C = rest - gain @ rest[rows], C - gain @ C[rows]
+
+
+def _inverse(C: Floats, rows: Integers) -> Floats:
+    """The inverse of a part of a covariance, whose variances are `MIN_SIGMA` squared at least."""
+    values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
+    out: Floats = (V / np.maximum(values, MIN_SIGMA**2)) @ V.T
+    return out
 
 
 def _prior_parameters(variables: Variables) -> list[Parameter]:

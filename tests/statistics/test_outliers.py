@@ -36,10 +36,9 @@ def linear(rng, n=40, m=6, scale=1.0, shifts=(), tied=0.5):
     W = np.linalg.inv(C)
     tangent = np.linalg.inv(J.T @ W @ J)
     z = y - J @ tangent @ J.T @ W @ y
-    nothing = np.zeros((n, 0))
-    errors = RowErrors(J, nothing, np.ones(n), scipy.sparse.csr_array(L), nothing)
+    errors = RowErrors(J, np.ones(n), scipy.sparse.csr_array(L), np.zeros((n, 0)))
     units = list(np.arange(n).reshape(-1, 2))
-    return (z, errors, tangent, units, float(n - m)), (y, J, C)
+    return (z, errors, tangent, units, float(n - m), (np.zeros(0), np.zeros((0, m)))), (y, J, C)
 
 
 def test_what_is_found_is_what_refits_find():
@@ -58,7 +57,7 @@ def test_what_is_found_is_what_refits_find():
 def test_where_the_problem_is_linearised_is_no_matter():
     """At the optimum, and with priors far from it, where residuals are others."""
     rng = np.random.default_rng(9)
-    (_, errors, _, units, dof), (y, J, C) = linear(rng, shifts=[([4, 5], [30.0, -20.0])])
+    (_, errors, _, units, dof, _), (y, J, C) = linear(rng, shifts=[([4, 5], [30.0, -20.0])])
     W, J_prior = np.linalg.inv(C), np.diag(rng.uniform(0.5, 2.0, 6))
     tangent = np.linalg.inv(J.T @ W @ J + J_prior.T @ J_prior)
     for x in (-tangent @ J.T @ W @ y, np.zeros(6), 30.0 * rng.normal(size=6)):
@@ -135,7 +134,7 @@ def spoilt(name, by, rng):
 
 def test_too_many_rows_to_search_for_outliers_are_a_warning(monkeypatch):
     problem, _ = spoilt("star", 300.0, np.random.default_rng(5))
-    monkeypatch.setattr(outliers, "MAX_SHARED_ROWS", 10)
+    monkeypatch.setattr(outliers, "MAX_ROWS", 10)
     found = assess(solve(problem))
     assert found.fit.goodness.gross is None
     assert any("outliers were not searched for: there are too many rows" in text for text in found.verdict.warnings)
