@@ -12,65 +12,13 @@ from __future__ import annotations
 
 import logging
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import lazy_loader  # type: ignore[import-untyped]
 
-if TYPE_CHECKING:
-    from fg_calib.assessment import Assessment, assess
-    from fg_calib.baseline.comparison import compare
-    from fg_calib.batch import calibrate_jobs
-    from fg_calib.calibration import Calibration, calibrate, calibrate_job
-    from fg_calib.designs.design import Design, design
-    from fg_calib.exports.export import export
-    from fg_calib.graph.build import build_problem
-    from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
-    from fg_calib.graph.problem import Problem
-    from fg_calib.graph.solver import Solution, SolverOptions, solve
-    from fg_calib.inputs import CalibrationError, InputError, ProblemError, SolverError
-    from fg_calib.io.job import read_job
-    from fg_calib.io.result import Result
-    from fg_calib.io.robot_file import read_robot
-    from fg_calib.job import Job
-    from fg_calib.measurements.dataset import Measurements, Noise
-    from fg_calib.measurements.table import CustomMeasurements, KnownPoint, Table
-    from fg_calib.observability.identifiability import observe_configurations, observe_structure
-    from fg_calib.options import Limits, Options, Pairing
-    from fg_calib.predictions import correct, predict
-    from fg_calib.robot.model import Robot
-    from fg_calib.simulation.scenario import Scenario
-    from fg_calib.simulation.simulator import simulate
-
 __version__ = "0.1.0"
 
-_import, __dir__, _ = lazy_loader.attach(
-    __name__,
-    submod_attrs={
-        "assessment": ["Assessment", "assess"],
-        "baseline.comparison": ["compare"],
-        "batch": ["calibrate_jobs"],
-        "calibration": ["Calibration", "calibrate", "calibrate_job"],
-        "designs.design": ["Design", "design"],
-        "inputs.errors": ["CalibrationError", "InputError", "ProblemError", "SolverError"],
-        "exports.export": ["export"],
-        "graph.build": ["build_problem"],
-        "graph.factors": ["DistanceFactor", "RotationAngleFactor"],
-        "graph.problem": ["Problem"],
-        "graph.solver": ["Solution", "SolverOptions", "solve"],
-        "io.job": ["read_job"],
-        "io.result": ["Result"],
-        "io.robot_file": ["read_robot"],
-        "job": ["Job"],
-        "measurements.dataset": ["Measurements", "Noise"],
-        "measurements.table": ["KnownPoint", "CustomMeasurements", "Table"],
-        "observability.identifiability": ["observe_configurations", "observe_structure"],
-        "options": ["Limits", "Options", "Pairing"],
-        "predictions": ["correct", "predict"],
-        "robot.model": ["Robot"],
-        "simulation.scenario": ["Scenario"],
-        "simulation.simulator": ["simulate"],
-    },
-)
+_import, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
 
 __all__ = [
     "Assessment",
