@@ -94,7 +94,7 @@ def measure(
     )
 
 
-def write_job(folder, robot: Robot, m: Measurements, **job):
+def write_job(folder, robot: Robot, m: Measurements, /, **job):
     """Robot, poses, pairs between groups and a job in SI as files; the path of the job."""
     columns = {"id": m.ids} | {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
     if m.position is not None:
@@ -109,7 +109,8 @@ def write_job(folder, robot: Robot, m: Measurements, **job):
         write_csv(folder / "pairs.csv", ends | {"distance": pairs.distance, "sigma_distance": pairs.sigma_distance})
         job |= {"pairs": "pairs.csv"}
     write_csv(folder / "poses.csv", columns | {"split": np.where(m.test, "test", "train")})
-    write_robot(folder / "robot.yaml", robot)
+    if robot.urdf is None:
+        write_robot(folder / "robot.yaml", robot)
     stated = {"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma_point}
     noise = {kind: float(np.max(sigma)) for kind, sigma in stated.items() if sigma is not None}
     noise |= {"joint": float(m.sigma_joint[0])} if m.sigma_joint[0] else {}

@@ -81,35 +81,3 @@ def test_targets_out_of_reach_are_named_and_end_with_3(result, fg_calib, tmp_pat
     assert "1 of 2 targets are not reached" in ended.err
     assert "Out of reach within the joint limits: moon." in " ".join(ended.out.split())
     assert pl.read_csv(tmp_path / "commands.csv")["reached"].to_list() == ["no", "yes"]
-
-
-@pytest.mark.sampled(3)
-@pytest.mark.parametrize(
-    ("table", "options", "message"),
-    [
-        ("x,y\n1,2\n", [], "targets.csv"),
-        ("qx,qy,qz,qw\n0,0,0,1\n", [], "orientations without x y z"),
-        ("a\n1\n", [], "targets.csv"),
-        ("x,y,z,q1\n1,2,3,0\n", [], "1 joint columns (q1)"),
-        ("x,y,z\n1,2,three\n", [], "targets.csv:2"),
-        ("x,y,z\n", [], "targets.csv"),
-        ("id,x,y,z\na,1,2,3\na,1,2,3\n", [], "different ids"),
-        ("x,y,z\n1,2,3\n", ["--world"], "world: the measurement frame was not estimated"),
-        ("x,y,z\n1,2,3\n", ["--out", "commands.txt"], "expected .csv"),
-    ],
-)
-def test_what_cannot_be_used_is_one_line(result, fg_calib, tmp_path, monkeypatch, table, options, message):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "targets.csv").write_text(table)
-    ended = fg_calib("correct", result, "targets.csv", *options)
-    assert ended.code == 1
-    assert message in ended.err
-    assert len(ended.err.splitlines()) == 1
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["targets.csv"]
-
-
-def test_a_table_that_is_no_commands_is_not_replaced(result, fg_calib, tmp_path):
-    (tmp_path / "targets.csv").write_text("x,y,z\n1,2,3\n")
-    ended = fg_calib("correct", result, tmp_path / "targets.csv", "--out", tmp_path / "targets.csv")
-    assert ended.code == 1
-    assert (tmp_path / "targets.csv").read_text() == "x,y,z\n1,2,3\n"

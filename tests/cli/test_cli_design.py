@@ -208,57 +208,6 @@ def test_more_of_a_job_is_written_as_a_table_to_fill_in(plan, fg_calib, tmp_path
 # --- what it refuses --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("options", "code", "message"),
-    [
-        (["--n", 3, "--target", "1mm"], 2, "--n and --target"),
-        (["--criterion", "G"], 2, "--criterion"),
-        (["--error", "tool"], 2, "--error"),
-        (["--n", 0], 1, "n: "),
-        (["--n", 100000], 1, "n: "),
-        (["--target", "5deg"], 1, "--target"),
-        (["--target", "0.3"], 1, "error: --target: 0.3; give a unit, such as 0.3mm"),
-        (["--lever", "200"], 1, "error: --lever: 200; give a unit, such as 200mm"),
-        (["--target", "-1mm"], 1, "target"),
-        (["--lever", "one"], 1, "--lever"),
-        (["--candidates", "nowhere.csv"], 1, "nowhere.csv"),
-        (["--candidates", "1"], 1, "n_candidates"),
-        (["--candidates", "rows"], 1, "rows of a scenario"),
-        (["--task", "nowhere.csv"], 1, "nowhere.csv"),
-        (["--task", "bad.csv"], 1, "bad.csv"),
-        (["--given", "bad.csv"], 1, "bad.csv"),
-        (["other.yaml"], 2, "other.yaml"),
-    ],
-)
-def test_what_cannot_be_used_is_one_line_and_writes_nothing(
-    options, code, message, plan, fg_calib, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    of = plan()
-    (tmp_path / "bad.csv").write_text("q1,q2,q3\n0,0,0\n")
-    (tmp_path / "bad.yaml").write_text("noise: {position: -1}\nnothing: 3\n")
-    (tmp_path / "fine.yaml").write_text("noise: {position: 1}\n")
-    before = sorted(tmp_path.iterdir())
-    ended = fg_calib("design", of, *options, "--out", "out")
-    assert ended.code == code, ended.err
-    assert message in ended.err
-    if code == 1:
-        assert len(ended.err.splitlines()) == 1
-    assert sorted(tmp_path.iterdir()) == before
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("name", ["poses.csv", "calibration.yaml", "design.json", "robot.yaml", "configurations.csv"])
-def test_a_folder_with_files_of_others_is_left_alone(name, plan, fg_calib, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / name).write_text("mine\n")
-    ended = fg_calib("design", plan(), "--n", 3, *FEW, "--out", out)
-    assert ended.code == 1
-    assert "expected another folder" in ended.err
-    assert [(file.name, file.read_text()) for file in out.iterdir()] == [(name, "mine\n")]
-
-
 @pytest.mark.slow
 def test_tables_that_were_filled_in_are_not_emptied(plan, fg_calib, tmp_path):
     """A second design in the same folder would lose what was measured."""

@@ -94,32 +94,3 @@ def test_names_steer_no_terminal(fg_calib, tmp_path, monkeypatch):
     shown = fg_calib("export", tmp_path / "arm.yaml", "--to", "urdf")
     assert r'name="\u202eone"' in shown.out
     assert all(line.isprintable() for line in shown.out.split("\n"))
-
-
-MISTAKES = {
-    "no such folder": (("{nowhere}", "--to", "dh"), 1, "error: nowhere: no such file\n"),
-    "no result": (("{empty}", "--to", "dh"), 1, "error: {empty}: no result.json in this folder, "),
-    "another format": (("{robot}", "--to", "kuka"), 2, "'kuka' is not one of 'urdf', 'ur', 'tesseract'"),
-    "a file that is there": (("{robot}", "--to", "dh", "--out", "{robot}"), 1, "error: {robot}: is there already, "),
-    "measured nowhere": (("{robot}", "--to", "zeros", "--at", "measured"), 2, "needs a RESULT"),
-    "an idle place": (("{robot}", "--to", "dh", "--at", "workspace"), 2, "means nothing for dh"),
-    "links of a result": (("{empty}", "--to", "dh", "--tip-link", "a"), 2, "a RESULT knows its links"),
-}
-
-
-@pytest.mark.sampled(6)
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_a_line_and_leaves_no_file(mistake, fg_calib, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "200")
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "robot.yaml").write_text(
-        "convention: dh\njoints: [{a: 1, alpha: 0, d: 0, theta: 0}, {a: 1, alpha: 0, d: 0, theta: 0}]\n"
-    )
-    places = {"robot": "robot.yaml", "empty": "empty", "nowhere": "nowhere"}
-    words, code, message = MISTAKES[mistake]
-    ended = fg_calib("export", *(word.format(**places) for word in words))
-    assert (ended.code, ended.out) == (code, "")
-    assert message.format(**places) in ended.err
-    assert code == 2 or ended.err.count("\n") == 1
-    assert sorted(file.name for file in tmp_path.rglob("*")) == ["empty", "robot.yaml"]

@@ -109,18 +109,9 @@ def test_json_of_a_job_with_findings_has_them(fg_calib, job):
     assert (one["ends"], one["row"], one["kind"], one["table"]) == (["4"], 4, "position", "")
 
 
-@pytest.mark.parametrize(
-    ("keys", "says"),
-    [
-        ({"modell": "pose"}, "error: calibration.yaml: unknown key 'modell'"),
-        ({"measurements": "none.csv"}, "error: "),
-        ({"units": {"length": "m", "angle": "rad"}}, "error: poses.csv:2: q1 = "),
-    ],
-)
-def test_bad_input_ends_with_1_and_the_line_that_calibrate_gives(fg_calib, example, keys, says):
-    path = changed(example, **keys)
+def test_bad_input_is_the_line_that_calibrate_gives(fg_calib, example):
+    path = changed(example, units={"length": "m", "angle": "rad"})
     ended = fg_calib("inspect", path)
     assert (ended.code, ended.out) == (1, "")
-    assert ended.err.startswith(says)
-    assert ended.err.count("\n") == 1
+    assert ended.err.startswith("error: poses.csv:2: q1 = ")
     assert fg_calib("calibrate", path).err == ended.err

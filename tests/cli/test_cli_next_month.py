@@ -33,7 +33,7 @@ def write_table(path, m):
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with a result, and tables of a healthy month, of a slip, and of a wrong kind."""
+    """A folder with a result, and tables of a healthy month and of a slip."""
     folder, rng, robot = tmp_path_factory.mktemp("month"), np.random.default_rng(3), arm()
     true = true_robot(robot, rng)
     write_robot(folder / "robot.yaml", robot)
@@ -51,7 +51,6 @@ def place(tmp_path_factory):
     write_table(folder / "healthy.csv", measured(true, 8, rng))
     write_table(folder / "slipped.csv", measured(slipped(true, theta3=3e-3), 10, rng))
     write_table(folder / "after.csv", measured(slipped(true, theta3=3e-3), 8, rng))
-    (folder / "wrong.csv").write_text("J1,J2,J3\n1,2,3\n")
     return folder
 
 
@@ -85,29 +84,3 @@ def test_a_job_may_stand_in_place_of_a_table(place):
     (place / "healthy.yaml").write_text(yaml.safe_dump(job))
     code, out = run("check", place / "result", place / "healthy.yaml", "--json")
     assert (code, json.loads(out)["dof"]) == (0, 48)
-
-
-BAD = {
-    "a table without the columns": (["check", "result", "wrong.csv"], "wrong.csv"),
-    "a limit that is none": (["check", "result", "healthy.csv", "--limit", "0.5 parsec"], "--limit"),
-    "a name of no table": (["check", "result", "healthy.csv", "--like", "x.csv"], "one of first.csv"),
-    "rows that are in it": (["update", "result", "first.csv", "--out", "new"], "in the calibration already"),
-    "its own folder": (["update", "result", "healthy.csv", "--out", "result"], "the folder of the result"),
-    "a bare growth": (["update", "result", "healthy.csv", "--growth", "theta", "--out", "new"], "NAME=FIGURE"),
-    "a date before": (
-        ["update", "result", "healthy.csv", "--date", "1999-01-01", "--out", "new"],
-        "is before the calibration",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.sampled(4)
-@pytest.mark.parametrize("what", BAD)
-def test_bad_input_is_one_line(place, what, monkeypatch):
-    monkeypatch.chdir(place)
-    words, expected = BAD[what]
-    code, message = run(*words)
-    assert code == 1
-    assert expected in message
-    assert "\n" not in message
-    assert not (place / "new").exists()

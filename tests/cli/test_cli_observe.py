@@ -73,32 +73,6 @@ def test_a_frame_may_be_unknown(fg_calib, example):
     assert json.loads(ended.out)["rank"] == 25
 
 
-OF_A_TABLE = (
-    ("--position-noise", "0.001"),
-    ("--angle", "deg"),
-)
-
-
-@pytest.mark.parametrize("option", OF_A_TABLE, ids=lambda option: option[0])
-def test_what_is_said_of_a_table_needs_one(fg_calib, example, option):
-    ended = fg_calib("observe", example / "robot_nominal.yaml", *option)
-    assert ended == (2, "", f"error: {option[0]} has no effect without --configurations\n")
-
-
-IDLE = (
-    ("position", "--orientation-noise", "0.001"),
-    ("distance", "--frame", "unknown"),
-    ("pose", "--pairing", "chain"),
-)
-
-
-@pytest.mark.parametrize(("model", "option", "value"), IDLE, ids=lambda value: value)
-def test_what_a_model_does_not_use_is_refused(fg_calib, example, model, option, value):
-    table = ("--configurations", example / "poses.csv", "--angle", "deg")
-    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, *table, option, value)
-    assert ended == (2, "", f"error: {option} has no effect with --model {model}\n")
-
-
 Y_SHAPED = """\
 <robot name="two-hands"><link name="root"/><link name="arm"/><link name="left"/><link name="right"/>
 <joint name="j1" type="continuous"><parent link="root"/><child link="arm"/><axis xyz="0 0 1"/></joint>
@@ -118,44 +92,3 @@ def test_links_of_a_urdf_are_named_as_the_message_asks(fg_calib, tmp_path):
     links = ("--base-link", "arm", "--tip-link", "right")
     found = json.loads(fg_calib("observe", tmp_path / "y.urdf", "--model", "pose", *links, "--json").out)
     assert {name.partition(".")[0] for name in found["names"]} == {"j3"}
-
-
-@pytest.mark.sampled(5)
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (("missing.yaml",), 1, "no such file"),
-        (("{robot}", "--prefer", "d9"), 1, "no parameter 'd9'"),
-        (("{robot}", "--configurations", "missing.csv"), 1, "no such file"),
-        (("{robot}", "--configurations", "{poses}"), 1, "is the table in deg?"),
-        (("{robot}", "--model", "poses"), 2, "--model"),
-        (("{robot}", "--angle", "grad"), 2, "--angle"),
-        (
-            ("{robot}", "--configurations", "{poses}", "--angle", "deg", "--position-noise", "0"),
-            1,
-            "--position-noise: found 0.0, expected a finite number above 0",
-        ),
-        (
-            ("{robot}", "--configurations", "{poses}", "--angle", "deg", "--joint-noise", "-1"),
-            1,
-            "--joint-noise: found -1.0, expected a finite number not below 0",
-        ),
-        (
-            ("{robot}", "--configurations", "{poses}", "--angle", "deg", "--orientation-noise", "1e-29"),
-            1,
-            "--orientation-noise: found 1e-29 deg, expected 1e-30 rad or more",
-        ),
-        ((), 2, "ROBOT"),
-    ],
-)
-def test_what_it_refuses(fg_calib, example, tmp_path, arguments, code, message):
-    places = {"robot": str(example / "robot_nominal.yaml"), "poses": str(example / "poses.csv")}
-    folder = tmp_path / "out"
-    ended = fg_calib("observe", *(a.format(**places) for a in arguments), "--out", folder)
-    assert ended.code == code
-    assert message in ended.err
-    assert ended.out == ""
-    assert not folder.exists()
-    if code == 1:
-        assert ended.err.startswith("error: ")
-        assert ended.err.count("\n") == 1

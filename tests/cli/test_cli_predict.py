@@ -90,33 +90,3 @@ def test_a_calibration_that_is_not_to_be_trusted_ends_with_3(result, fg_calib, t
     assert ended.code == 3
     assert ended.err.splitlines() == ["not to be trusted: rows do not fit"]
     assert "DOUBTFUL" in ended.out
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    ("text", "options", "message"),
-    [
-        ("a\n1\n", [], "no joint columns"),
-        ("q1,q2,q3\n0,0,0\n", [], "3 joint columns"),
-        ("q1,q2,q3,q4\n0,0,0,x\n", [], "program.csv:2"),
-        ("q1,q2,q3,q4\n", [], "program.csv"),
-        ("q1,q2,q3,q4\n0,0,0,0\n", ["--limit", "0.5deg"], "--limit"),
-        ("q1,q2,q3,q4\n0,0,0,0\n", ["--limit", "0"], "--limit"),
-    ],
-)
-def test_what_cannot_be_used_is_one_line(result, fg_calib, tmp_path, monkeypatch, text, options, message):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "program.csv").write_text(text)
-    ended = fg_calib("predict", result, "--at", "program.csv", "--out", "out", *options)
-    assert ended.code == 1
-    assert message in ended.err
-    assert len(ended.err.splitlines()) == 1
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["program.csv"]
-
-
-def test_what_is_no_prediction_is_not_replaced(result, fg_calib, tmp_path):
-    (tmp_path / "predict.csv").write_text("mine\n")
-    ended = fg_calib("predict", result, "--out", tmp_path)
-    assert ended.code == 1
-    assert "not written by this command" in ended.err
-    assert [file.name for file in tmp_path.iterdir()] == ["predict.csv"]

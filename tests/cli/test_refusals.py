@@ -1,0 +1,247 @@
+"""What no command can use is refused in one line, with exit code 1, or 2 for usage; nothing is printed or written."""
+
+import re
+import shutil
+
+import pytest
+
+from fg_calib import calibrate_job, cli
+
+JOB, POSES, ROBOT = "calibration.yaml", "poses.csv", "robot_nominal.yaml"
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """The bundled example with 50 of its test rows, and its result."""
+    folder = shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path_factory.mktemp("refusals") / "job")
+    poses = folder / POSES
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-450]))
+    calibrate_job(folder / JOB).save(folder / "result")
+    return folder
+
+
+def replaced(file, old, new):
+    """Replace the first match of a pattern in a file."""
+
+    def edit(folder):
+        text, n = re.subn(old, new, (folder / file).read_text(), count=1, flags=re.M)
+        assert n == 1
+        (folder / file).write_text(text)
+
+    return edit
+
+
+def written(text, file="table.csv"):
+    return lambda folder: (folder / file).write_text(text)
+
+
+def without(file):
+    return lambda folder: (folder / file).unlink()
+
+
+CALIBRATE = ("calibrate", JOB, "--out", "out")
+OBSERVE = ("observe", ROBOT, "--configurations", POSES, "--angle", "deg")
+CORRECT = ("correct", "result", "table.csv")
+PREDICT = ("predict", "result", "--at", "table.csv", "--out", "out")
+UPDATE = ("update", "result", POSES, "--out", "out")
+DESIGN = ("design", JOB, "--out", "out")
+EXPORT = ("export", ROBOT, "--to", "dh")
+JOINTS = "q1,q2,q3,q4,q5,q6,q7\n"
+CENTRE = "0,0,0,0,0,0,0\n"
+
+
+def nothing(_folder):
+    pass
+
+
+INPUT = {  # edit of the example's folder, command, what the one line holds
+    "no job": (without(JOB), CALIBRATE, "calibration.yaml: no such file"),
+    "no robot": (without(ROBOT), CALIBRATE, "robot_nominal.yaml: no such file"),
+    "no table": (without(POSES), CALIBRATE, "poses.csv: no such file"),
+    "no column": (replaced(POSES, ",y,", ",other,"), CALIBRATE, "poses.csv: no column y, expected x y z together"),
+    "a joint too few": (
+        replaced(POSES, ",q7,", ",seventh,"),
+        CALIBRATE,
+        "poses.csv: 6 joint columns (q1, q2, q3, q4, q5, q6), expected q1 to q7 for the robot's 7 joints",
+    ),
+    "text in a number": (
+        replaced(POSES, r"^(p2,[^,]*,)[^,]*", r"\1abc"),
+        CALIBRATE,
+        "poses.csv:4: q2: found 'abc', expected a finite number",
+    ),
+    "an unknown key": (replaced(JOB, "^pairing", "pairng"), CALIBRATE, "unknown key 'pairng', expected one of robot,"),
+    "degrees read as radians": (
+        replaced(JOB, "angle: deg", "angle: rad"),
+        CALIBRATE,
+        "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is the table in deg?",
+    ),
+    "outside the limits": (
+        replaced(POSES, "^p1,[^,]*", "p1,181"),
+        CALIBRATE,
+        "poses.csv:3: q1 = 181 deg is outside [-180, 180]; widen the joint's limits if the reading is right",
+    ),
+    "an unknown model": (replaced(JOB, "^model: .*", "model: distances"), CALIBRATE, "did you mean distance?"),
+    "no noise": (replaced(JOB, "^noise.*", ""), CALIBRATE, "no sigma for distance, expected noise.position or a"),
+    "one id twice": (
+        replaced(POSES, "^p1,", "p0,"),
+        CALIBRATE,
+        "poses.csv:3: id: found 'p0', expected different ids; the same as poses.csv:2",
+    ),
+    "a table as the job": (
+        nothing,
+        ("calibrate", POSES),
+        "expected a mapping, key: value",
+    ),
+    "an output folder that is a file": (written("mine", "out"), CALIBRATE, "out: cannot be written: "),
+    "a folder below a file": (
+        written("mine", "out"),
+        ("calibrate", JOB, "--out", "out/below"),
+        "out/below: cannot be written: ",
+    ),
+    "no robot to observe": (nothing, ("observe", "missing.yaml"), "missing.yaml: no such file"),
+    "an unknown parameter": (nothing, ("observe", ROBOT, "--prefer", "d9"), "no parameter 'd9'"),
+    "a table in degrees": (nothing, OBSERVE[:4], "is the table in deg?"),
+    "noise of zero": (nothing, (*OBSERVE, "--position-noise", 0), "--position-noise: found 0.0, expected a finite num"),
+    "noise below zero": (
+        nothing,
+        (*OBSERVE, "--joint-noise", -1),
+        "--joint-noise: found -1.0, expected a finite number",
+    ),
+    "noise of nothing": (
+        nothing,
+        (*OBSERVE, "--orientation-noise", 1e-29),
+        "--orientation-noise: found 1e-29 deg, expected 1e-30 rad or more",
+    ),
+    "no z": (written("x,y\n1,2\n"), CORRECT, "table.csv"),
+    "orientations alone": (written("qx,qy,qz,qw\n0,0,0,1\n"), CORRECT, "orientations without x y z"),
+    "one joint": (written("x,y,z,q1\n1,2,3,0\n"), CORRECT, "1 joint columns (q1)"),
+    "text in a target": (written("x,y,z\n1,2,three\n"), CORRECT, "table.csv:2"),
+    "no targets": (written("x,y,z\n"), CORRECT, "table.csv"),
+    "targets of one id": (written("id,x,y,z\na,1,2,3\na,1,2,3\n"), CORRECT, "different ids"),
+    "a frame that is known": (
+        written("x,y,z\n1,2,3\n"),
+        (*CORRECT, "--world"),
+        "world: the measurement frame was not estimated",
+    ),
+    "commands as text": (written("x,y,z\n1,2,3\n"), (*CORRECT, "--out", "commands.txt"), "expected .csv"),
+    "a table that is no commands": (written("x,y,z\n1,2,3\n"), (*CORRECT, "--out", "table.csv"), "table.csv"),
+    "no joint columns": (written("a\n1\n"), PREDICT, "no joint columns"),
+    "text in a reading": (written(f"{JOINTS}0,0,0,x,0,0,0\n"), PREDICT, "table.csv:2"),
+    "no configurations": (written(JOINTS), PREDICT, "table.csv"),
+    "a limit that is an angle": (written(JOINTS + CENTRE), (*PREDICT, "--limit", "0.5deg"), "--limit"),
+    "a limit of zero": (written(JOINTS + CENTRE), (*PREDICT, "--limit", "0"), "--limit"),
+    "a prediction over a stranger's file": (
+        written("mine", "predict.csv"),
+        ("predict", "result", "--out", "."),
+        "not written by this command",
+    ),
+    "another table to check": (written("x,y\n1,2\n"), ("check", "result", "table.csv"), "table.csv"),
+    "a limit in parsec": (nothing, ("check", "result", POSES, "--limit", "0.5 parsec"), "--limit"),
+    "a name of no table": (nothing, ("check", "result", POSES, "--like", "x.csv"), "one of poses.csv"),
+    "rows that were counted": (nothing, UPDATE, "in the calibration already"),
+    "a bare growth": (nothing, (*UPDATE, "--growth", "theta"), "NAME=FIGURE"),
+    "a date before": (nothing, (*UPDATE, "--date", "1999-01-01"), "is before the calibration"),
+    "the folder of the result": (nothing, (*UPDATE[:-1], "result"), "the folder of the result"),
+    "no stops": (nothing, (*DESIGN, "--n", 0), "n: "),
+    "too many stops": (nothing, (*DESIGN, "--n", 100000), "n: "),
+    "a target that is an angle": (nothing, (*DESIGN, "--target", "5deg"), "--target"),
+    "a target without unit": (
+        nothing,
+        (*DESIGN, "--target", "0.3"),
+        "--target: 0.3; give a unit, such as 0.3mm",
+    ),
+    "a target below zero": (nothing, (*DESIGN, "--target", "-1mm"), "target"),
+    "a lever in words": (nothing, (*DESIGN, "--lever", "one"), "--lever"),
+    "no candidates": (nothing, (*DESIGN, "--candidates", "nowhere.csv"), "nowhere.csv"),
+    "one candidate": (nothing, (*DESIGN, "--candidates", "1"), "n_candidates"),
+    "a task of three joints": (written("q1,q2,q3\n0,0,0\n"), (*DESIGN, "--task", "table.csv"), "table.csv"),
+    "designs over a stranger's file": (
+        written("mine", "poses2.csv"),
+        ("design", JOB, "--n", 3, "--candidates", 25, "--out", "."),
+        "expected another folder",
+    ),
+    "nothing to export": (nothing, ("export", "nowhere", "--to", "dh"), "error: nowhere: no such file"),
+    "a folder without result": (
+        lambda folder: (folder / "empty").mkdir(),
+        ("export", "empty", "--to", "dh"),
+        "error: empty: no result.json in this folder, ",
+    ),
+    "an export over a file": (nothing, (*EXPORT, "--out", ROBOT), f"error: {ROBOT}: is there already, "),
+    "an example over a file": (
+        nothing,
+        ("example", "space-robot", "--out", "."),
+        f"{JOB}: is there already, expected a folder without it",
+    ),
+}
+
+USAGE = {  # command, what is said of it
+    "no command": ((), "Usage: fg-calib"),
+    "an unknown command": (("recalibrate", JOB), "recalibrate"),
+    "no job": (("calibrate",), "JOB"),
+    "two jobs": (("inspect", JOB, "more.yaml"), "Usage: fg-calib"),
+    "no folder": (("calibrate", JOB, "--out"), "requires an argument"),
+    "an unknown option": (("calibrate", JOB, "--nonsense"), "--nonsense"),
+    "an example without folder": (("example", "space-robot"), "--out"),
+    "a page without folder": (("calibrate", JOB, "--report"), "needs --out"),
+    "processes and a scheduler": (("calibrate", JOB, "--workers", 2, "--scheduler", "tcp://a:1"), "--scheduler"),
+    "an unknown model": (("observe", ROBOT, "--model", "poses"), "--model"),
+    "an unknown unit": (("observe", ROBOT, "--angle", "grad"), "--angle"),
+    "noise without a table": (
+        ("observe", ROBOT, "--position-noise", "0.001"),
+        "no effect without --configurations",
+    ),
+    "a unit without a table": (("observe", ROBOT, "--angle", "deg"), "no effect without --configurations"),
+    "noise of another model": (
+        (*OBSERVE, "--model", "position", "--orientation-noise", "0.001"),
+        "error: --orientation-noise has no effect with --model position",
+    ),
+    "a frame of pairs": (
+        (*OBSERVE, "--model", "distance", "--frame", "unknown"),
+        "error: --frame has no effect with --model distance",
+    ),
+    "pairs of poses": (
+        (*OBSERVE, "--model", "pose", "--pairing", "chain"),
+        "error: --pairing has no effect with --model pose",
+    ),
+    "stops and an accuracy": ((*DESIGN, "--n", 3, "--target", "1mm"), "--n and --target"),
+    "an unknown criterion": ((*DESIGN, "--criterion", "G"), "--criterion"),
+    "an unknown error": ((*DESIGN, "--error", "tool"), "--error"),
+    "an unknown format": (("export", ROBOT, "--to", "kuka"), "'kuka' is not one of 'urdf', 'ur', 'tesseract'"),
+    "a robot measured": (("export", ROBOT, "--to", "zeros", "--at", "measured"), "needs a RESULT"),
+    "places of a table": ((*EXPORT, "--at", "workspace"), "means nothing for dh"),
+    "links of a result": (("export", "result", "--to", "dh", "--tip-link", "a"), "a RESULT knows its links"),
+}
+
+
+@pytest.fixture
+def place(calibrated, tmp_path, monkeypatch):
+    """A copy of the folder, which is the current one."""
+    monkeypatch.chdir(shutil.copytree(calibrated, tmp_path / "job"))
+    monkeypatch.setenv("COLUMNS", "200")
+    return tmp_path / "job"
+
+
+def content(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(("edit", "words", "message"), INPUT.values(), ids=INPUT)
+def test_input_that_cannot_be_used_is_one_line_and_changes_nothing(fg_calib, place, edit, words, message):
+    edit(place)
+    before = content(place)
+    ended = fg_calib(*words)
+    assert (ended.code, ended.out) == (1, "")
+    assert message in ended.err
+    assert ended.err.startswith("error: ")
+    assert ended.err.count("\n") == 1
+    assert content(place) == before
+
+
+@pytest.mark.parametrize(("words", "message"), USAGE.values(), ids=USAGE)
+def test_wrong_usage_is_exit_code_2(fg_calib, place, words, message):
+    before = content(place)
+    ended = fg_calib(*words)
+    assert ended.code == 2
+    assert message in ended.err + ended.out
+    assert "Traceback" not in ended.err
+    assert content(place) == before
