@@ -15,66 +15,42 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from fg_calib.parallel import THREADS, one_blas_thread, single_threaded
 
-EVERYTHING = """
+LIMITS = ("OPENBLAS", "OMP", "MKL", "NUMBA")
+RUN = """
 import os, sys
-if sys.argv[2] == "1" and hasattr(os, "sched_setaffinity"):
+from fg_calib import cli
+if sys.argv.pop(1) == "1" and hasattr(os, "sched_setaffinity"):
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-import json
-import fg_calib as fg
-from fg_calib.graph import problem_of
-from fg_calib.observability.cramer_rao import cramer_rao
-from fg_calib.report import comparison_document, observability_document
-
-def hexadecimal(found):
-    if isinstance(found, dict):
-        return {k: hexadecimal(v) for k, v in found.items() if k not in ("seconds", "date")}
-    if isinstance(found, list):
-        return [hexadecimal(v) for v in found]
-    return found.hex() if isinstance(found, float) else found
-
-job = fg.read_job(sys.argv[1])
-found = {}
-for name, change in {
-    "star": {"pairing": fg.Pairing("star")},
-    "random, kept": {"pairing": fg.Pairing("random", 400), "gauge": "keep"},
-    "poses": {"model": "pose", "frame": "unknown", "encoder": "estimated"},
-    "independent": {"pair_errors": "independent", "pairing": fg.Pairing("all")},
-    **{loss: {"loss": loss} for loss in ("huber", "gnc")},
-}.items():
-    solution = fg.solve(problem_of(job, **change))
-    found[name] = fg.Calibration.of(solution, fg.assess(solution)).result.document()
-bound = cramer_rao(job.robot, job.measurements, model=job.options.model, pairing=fg.Pairing("all"))
-found["bound"] = bound.covariance.tolist()
-found["compare"] = comparison_document(fg.compare(job))
-found["structural"] = observability_document(fg.observe_structure(job.robot, job.options.model))
-print(json.dumps(hexadecimal(found)))
+cli.main()
 """
 
 
-LIMITS = ("OPENBLAS", "OMP", "MKL", "NUMBA")
-
-
-def everything(job, threads, processors, seed="0"):
-    """What every public computation finds, in a process of its own."""
+def documents(jobs, threads, processors, seed="0"):
+    """The results of jobs, each by the command in a process of its own."""
     limits = {f"{library}_NUM_THREADS": threads for library in LIMITS}
-    limits |= {"POLARS_MAX_THREADS": threads, "PYTHONHASHSEED": seed}
-    ended = subprocess.run([sys.executable, "-c", EVERYTHING, job, processors], capture_output=True, text=True,
-                           env=os.environ | limits, check=False)  # fmt: skip
-    assert ended.returncode == 0, ended.stderr
-    return json.loads(ended.stdout)
+    env = os.environ | limits | {"POLARS_MAX_THREADS": threads, "PYTHONHASHSEED": seed}
+    for job in jobs:
+        command = [sys.executable, "-c", RUN, processors, "calibrate", job, "--json"]
+        document = json.loads(subprocess.run(command, capture_output=True, text=True, env=env, check=False).stdout)
+        document["solver"].pop("seconds")
+        document.pop("date")
+        yield document
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_every_bit_is_the_same_on_one_thread_and_on_several(whole_example):
     """With joint noise, so that all pairs share errors: the dense algebra that BLAS would spread over its threads."""
     job, table = whole_example / "calibration.yaml", whole_example / "poses.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:163]))
-    job.write_text(re.sub("joint: [0-9.]+", "joint: 0.005", job.read_text()))
-    one = everything(job, "1", "1")
-    assert len(one) == 9
+    text = re.sub("joint: [0-9.]+", "joint: 0.005", job.read_text())
+    poses = "model: pose\nencoder: estimated"
+    jobs = [whole_example / name for name in ("star.yaml", "poses.yaml", "gnc.yaml")]
+    changes = (text, re.sub("model: .*", poses, text).replace("pairing: star\n", ""), f"{text}\nloss: gnc\n")
+    for path, changed in zip(jobs, changes, strict=True):
+        path.write_text(changed)
+    one = list(documents(jobs, "1", "1"))
     for other in (("2", "all", "1"), ("7", "all", "random")):  # more threads, other hashes
-        found = everything(job, *other)
-        assert {name for name in one if one[name] != found[name]} == set(), other
+        assert list(documents(jobs, *other)) == one
 
 
 def blas_threads():
