@@ -109,7 +109,7 @@ def calibrate(
         ProblemError: The measurements lack what the model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    options = Options.given(options, choices)
+    options = Options.of(options, **choices)
     tables = tables_of(measurements, options)
     for table in tables:
         check_readings(table.measurements.readings, robot, table.measurements.source)

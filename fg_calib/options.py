@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from fg_calib.inputs import (
@@ -220,43 +220,27 @@ class Options:
             check_number("folds", self.folds, least=2, whole=True)
 
     @classmethod
-    def given(cls, options: Options | None, choices: dict[str, Any]) -> Options:
-        """The options given, as such or as keywords.
+    def of(cls, options: Options | None = None, **choices: Any) -> Options:
+        """The options given, or options from keywords; `prior=False` is `gauge="none"`.
 
         Raises:
             InputError: Both were given, a keyword is not known, or its value is not one of those possible.
         """
-        if options is not None and choices:
-            raise InputError("options", f"both options and {next(iter(choices))}=...", "one of the two")
-        return options or cls.of(**choices)
-
-    @classmethod
-    def of(cls, **choices: Any) -> Options:
-        """Options from keywords; no pairing is a star, and `prior=False` is `gauge="none"`.
-
-        Raises:
-            InputError: A keyword is not known, or its value is not one of those possible.
-        """
-        prior = choices.pop("prior", None)
-        check_names("options", choices, [f.name for f in fields(cls)], "option")
+        if options is not None:
+            if choices:
+                raise InputError("options", f"both options and {next(iter(choices))}=...", "one of the two")
+            return options
+        check_names("options", choices, [*(f.name for f in fields(cls)), "prior"], "option")
+        if "prior" in choices:
+            prior = choices.pop("prior")
+            check_flag("prior", prior)
+            gauge = choices.setdefault("gauge", "prior" if prior else "none")
+            if prior != (gauge == "prior"):
+                raise InputError("prior", f"found {prior} beside gauge: {gauge}", "gauge alone")
         choices["pairing"] = as_pairing(choices.get("pairing"))
         if not isinstance(choices.get("prefer", ()), str):
             choices["prefer"] = listed("prefer", choices.get("prefer", ()))
-        options = cls(**choices)
-        if prior is None:
-            return options
-        if "gauge" in choices and (options.with_prior(prior) != options or prior != options.has_priors):
-            raise InputError("prior", f"found {prior} beside gauge: {options.gauge}", "gauge alone")
-        return options.with_prior(prior)
-
-    def with_prior(self, prior: bool) -> Options:
-        """The same with or without the tolerances as priors, what `prior` once said.
-
-        Raises:
-            InputError: It is neither True nor False.
-        """
-        check_flag("prior", prior)
-        return self if prior or self.gauge != "prior" else replace(self, gauge="none")
+        return cls(**choices)
 
     @property
     def has_priors(self) -> bool:

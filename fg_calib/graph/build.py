@@ -76,7 +76,7 @@ def build_problem(
         InputError: An option is not one of those possible.
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
-    options = Options.given(options, choices)
+    options = Options.of(options, **choices)
     tables = tables_of(measurements, options)
     for table in tables:
         if not table.uses_pairs and table.measurements.pairs is not None:
