@@ -35,7 +35,6 @@ from scipy.spatial.transform import Rotation
 
 import fg_calib
 from fg_calib import Measurements, Robot, assess, build_problem, calibrate_job, read_job, read_robot, solve
-from fg_calib.report.figures import Drawn
 from fg_calib.report.html import build_page
 from fg_calib.robot import pose
 
@@ -104,8 +103,7 @@ def steps(task: Task) -> Row:
     }
     if case != "60 UR10 poses":
         found = calibrate_job(job)
-        drawn = Drawn(found.result, found.robot, found.posterior, found.configurations, found.residuals)
-        row["page"] = median_of(lambda: build_page(drawn), max(repeats // 5, 1))
+        row["page"] = median_of(lambda: build_page(found.report_data), max(repeats // 5, 1))
     return row
 
 

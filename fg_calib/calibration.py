@@ -65,7 +65,7 @@ from fg_calib.options import Options
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import predict_poses
 from fg_calib.report import (
-    Drawn,
+    ReportData,
     build_page,
     draw_figures,
     format_result,
@@ -269,7 +269,7 @@ class Calibration:
             tables[f"residuals.{residuals}"] = self.residuals
         if assessed.estimates.joint_errors is not None:
             tables["joints.csv"] = joint_frame(assessed.estimates.joint_errors, solution)
-        drawn = self._drawn
+        drawn = self.report_data
         pages = {"report.html": build_page(drawn)} if report else {}
         pages |= draw_figures(drawn) if figures else {}
         known = {name: table for name, table in tables.items() if table is not None}
@@ -296,8 +296,9 @@ class Calibration:
         return None if table is None else table.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
 
     @property
-    def _drawn(self) -> Drawn:
-        return Drawn(self.result, self.robot, self.posterior, self.configurations, self.residuals)
+    def report_data(self) -> ReportData:
+        """What its report, page and figures are made of."""
+        return ReportData(self.result, self.robot, self.posterior, self.configurations, self.residuals)
 
     @property
     def runs(self) -> tuple[Run, ...]:
@@ -550,7 +551,7 @@ class Calibration:
         return "\n".join(summary(self.result))
 
     def __str__(self) -> str:
-        return format_result(self)
+        return format_result(self.report_data)
 
     def _repr_html_(self) -> str:
         return parameter_table_html(self.result)
@@ -570,7 +571,7 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
     """
     found = Calibration.load(path)
     assert found.folder is not None
-    texts = {"report.html": build_page(found._drawn), **(draw_figures(found._drawn) if figures else {})}
+    texts = {"report.html": build_page(found.report_data), **(draw_figures(found.report_data) if figures else {})}
 
     def write(into: Path) -> None:
         for name, text in texts.items():

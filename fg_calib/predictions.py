@@ -6,8 +6,6 @@ compliance, are not part of them.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +13,9 @@ from numpy.typing import ArrayLike
 
 from fg_calib.calibration import Calibration
 from fg_calib.inputs import Floats, InputError, as_floats, check_number, checked
-from fg_calib.io import Units, fill_folder, require_own, require_writable, write_text
 from fg_calib.measurements import check_readings
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import Correction, PredictedErrors, ToolPoseUncertainty, correct_targets, predict_errors
-from fg_calib.report import error_slices, prediction_document, write_charts, write_prediction_table
 from fg_calib.robot import Robot
 
 
@@ -129,56 +125,3 @@ def correct(
 def nominal_robot(calibration: Calibration) -> Robot:
     """The robot that a calibration began with."""
     return calibration.robot.with_values([p.nominal for p in calibration.result.parameters])
-
-
-FILES = {
-    "predict.json": b'{\n "schema": "fg-calib/predict/',
-    "predict.csv": b"id,",
-    "predict.svg": b"<svg",
-}
-"""What `write_prediction` may write, and how it begins."""
-
-
-def require_prediction(folder: Path) -> None:
-    """Check that a prediction can be written to a folder, and would not replace what is of none.
-
-    Raises:
-        InputError: It cannot, or it would.
-    """
-    require_writable(folder)
-    require_own(folder, FILES)
-
-
-@checked
-def write_prediction(
-    folder: Path | str,
-    found: PredictedErrors,
-    calibration: Calibration,
-    *,
-    ids: Sequence[str] = (),
-    units: Units | None = None,
-) -> None:
-    """Write `predict.json` and `predict.csv` into a folder, all or none; over the workspace also its picture.
-
-    Args:
-        folder: Where to.
-        found: The prediction.
-        calibration: What it is of.
-        ids: Names of the configurations, where they were given.
-        units: Of joint values and positions in the table; m and rad if None.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    text = json.dumps(prediction_document(found, calibration.result, ids), indent=1, allow_nan=False) + "\n"
-
-    def write(into: Path) -> None:
-        write_text(into / "predict.json", text)
-        write_prediction_table(into / "predict.csv", found, calibration.robot, units or Units(), ids)
-        if not found.given:
-            errors = found.errors
-            write_charts(
-                into, {"predict": error_slices(errors.position, errors.of(found.fitted)[:, 0], found.measured)}
-            )
-
-    fill_folder(Path(folder), write, FILES)

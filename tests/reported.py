@@ -5,7 +5,7 @@ from fg_calib.report.text import format_result
 
 
 def format_report(solution, assessed, width=100):
-    return format_result(Calibration.of(solution, assessed), width)
+    return format_result(Calibration.of(solution, assessed).report_data, width)
 
 
 def result_document(solution, assessed, inputs=None):

@@ -5,7 +5,6 @@
 | `graph` | what the job says, with its priors | noise |
 | `graph-keep` | the kept parameters alone, no priors (gauge `keep`) | noise |
 | `gauss-newton` | the same parameters, by Eq. (54)-(55) of Jia et al. (2019) | none: metres, radians, pixels alike |
-| `weighted-gauss-newton` | the same parameters, by the same steps | noise |
 | `scipy` | the same parameters, by `scipy.optimize.least_squares` | noise |
 
 All of them also estimate landmarks, unknown frames and offsets, from the graph's start. Plain least squares takes
@@ -46,8 +45,7 @@ ESTIMATORS: Mapping[str, str] = {
     "graph": "the factor graph, as the job says",
     "graph-keep": "the factor graph, the kept parameters alone and no priors",
     "gauss-newton": "plain least squares of the kept parameters without weights: Eq. (54) of Jia et al. (2019)",
-    "weighted-gauss-newton": "the same, weighted by noise, each measurement as if it were alone",
-    "scipy": "scipy.optimize.least_squares of the same parameters and weights",
+    "scipy": "scipy.optimize.least_squares of the same, weighted by noise, each measurement as if it were alone",
 }
 """The estimators in the order of a comparison, in words."""
 
@@ -218,14 +216,7 @@ def _fit_kept(job: Job, problem: Problem, name: str) -> LeastSquares:
     held = [i for i, p in enumerate(job.robot.parameters) if p.name not in kept]
     start = problem.start.copy()
     start[held] = job.robot.nominal[held]  # of an unknown tool too, as in the graph
-    return fit_least_squares(
-        job.robot,
-        problem.data,
-        names=kept,
-        start=start,
-        weighted=name != "gauss-newton",
-        method="scipy" if name == "scipy" else "gauss-newton",
-    )
+    return fit_least_squares(job.robot, problem.data, names=kept, start=start, weighted=name == "scipy")
 
 
 @single_threaded

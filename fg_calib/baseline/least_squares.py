@@ -1,13 +1,13 @@
-r"""Plain least squares, the paper's own estimator: the baseline that the factor graph is compared with.
+r"""Plain least squares: the baseline that the factor graph is compared with.
 
-Jia et al. (2019), Eq. (54) and (55), as printed:
+Without weights, the paper's own estimator: Jia et al. (2019), Eq. (54) and (55), as printed:
 
     dPsi_i = Psi* - f(Omega_i, Theta)               measured minus predicted, metres and radians side by side
     dOmega_{i+1} = J(Omega_i, Theta)^+ dPsi_i       the Moore-Penrose inverse: a minimum-norm step
     Omega_{i+1} = Omega_i + dOmega_{i+1}            until dOmega is small
 
-The same with rows whitened by their noise, and `scipy.optimize.least_squares` on the same rows, are further methods.
-Nothing here knows GTSAM, priors, damping or observability: of the graph's mathematics only `residuals` is shared.
+With weights, `scipy.optimize.least_squares` on the same rows, whitened by their noise. Nothing here knows GTSAM,
+priors, damping or observability: of the graph's mathematics only `residuals` is shared.
 
 An unknown measurement frame takes six more unknowns: world_T_base = start * Txyz Rz(yaw) Ry(pitch) Rx(roll), a
 correction of the frame that the fit starts from. It starts at zero, where its angles are far from singular. Landmarks
@@ -29,11 +29,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check, check_names, check_number, checked
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check_names, checked
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import (
@@ -48,8 +49,6 @@ from fg_calib.robot import (
     rotation_of,
     yaw_pitch_roll,
 )
-
-Method = Literal["gauss-newton", "scipy"]
 
 RCOND = 1e-10
 """Singular values of J below this part of the largest count as zero in J^+."""
@@ -66,77 +65,46 @@ REWEIGHTED = 1e-10
 NOT_DIFFERENTIABLE = 1e-12
 """A predicted distance below this, or an angle this near to 0 or pi, has no derivative, [m], [rad]."""
 
-_ROUNDS = 20
-"""Fits with new weights at most."""
+_ROUNDS, _STEPS = 20, 50
+"""Fits with new weights, and steps of one fit, at most."""
+
+_SMALL_STEP = 1e-12
+"""Length of a step that ends a fit, metres and radians side by side."""
 
 
 @dataclass(frozen=True)
-class Fit(Brief):
-    """Unknowns where a method stopped, and why.
-
-    Attributes:
-        x: The unknowns, shape (n,).
-        converged: Whether the last step was small enough.
-        message: Why it stopped.
-        iterations: Steps taken (scipy: derivatives asked for).
-        steps: Length of each Gauss-Newton step, metres and radians side by side; empty for scipy.
-    """
-
-    x: Floats
-    converged: bool
-    message: str
-    iterations: int
-    steps: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class LeastSquares(Fit):
+class LeastSquares(Brief):
     """The result of plain least squares.
 
     Attributes:
         robot: The robot with the estimated values.
         names: The parameters that were estimated, in the order of the covariance.
-        frames: x, y, z, yaw, pitch, roll of each unknown measurement frame world_T_base, shape (n_frames, 6), [m] and
-            [rad].
-        places: Coordinates of the estimated landmarks, shape (n_coordinates,).
+        parameters: Values of the robot, x, y, z, yaw, pitch, roll of each unknown measurement frame world_T_base (six
+            zeros where there is none), coordinates of the estimated landmarks: as `Problem.start` has them.
         covariance: Of the estimated parameters as least squares claims it, shape (n_names, n_names), [m] and [rad]:
             (J^T W J)^-1 if weighted by noise, else s^2 (J^T J)^-1 with s^2 = |r|^2 / (n_rows - rank). nan in rows and
             columns of parameters that J does not determine, and everywhere where s^2 has no degree of freedom.
-        residuals: Predicted minus measured of the rows that took part, not weighted, shape (n_rows,), [m], [rad] and
-            pixels.
-        rank: Of J at the estimate, the columns of frames and places included.
+        n_rows: Number of scalar residuals.
+        converged: Whether the last step was small enough.
+        message: Why it stopped.
+        iterations: Steps taken (scipy: derivatives asked for).
         seconds: Time taken.
     """
 
     robot: Robot
     names: tuple[str, ...]
-    frames: Floats
-    places: Floats
+    parameters: Floats
     covariance: Floats
-    residuals: Floats
-    rank: int
-    seconds: float = 0.0
-
-    @property
-    def n_rows(self) -> int:
-        """Number of scalar residuals."""
-        return len(self.residuals)
+    n_rows: int
+    converged: bool
+    message: str
+    iterations: int
+    seconds: float
 
     @property
     def sigma(self) -> dict[str, float]:
         """1 sigma of each estimated parameter, [m] or [rad]; nan where J does not determine it."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
-
-    @property
-    def frame(self) -> Floats:
-        """The first of `frames`, zero where none was estimated, shape (6,), [m] and [rad]."""
-        return self.frames[0] if len(self.frames) else np.zeros(6)
-
-    @property
-    def parameters(self) -> Floats:
-        """The robot's values, `frames` (six values where there is none), and `places`: as `Problem.start` has them."""
-        frames = self.frames if len(self.frames) else np.zeros(6)
-        return np.concatenate([self.robot.nominal, frames.ravel(), self.places])
 
 
 @checked
@@ -148,46 +116,42 @@ def fit_least_squares(
     names: Sequence[str] | None = None,
     start: Floats | None = None,
     weighted: bool = False,
-    method: Method = "gauss-newton",
-    max_iterations: int = 50,
-    tolerance: float = 1e-12,
 ) -> LeastSquares:
     """Estimate parameters by plain least squares.
 
     Args:
-        robot: The nominal robot; its tolerances are not used.
+        robot: The nominal robot; its prior sigmas are not used.
         data: What was measured: all tables of a calibration with their landmarks (see `measurements.build_dataset`).
         names: The parameters to estimate; all that the robot's file lets be estimated if None. With more than the
             measurements determine every step is a minimum-norm step.
-        start: Values to start from, as `Problem.start`: of the robot, [m] or [rad]; x, y, z, yaw, pitch, roll of the
-            measurement frames (six values at least); coordinates of estimated landmarks. Without landmarks those of
-            the robot suffice. Nominal values and the identity if None.
+        start: Values to start from, as `Problem.start`: see `LeastSquares.parameters`. Nominal values, the identity and
+            the landmarks' own starts if None.
         weighted: Whether rows are whitened by the noise of measurements and, to first order, of joint readings. The
             weights are those at the start, then those at the estimate, until they change nothing more.
-        method: `gauss-newton`, as printed; `scipy`: `scipy.optimize.least_squares` with the same derivatives.
-        max_iterations: Steps (scipy: evaluations) after which it gives up.
-        tolerance: Length of a Gauss-Newton step that is small enough, metres and radians side by side.
 
     Raises:
         InputError: An argument is not one of those possible, there is no row to fit, or nothing to estimate.
     """
     clock = time.perf_counter()
-    check("method", method, Method)
-    check_number("max_iterations", max_iterations, least=1, whole=True)
-    check_number("tolerance", tolerance, finite=False)
-    system = _System(robot, data, _chosen(robot, names), start)
-    solver = partial(_METHODS[method], limit=max_iterations, tolerance=tolerance)
-    fit, weights = system.solve(solver, weighted)
-    return replace(system.result(fit, weights), seconds=time.perf_counter() - clock)
-
-
-def _chosen(robot: Robot, names: Sequence[str] | None) -> list[int]:
-    """Indices of the parameters to estimate, in the robot's order."""
     wanted = [p.name for p in robot.parameters if p.estimated] if names is None else list(names)
     check_names("names", wanted, names_of(robot.parameters))
     if not wanted:
         raise InputError("names", "nothing to estimate", "at least one parameter")
-    return [i for i, p in enumerate(robot.parameters) if p.name in wanted]
+    system = _System(robot, data, [i for i, p in enumerate(robot.parameters) if p.name in wanted], start)
+    fit, weights = system.solve(weighted)
+    m = len(system.chosen)
+    r, J = system.evaluate(fit.x, weights)
+    return LeastSquares(
+        robot=robot.with_values(system.values(fit.x)),
+        names=tuple(robot.parameters[i].name for i in system.chosen),
+        parameters=system.parameters(fit.x),
+        covariance=claimed_covariance(r, J, weighted)[:m, :m],
+        n_rows=len(r),
+        converged=fit.converged,
+        message=fit.message,
+        iterations=fit.iterations,
+        seconds=time.perf_counter() - clock,
+    )
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]
@@ -197,35 +161,33 @@ Weights = tuple[Floats, ...]
 """Whitening of each block of rows, shape (n, residual_dim, residual_dim)."""
 
 
-def gauss_newton(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) -> Fit:
+@dataclass(frozen=True)
+class Fit:
+    """Unknowns where a method stopped, shape (n,), and why."""
+
+    x: Floats
+    converged: bool
+    message: str
+    iterations: int
+
+
+def gauss_newton(evaluate: Evaluate, x: Floats) -> Fit:
     """Minimum by Eq. (54) and (55) of the paper."""
-    steps: list[float] = []
-    converged, message = False, ""
-    while not message:
-        with np.errstate(all="ignore"):
-            r, J = evaluate(x)
-            finite = np.isfinite(r).all() and np.isfinite(J).all()
-            step = np.linalg.pinv(J, rcond=RCOND) @ -r if finite else np.full(len(x), np.nan)
-        if not np.isfinite(step).all():
-            message = f"diverged: residuals are not finite after {len(steps)} steps"
-            break
-        x = x + step
-        steps.append(float(np.linalg.norm(step)))
-        rounding = steps[-1] <= ROUNDING and len(steps) > 1 and steps[-1] >= steps[-2]
-        converged = steps[-1] <= tolerance or rounding
-        if converged:
-            message = f"converged: the last step was {steps[-1]:.1e}"
-        elif len(steps) == limit:
-            message = f"not converged: {limit} iterations, the last step was {steps[-1]:.1e}"
-    return Fit(x, converged, message, len(steps), tuple(steps))
+    last = np.inf
+    for n in range(1, _STEPS + 1):
+        r, J = evaluate(x)
+        if not (np.isfinite(r).all() and np.isfinite(J).all()):
+            return Fit(x, False, f"diverged: residuals are not finite after {n - 1} steps", n - 1)
+        step = np.linalg.pinv(J, rcond=RCOND) @ -r
+        x, before, last = x + step, last, float(np.linalg.norm(step))
+        if last <= _SMALL_STEP or before <= last <= ROUNDING:
+            return Fit(x, True, f"converged: the last step was {last:.1e}", n)
+    return Fit(x, False, f"not converged: {_STEPS} iterations, the last step was {last:.1e}", _STEPS)
 
 
-def scipy_fit(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) -> Fit:
+def scipy_fit(evaluate: Evaluate, x: Floats) -> Fit:
     """Minimum by MINPACK's Levenberg-Marquardt, or scipy's trust region with fewer rows than unknowns."""
     from scipy import optimize  # here: it takes as long to import as a small calibration
-
-    method: Literal["lm", "trf"] = "lm" if len(evaluate(x)[0]) >= len(x) else "trf"
-    exact = 1e-15  # near the least that MINPACK takes
 
     def residual(x: Floats) -> Floats:
         return evaluate(x)[0]
@@ -233,17 +195,19 @@ def scipy_fit(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) ->
     def jacobian(x: Floats) -> Floats:
         return evaluate(x)[1]
 
+    method: Literal["lm", "trf"] = "lm" if len(residual(x)) >= len(x) else "trf"
+    exact = 1e-15  # near the least that MINPACK takes
     try:
         found = optimize.least_squares(
             residual,
             x,
-            jac=jacobian,
+            jacobian,
             method=method,
             x_scale="jac",
             ftol=exact,
-            xtol=max(exact, tolerance),
+            xtol=_SMALL_STEP,
             gtol=exact,
-            max_nfev=limit,
+            max_nfev=_STEPS,
         )
     except (ValueError, np.linalg.LinAlgError) as error:
         return Fit(x, False, f"no step possible: {error}", 0)
@@ -252,14 +216,11 @@ def scipy_fit(evaluate: Evaluate, x: Floats, *, limit: int, tolerance: float) ->
     return Fit(np.asarray(found.x, float), bool(found.status > 0), message, int(found.njev or found.nfev))
 
 
-_METHODS = {"gauss-newton": gauss_newton, "scipy": scipy_fit}
-
-
-def claimed_covariance(r: Floats, J: Floats, weighted: bool) -> tuple[Floats, int]:
-    """(J^T J)^-1, times s^2 of unweighted rows, nan where J does not determine a parameter; and the rank of J."""
+def claimed_covariance(r: Floats, J: Floats, weighted: bool) -> Floats:
+    """(J^T J)^-1, times s^2 of unweighted rows, nan where J does not determine a parameter."""
     n = J.shape[1]
     if not np.isfinite(J).all():
-        return np.full((n, n), np.nan), 0
+        return np.full((n, n), np.nan)
     _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
     rank = int(np.sum(s > RCOND * s.max(initial=0.0)))
     sqrt_cov = Vt[:rank].T / s[:rank]
@@ -269,7 +230,7 @@ def claimed_covariance(r: Floats, J: Floats, weighted: bool) -> tuple[Floats, in
     undetermined = np.linalg.norm(Vt[rank:], axis=0) > MAX_SHARE
     covariance[undetermined, :] = np.nan
     covariance[:, undetermined] = np.nan
-    return covariance, rank
+    return covariance
 
 
 @dataclass(frozen=True)
@@ -349,23 +310,33 @@ class _System:
     """Rows as a function of the unknowns: parameters, a correction of each unknown frame, landmarks' coordinates."""
 
     def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None) -> None:
-        self._robot, self.chosen = robot, chosen
-        self._sigma_joint = data.sigma_joint
+        self.chosen, self._sigma_joint = chosen, data.sigma_joint
         unknown = np.array([table.unknown_frame for table in data.tables])
         self._frame_of = np.where(unknown, np.cumsum(unknown) - 1, -1).tolist()
-        edges = np.cumsum([0, *data.unknowns.sizes])
-        places = [np.arange(edges[i], edges[i + 1]) for i in np.flatnonzero(data.estimated()).tolist()]
-        self._estimated = np.concatenate([np.zeros(0, dtype=np.int64), *places])
-        tolerances = [t for t, of in zip(data.unknowns.tolerances, data.estimated(), strict=True) if of]
+        estimated = data.estimated()
+        places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.unknowns.sizes]).tolist())]
         self._coordinates: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
-        self._priors = [(p, self._coordinates[p], t) for p, t in zip(places, tolerances, strict=True) if t is not None]
-        n, n_frames, m = len(robot.parameters), int(unknown.sum()), len(chosen)
-        given = _checked_start(robot, start, n_frames, len(self._estimated))
-        self._values, self._frames = given[:n], given[n : n + 6 * n_frames].reshape(-1, 6)
-        landmarks = given[n + 6 * max(1, n_frames) :]
+        self._priors = [
+            (place, self._coordinates[place], sigma)
+            for place, sigma, of in zip(places, data.unknowns.tolerances, estimated, strict=True)
+            if of and sigma is not None
+        ]
+        self._estimated = np.concatenate(
+            [np.zeros(0, np.int64), *(p for p, of in zip(places, estimated, strict=True) if of)]
+        )
+        n, m, n_frames = len(robot.parameters), len(chosen), int(unknown.sum())
+        edges = [n, n + 6 * max(1, n_frames)]
+        if start is None:
+            start = np.concatenate([robot.nominal, np.zeros(6 * max(1, n_frames)), self._coordinates[self._estimated]])
+        if start.shape != (edges[1] + len(self._estimated),) or not np.isfinite(start).all():
+            raise InputError(
+                "start", f"shape {start.shape}, or a value that is not finite", "values as `Problem.start`"
+            )
+        self._values, frames, landmarks = np.split(start, edges)
+        self._frames = frames.reshape(-1, 6)[:n_frames]
         self._coordinates[self._estimated] = landmarks
-        self.n_core = m + self._frames.size
-        self._first = np.concatenate([self._values[chosen], np.zeros(self._frames.size), landmarks])
+        self.n_core = m + 6 * n_frames
+        self._first = np.concatenate([self._values[chosen], np.zeros(6 * n_frames), landmarks])
         self._column = np.full(len(self._coordinates), -1, dtype=np.int64)  # -1: a known coordinate
         self._column[self._estimated] = self.n_core + np.arange(len(landmarks))
         self._chains = []
@@ -386,29 +357,14 @@ class _System:
         values[self.chosen] = x[: len(self.chosen)]
         return values
 
-    def frames(self, x: Floats) -> Floats:
-        """x, y, z, yaw, pitch, roll of each unknown frame at the unknowns x, shape (n_frames, 6)."""
+    def parameters(self, x: Floats) -> Floats:
+        """Values of the robot, the frames and the landmarks at the unknowns x: see `LeastSquares.parameters`."""
+        frames = np.zeros((max(1, len(self._frames)), 6))
         corrections = x[len(self.chosen) : self.n_core].reshape(-1, 6)
-        found = np.empty((len(corrections), 6))
-        for out, start, correction in zip(found, self._frames, corrections, strict=True):
+        for out, start, correction in zip(frames, self._frames, corrections, strict=False):
             R = rotation_of(*start[3:])
             out[:3], out[3:] = start[:3] + R @ correction[:3], yaw_pitch_roll(R @ rotation_of(*correction[3:]))
-        return found
-
-    def result(self, fit: Fit, weights: Weights | None) -> LeastSquares:
-        """The estimate at the end of a fit, with the covariance that it claims."""
-        x, m = fit.x, len(self.chosen)
-        covariance, rank = claimed_covariance(*self.evaluate(x, weights), weights is not None)
-        return LeastSquares(
-            **vars(fit),
-            robot=self._robot.with_values(self.values(x)),
-            names=tuple(self._robot.parameters[i].name for i in self.chosen),
-            frames=self.frames(x),
-            places=x[self.n_core :],
-            covariance=covariance[:m, :m],
-            residuals=self.evaluate(x, None)[0],
-            rank=rank,
-        )
+        return np.concatenate([self.values(x), frames.ravel(), x[self.n_core :]])
 
     def _chain(self, table: int, x: Floats) -> Chain:
         """The arm in a table's measurement frame at the unknowns x."""
@@ -447,37 +403,18 @@ class _System:
         coordinates = self._landmarks(x)
         return tuple(r.whitening(self._chain(r.table, x), coordinates, self._sigma_joint) for r in self._rows)
 
-    def solve(self, solver: Callable[[Evaluate, Floats], Fit], weighted: bool) -> tuple[Fit, Weights | None]:
+    def solve(self, weighted: bool) -> tuple[Fit, Weights | None]:
         """The fit and its weights: those at the estimate, where joint noise makes them depend on it."""
         if not weighted:
-            return solver(lambda x: self.evaluate(x, None), self._first), None
-        fit = Fit(self._first, converged=False, message="", iterations=0)
+            return gauss_newton(partial(self.evaluate, weights=None), self._first), None
+        x, iterations, moved = self._first, 0, np.inf
         for _ in range(_ROUNDS):
-            weights = self._weights(fit.x)
-            again = solver(partial(self.evaluate, weights=weights), fit.x)
-            moved = float(np.linalg.norm(again.x - fit.x))
-            fit = replace(again, iterations=fit.iterations + again.iterations, steps=fit.steps + again.steps)
+            weights = self._weights(x)
+            fit = scipy_fit(partial(self.evaluate, weights=weights), x)
+            moved, x, iterations = float(np.linalg.norm(fit.x - x)), fit.x, iterations + fit.iterations
             if not fit.converged or moved <= REWEIGHTED or not np.any(self._sigma_joint > 0.0):
-                return fit, weights
-        return replace(
-            fit, converged=False, message=f"not converged: new weights still move it by {moved:.1e}"
-        ), weights
-
-
-def _checked_start(robot: Robot, start: Floats | None, n_frames: int, n_landmarks: int) -> Floats:
-    """Values of the robot, of at least one measurement frame (zeros where they are left out), and of landmarks.
-
-    Raises:
-        InputError: There are more or fewer, or one is not finite.
-    """
-    given, n = np.asarray(robot.nominal if start is None else start, dtype=np.float64), len(robot.parameters)
-    whole = n + 6 * max(1, n_frames) + n_landmarks
-    if given.shape == (n,) and not n_landmarks:
-        given = np.append(given, np.zeros(whole - n))
-    if given.shape != (whole,) or not np.isfinite(given).all():
-        found = f"shape {given.shape}" if np.isfinite(given).all() else "a value that is not finite"
-        raise InputError("start", found, f"{n} values of the robot, or {whole} with the measurement frame's")
-    return given
+                return replace(fit, iterations=iterations), weights
+        return Fit(x, False, f"not converged: new weights still move it by {moved:.1e}", iterations), weights
 
 
 def _with_frame(robot: Robot, world_T_base: Floats) -> Robot:

@@ -91,10 +91,8 @@ def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -
 
 def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> RenderableType:
     """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
-    from rich.console import Group
-
     from fg_calib.importers import period
-    from fg_calib.report import indented, line, section, table_of
+    from fg_calib.report import line, report, section, table_of
 
     n, skipped = len(stops.ids), len(stops.skipped)
     streams = [
@@ -112,14 +110,14 @@ def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> 
     ]
     slow = [what for what, s in stops.scatter.items() if s.slow and what != "joint"]
     rough = [f"noise of {' and '.join(slow)} is slower than the stops are long: its sigmas are rough"] if slow else []
-    return Group(
+    return report(
         line(f"{name}: {n + skipped} stops found, {n} used, {skipped} skipped", "bold"),
         table_of(("", "topic", "type", "messages", "Hz"), streams, left="lll"),
-        *indented(f"{s.source.topic}: {note}" for s in (joints, poses) for note in s.source.notes),
-        *section("Clocks", *indented(_clocks(stops))),
+        *(f"{s.source.topic}: {note}" for s in (joints, poses) for note in s.source.notes),
+        *section("Clocks", *_clocks(stops)),
         *section("Scatter during stops", table_of(("", "of one", "of the mean", "correlated over"), scatter)),
-        *indented(rough),
-        *section("Skipped", *indented(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
+        *rough,
+        *section("Skipped", *(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
     )
 
 

@@ -74,10 +74,9 @@ def board(
 def _report(tables: BoardTables) -> RenderableType:
     """Corners, images and the camera, then what to know of the tables."""
     import numpy as np
-    from rich.console import Group
 
     from fg_calib.importers import INTRINSICS
-    from fg_calib.report import figure, indented, line, section, table_of
+    from fg_calib.report import figure, line, report, section, table_of
 
     fit, board = tables.fit, tables.fit.board
     n_images = len(fit.views) + len(fit.without_pose) + len(tables.without)
@@ -94,13 +93,13 @@ def _report(tables: BoardTables) -> RenderableType:
         unit, decimals = ("px", 3) if name in INTRINSICS[:4] else ("", 6)
         camera.append((name, f"{getattr(fit.camera, name):.{decimals}f}", f"{sigma:.{decimals}f}", unit))
     headings = ("Image", "corners", "RMS px", "sigma px", "distance mm", "sigma mm", "sigma deg", "")
-    return Group(
+    return report(
         line(f"{title}: {seen}"),
         *(line(f"DOUBTFUL: {finding}", "bold red") for finding in fit.findings),
         line(f"RMS of residuals {fit.rms:.3f} px, sigma of a corner {fit.sigma:.3f} px"),
         table_of(headings, images, left="lrrrrrrl"),
         *(section("Camera (1 sigma)", table_of(("", "estimate", "sigma", ""), camera, left="lrrl")) if camera else []),
-        *section("Notes", *indented(_notes(tables))),
+        *section("Notes", *_notes(tables)),
     )
 
 

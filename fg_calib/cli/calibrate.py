@@ -82,7 +82,7 @@ def show_calibration(found: Calibration, as_json: bool) -> None:
     """Print a calibration, and end with 3 where it is not to be trusted or not accepted."""
     from fg_calib.report import build_report
 
-    show_result(as_json, found.result.document, lambda: build_report(found))
+    show_result(as_json, found.result.document, lambda: build_report(found.report_data))
     end(found.findings, not_accepted=found.not_accepted)
 
 

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
-from fg_calib.robot import Joint, Robot, pose, random_readings
+from fg_calib.robot import Robot, pose, random_readings
 
 QUANTILES: Mapping[str, float] = {"median": 0.5, "p95": 0.95, "largest": 1.0}
 """Statistics by which errors are summarised."""
@@ -38,25 +39,6 @@ _N_SAMPLED = 1000
 """Configurations that give the radius of the workspace where these are given, and the responsible parameters."""
 
 
-@dataclass(frozen=True)
-class JointRange(FrozenArrays):
-    """Where a joint was read, and where it may be.
-
-    Attributes:
-        name: Its name.
-        unit: `m` or `rad`.
-        limits: Lower and upper, infinite where it has none.
-        range: The lowest and the highest reading.
-        gap: The widest interval between its limits, or lowest and highest reading, without a reading.
-    """
-
-    name: str
-    unit: str
-    limits: tuple[float, float]
-    range: tuple[float, float]
-    gap: tuple[float, float]
-
-
 def _bounded(robot: Robot, readings: Floats) -> Robot:
     """The robot with its readings as the limits of joints that slide without any."""
     ends = zip(robot.joints, readings.min(axis=0).tolist(), readings.max(axis=0).tolist(), strict=True)
@@ -67,15 +49,6 @@ def _bounded(robot: Robot, readings: Floats) -> Robot:
         for joint, low, high in ends
     ]
     return replace(robot, joints=tuple(joints))
-
-
-def _range(joint: Joint, readings: Floats) -> JointRange:
-    inside = np.unique(readings)
-    ends = [limit for limit in (joint.lower, joint.upper) if np.isfinite(limit)]
-    places = np.unique(np.concatenate([inside, ends]))
-    widest = int(np.argmax(np.diff(places))) if len(places) > 1 else 0
-    gap = (float(places[widest]), float(places[min(widest + 1, len(places) - 1)]))
-    return JointRange(joint.name, joint.unit, (joint.lower, joint.upper), (float(inside[0]), float(inside[-1])), gap)
 
 
 @dataclass(frozen=True)
@@ -122,29 +95,45 @@ class PredictedErrors(FrozenArrays):
     """Expected errors of the tool of a calibrated arm.
 
     Attributes:
+        model: What is expected of the tool.
         errors: Configuration by configuration.
         fitted: Whether they count after the best rigid fit of what was measured, because nothing was measured in the
             base frame; else in the base frame.
         given: Whether the configurations were given; else they were drawn all over the workspace.
         far: Whether no measured position is near each of them, shape (n,).
         measured: Where the tool was measured, shape (m, 3), [m].
-        joints: Where each joint was read, and where it may be.
-        worst: Where the error is largest; None where it is known nowhere.
-        responsible: The parameters that errors follow over all configurations where they are known, most first.
-        undetermined: Parameters that neither measurements nor tolerances determine, if some errors depend on them.
         limit: Largest allowed position error, [m]; None without any.
     """
 
+    model: ToolPoseUncertainty
     errors: ToolErrors
     fitted: bool
     given: bool
     far: Booleans
     measured: Floats
-    joints: tuple[JointRange, ...]
-    worst: WorstConfiguration | None
-    responsible: tuple[Responsible, ...]
-    undetermined: tuple[str, ...]
     limit: float | None
+
+    @cached_property
+    def worst(self) -> WorstConfiguration | None:
+        """Where the error is largest; None where it is known nowhere."""
+        if self.unknown == 1.0:
+            return None
+        row = int(np.nanargmax(self.expected[:, 0]))
+        return _worst(self, self.model.at(self.errors.readings[row : row + 1]), row)
+
+    @cached_property
+    def responsible(self) -> tuple[Responsible, ...]:
+        """The parameters that errors follow over all configurations where they are known, most first."""
+        known = self.errors.readings[np.isfinite(self.expected[:, 0])]
+        sampled = known[np.unique(np.linspace(0, len(known) - 1, min(_N_SAMPLED, len(known))).astype(np.int64))]
+        return _responsible(self.model, sampled, self.fitted)
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Parameters that neither measurements nor priors determine, if some errors depend on them."""
+        covariance = self.model.covariance
+        variances = zip(covariance.variables.names, np.diag(covariance.named()), strict=False)
+        return tuple(name for name, variance in variances if np.isnan(variance)) if self.unknown else ()
 
     @property
     def expected(self) -> Floats:
@@ -214,39 +203,18 @@ def predict_errors(
     radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
     measured_points = pose(robot, measured).position
     far = np.asarray(cKDTree(measured_points).query(errors.position)[0]) > FAR * radius
-    expected, worst = errors.of(fitted)[:, 0], None
-    known = errors.readings[np.isfinite(expected)]
-    sampled = known[np.unique(np.linspace(0, len(known) - 1, min(_N_SAMPLED, len(known))).astype(np.int64))]
-    named = zip(model.covariance.variables.names, np.diag(model.covariance.named()), strict=False)
-    if len(known):
-        row = int(np.nanargmax(expected))
-        at = model.at(errors.readings[row : row + 1])
-        worst = _worst(model, at, fitted, None if readings is None else row, bool(far[row]))
-    return PredictedErrors(
-        errors=errors,
-        fitted=fitted,
-        given=readings is not None,
-        far=far,
-        measured=measured_points,
-        joints=tuple(_range(joint, measured[:, i]) for i, joint in enumerate(robot.joints)),
-        worst=worst,
-        responsible=_responsible(model, sampled, fitted),
-        undetermined=tuple(name for name, one in named if np.isnan(one)) if len(known) < len(expected) else (),
-        limit=limit,
-    )
+    return PredictedErrors(model, errors, fitted, readings is not None, far, measured_points, limit)
 
 
-def _worst(
-    model: ToolPoseUncertainty, there: ToolErrors, fitted: bool, row: int | None, far: bool
-) -> WorstConfiguration:
+def _worst(found: PredictedErrors, errors: ToolErrors, row: int) -> WorstConfiguration:
     """The error ellipsoid and the responsible parameters at one configuration."""
-    v = model.motions(there.readings, fitted=fitted)[0, 3:]
+    model, fitted = found.model, found.fitted
+    v = model.motions(errors.readings, fitted=fitted)[0, 3:]
     size, axes = np.linalg.eigh(v @ model.covariance.tangent @ v.T)
     sigma, axes = np.sqrt(np.maximum(size[::-1], 0.0)), axes.T[::-1]
     axes = axes * np.where(axes[np.arange(3), np.argmax(np.abs(axes), axis=1)] < 0.0, -1.0, 1.0)[:, None]
-    return WorstConfiguration(
-        there, row, axes, sigma, far, _responsible(model, there.readings, fitted, along=axes[0] @ v)
-    )
+    along = _responsible(model, errors.readings, fitted, along=axes[0] @ v)
+    return WorstConfiguration(errors, row if found.given else None, axes, sigma, bool(found.far[row]), along)
 
 
 def _responsible(

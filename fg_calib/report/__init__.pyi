@@ -1,7 +1,5 @@
-from .charts import write_charts
 from .compare import build_history, comparison_document, format_comparison, history_document, write_comparison
 from .design import build_design_report, design_document, write_design
-from .figures import Drawn, error_slices
 from .html import build_page, draw_figures, parameter_table_html
 from .inspect import (
     build_identifiability_report,
@@ -20,15 +18,15 @@ from .predict import (
     prediction_document,
     require_commands,
     write_commands,
-    write_prediction_table,
+    write_prediction,
 )
-from .tables import SHOWN, WIDTH, figure, in_order, indented, line, plain, section, shortened, table_of, width_for
-from .text import build_report, format_result, judged, notes_of, summary
+from .tables import SHOWN, WIDTH, figure, in_order, line, plain, report, section, shortened, table_of, width_for
+from .text import ReportData, build_report, format_result, judged, notes_of, summary
 
 __all__ = [
     "SHOWN",
     "WIDTH",
-    "Drawn",
+    "ReportData",
     "build_check_report",
     "build_correction_report",
     "build_design_report",
@@ -43,7 +41,6 @@ __all__ = [
     "correction_document",
     "design_document",
     "draw_figures",
-    "error_slices",
     "figure",
     "format_comparison",
     "format_identifiability",
@@ -51,7 +48,6 @@ __all__ = [
     "format_result",
     "history_document",
     "in_order",
-    "indented",
     "inspection_document",
     "judged",
     "line",
@@ -60,16 +56,16 @@ __all__ = [
     "parameter_table_html",
     "plain",
     "prediction_document",
+    "report",
     "require_commands",
     "section",
     "shortened",
     "summary",
     "table_of",
     "width_for",
-    "write_charts",
     "write_commands",
     "write_comparison",
     "write_design",
     "write_observability",
-    "write_prediction_table",
+    "write_prediction",
 ]

@@ -1,4 +1,4 @@
-"""Charts as SVG: axes, dots, bars, whiskers and matrices, in colours that the page's style sheet sets.
+"""Charts as SVG: dots, lines, boxes and words on two axes, in colours that the page's style sheet sets.
 
 A chart is a caption and its SVG. It stands in the page as it is, or in a file of its own (`write_charts`).
 """
@@ -23,8 +23,8 @@ WIDTH, HEIGHT = 360.0, 230.0
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 10.0, 12.0, 40.0
 """Margins of the plot within it."""
 
-NAMES = 92.0
-"""Width of the names to the left of rows."""
+CELL, LETTER = 14.0, 5.8
+"""Size of a row or column that has a name, and width of a letter of the name."""
 
 MAX_DOTS = 1500
 """Dots that a chart shows; of more, as many that are evenly spaced."""
@@ -48,34 +48,18 @@ def tag(name: str, content: str = "", **attributes: str | float) -> str:
     Args:
         name: Of the element.
         content: Elements, or text that has been escaped.
-        attributes: By name, a trailing _ removed.
+        attributes: By name, a trailing _ removed; numbers are coordinates, in few characters.
     """
     plain = [
-        f' {key.rstrip("_")}="{escape(escaped(value)) if isinstance(value, str) else coordinate(value)}"'
+        f' {key.rstrip("_")}="{escape(escaped(value)) if isinstance(value, str) else f"{round(value, 1):g}"}"'
         for key, value in attributes.items()
     ]
     return f"<{name}{''.join(plain)}>{content}</{name}>"
 
 
-def coordinate(value: float) -> str:
-    """A coordinate in few characters."""
-    return f"{round(value, 1):g}"
-
-
-def words(x: float, y: float, text: str, kind: str, **attributes: str) -> str:
-    """Text at coordinates."""
-    return tag("text", escape(escaped(text)), x=x, y=y, class_=kind, **attributes)
-
-
 def title(text: str) -> str:
     """Text that shows when its element is pointed at, and for who cannot see it."""
     return tag("title", escape(escaped(text)))
-
-
-def framed(caption: str, width: float, height: float, *elements: str) -> Chart:
-    """A chart of elements."""
-    box = f"0 0 {coordinate(width)} {coordinate(height)}"
-    return Chart(caption, tag("svg", title(caption) + "".join(elements), viewBox=box, role="img"), width, height)
 
 
 @dataclass(frozen=True)
@@ -118,57 +102,75 @@ def limits_of(*values: Any, around: float = 0.05, with_zero: bool = False) -> tu
     return (low if with_zero and low == 0.0 else low - room), high + room
 
 
+Axis = tuple[float, float] | Sequence[str]
+"""What an axis shows: values from a lowest to a highest, or names, whose values are 0, 1, 2 ..."""
+
+
 class Plot:
-    """A plot with axes; marks are added to it.
+    """A plot with axes; marks are added to it, at values.
 
     Args:
-        x: Lowest and highest value from left to right.
-        y: Those from bottom to top.
+        x: From left to right.
+        y: Values from bottom to top, or names from top to bottom.
         names: What the axes show, with units.
-        size: Width and height.
+        height: Of the chart with values from bottom to top.
         powers: Whether the values from bottom to top are powers of ten.
     """
 
     def __init__(
-        self,
-        x: tuple[float, float],
-        y: tuple[float, float],
-        names: tuple[str, str],
-        size: tuple[float, float] = (WIDTH, HEIGHT),
-        *,
-        powers: bool = False,
+        self, x: Axis, y: Axis, names: tuple[str, str], *, height: float = HEIGHT, powers: bool = False
     ) -> None:
-        self.size, (width, height) = size, size
-        self.x, self.y = Scale(*x, LEFT, width - RIGHT), Scale(*y, height - BOTTOM, TOP)
+        columns, rows = ([short(name, 28) for name in axis if isinstance(name, str)] for axis in (x, y))
+        left = 10.0 + LETTER * max(map(len, rows)) if rows else LEFT
+        bottom = 8.0 + LETTER * max(map(len, columns)) if columns else BOTTOM
+        right, foot = WIDTH - RIGHT, TOP + CELL * len(rows) if rows else height - bottom
+        if columns:
+            right = left + CELL * len(columns)
+        self._size = right + RIGHT, foot + bottom
+        self.x, self.y = _scale(x, left, right), _scale(y, TOP, foot) if rows else _scale(y, foot, TOP)
         self._elements: list[str] = []
-        for value in self.y.ticks():
-            at = self.y(value)
-            self.line(self.x.start, at, self.x.end, at, "grid")
-            self.add(words(self.x.start - 5.0, at + 3.5, f"1e{value:.3g}" if powers else _label(value), "tick end"))
-        for value in self.x.ticks():
+        for value, word in enumerate(rows) if rows else _labels(self.y, powers):
+            if not rows:
+                self.line((self.x.low, self.x.high), value, "grid")
+            self._words(left - 5.0, self.y(value) + 3.5, word, "tick end")
+        for value, word in enumerate(columns) if columns else _labels(self.x):
             at = self.x(value)
-            self.line(at, self.y.start, at, self.y.start + 4.0, "axis")
-            self.add(words(at, self.y.start + 15.0, _label(value), "tick middle"))
-        self.line(self.x.start, self.y.start, self.x.end, self.y.start, "axis")
-        middle = 0.5 * (self.y.start + self.y.end)
-        self.add(words(0.5 * (self.x.start + self.x.end), height - 8.0, names[0], "name middle"))
-        self.add(words(11.0, middle, names[1], "name middle", transform=f"rotate(-90 11 {coordinate(middle)})"))
+            if columns:
+                at, end = at + 3.5, foot + 6.0
+                self._words(at, end, word, "tick end", transform=f"rotate(-90 {at:.1f} {end:.1f})")
+            else:
+                top, kind = (TOP, "grid" if value else "axis") if rows else (foot + 4.0, "axis")
+                self._add("line", x1=at, y1=top, x2=at, y2=foot, class_=kind)
+                self._words(at, foot + 15.0, word, "tick middle")
+        if not rows:
+            self._add("line", x1=left, y1=foot, x2=right, y2=foot, class_="axis")
+        across, up = 0.5 * (left + right), 0.5 * (TOP + foot)
+        self._words(across, foot + bottom - 8.0, names[0], "name middle")
+        self._words(11.0, up, names[1], "name middle", transform=f"rotate(-90 11 {up:.1f})")
 
     def chart(self, caption: str) -> Chart:
         """The plot with a caption."""
-        return framed(caption, *self.size, *self._elements)
+        width, height = self._size
+        svg = tag("svg", title(caption) + "".join(self._elements), viewBox=f"0 0 {width:g} {height:g}", role="img")
+        return Chart(caption, svg, width, height)
 
-    def add(self, element: str) -> None:
-        """Add an element in coordinates."""
-        self._elements.append(element)
+    def _add(self, name: str, content: str = "", **attributes: str | float) -> None:
+        self._elements.append(tag(name, content, **attributes))
 
-    def line(self, x1: float, y1: float, x2: float, y2: float, kind: str) -> None:
-        """A line between coordinates."""
-        self.add(tag("line", x1=x1, y1=y1, x2=x2, y2=y2, class_=kind))
+    def _words(self, x: float, y: float, text: str, kind: str, **attributes: str) -> None:
+        self._add("text", escape(escaped(text)), x=x, y=y, class_=kind, **attributes)
+
+    def words(self, x: float, y: float, text: str) -> None:
+        """Words to the right of a place."""
+        self._words(self.x(x) + 5.0, self.y(y) + 3.5, text, "tick")
+
+    def line(self, x: tuple[float, float], y: float, kind: str) -> None:
+        """A line from left to right at a height."""
+        self._add("line", x1=self.x(x[0]), y1=self.y(y), x2=self.x(x[1]), y2=self.y(y), class_=kind)
 
     def level(self, y: float) -> None:
-        """A dashed line from left to right at a value."""
-        self.line(self.x.start, self.y(y), self.x.end, self.y(y), "level")
+        """A dashed line all from left to right."""
+        self.line((self.x.low, self.x.high), y, "level")
 
     def dots(self, x: Floats, y: Floats, kind: str) -> None:
         """A dot at each pair of finite values."""
@@ -177,125 +179,33 @@ class Plot:
         if len(at):
             at = at[np.unique(np.linspace(0, len(at) - 1, min(len(at), MAX_DOTS)).astype(np.int64))]
             path = "".join([f"M{a:g} {b:g}h0" for a, b in np.round(at, 1).tolist()])
-            self.add(tag("path", d=path, class_=f"dots {kind}"))
+            self._add("path", d=path, class_=f"dots {kind}")
 
     def ring(self, x: float, y: float, text: str) -> None:
         """A ring about a dot; its text shows when it is pointed at."""
-        self.add(tag("circle", title(text), cx=self.x(x), cy=self.y(y), r=5.0, class_="ring"))
+        self._add("circle", title(text), cx=self.x(x), cy=self.y(y), r=5.0, class_="ring")
 
-    def curve(self, x: Floats, y: Floats, kind: str) -> None:
+    def curve(self, x: Floats, y: Floats) -> None:
         """A curve through values."""
         points = zip(self.x(x).tolist(), self.y(y).tolist(), strict=True)
-        path = "M" + "L".join(f"{coordinate(a)} {coordinate(b)}" for a, b in points)
-        self.add(tag("path", d=path, class_=kind))
+        self._add("path", d="M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in points), class_="curve")
 
-    def box(self, x1: float, y1: float, x2: float, y2: float, **attributes: str) -> None:
-        """A rectangle between values."""
-        (left, right), (top, bottom) = sorted((self.x(x1), self.x(x2))), sorted((self.y(y1), self.y(y2)))
-        self.add(tag("rect", x=left, y=top, width=right - left, height=bottom - top, **attributes))
-
-
-def bars(rows: Sequence[tuple[str, Sequence[tuple[str, float, str]]]], caption: str) -> Chart:
-    """Groups of horizontal bars, each with its own scale, the last of a group in colour.
-
-    Args:
-        rows: Name of a group, and its bars: name, length, and value in words.
-        caption: Of the chart.
-    """
-    bar, gap, first = 17.0, 13.0, 18.0
-    elements, y = [], 0.0
-    for name, group in rows:
-        elements.append(words(0.0, y + 12.0, name, "name"))
-        most = max((length for _, length, _ in group if np.isfinite(length)), default=0.0) or 1.0
-        y += first
-        for i, (what, length, value) in enumerate(group, start=1):
-            wide = 165.0 * length / most if np.isfinite(length) else 0.0
-            kind = "bar after" if i == len(group) else "bar before"
-            elements.append(words(72.0, y + 12.0, what, "tick end"))
-            elements.append(tag("rect", x=78.0, y=y + 2.0, width=max(wide, 1.0), height=bar - 5.0, class_=kind))
-            elements.append(words(84.0 + wide, y + 12.0, value, "tick"))
-            y += bar
-        y += gap
-    return framed(caption, WIDTH, y, *elements)
+    def box(self, x: tuple[float, float], y: tuple[float, float], about: str = "", **attributes: str) -> None:
+        """A rectangle between values; what it is about shows when it is pointed at."""
+        (left, right), (top, bottom) = sorted(map(self.x, x)), sorted(map(self.y, y))
+        size = {"x": left, "y": top, "width": right - left, "height": bottom - top}
+        self._add("rect", title(about) if about else "", **size, **attributes)
 
 
-class Whisker(NamedTuple):
-    """A name, a value, its sigma (nan: unknown), and its prior sigma (nan: none)."""
-
-    name: str
-    value: float
-    sigma: float
-    prior: float
+def _scale(axis: Axis, start: float, end: float) -> Scale:
+    low, high = (-0.5, len(axis) - 0.5) if isinstance(axis[0], str) else axis
+    return Scale(float(low), float(high), start, end)
 
 
-def whiskers(rows: Sequence[Whisker], caption: str, name: str) -> Chart:
-    """A row each with a dot, a line of one sigma to both sides, and a pale band of the prior sigma.
-
-    Args:
-        rows: What is shown.
-        caption: Of the chart.
-        name: Of the axis.
-    """
-    row = 15.0
-    height = TOP + BOTTOM + row * len(rows)
-    value, sigma, prior = (np.array([one[i] for one in rows]) for i in (1, 2, 3))
-    spread = np.nan_to_num(sigma)
-    x = Scale(*limits_of(value - spread, value + spread, [0.0], prior, -prior), NAMES, WIDTH - RIGHT)
-    elements = []
-    for tick in x.ticks():
-        at, bottom = x(tick), height - BOTTOM
-        elements.append(tag("line", x1=at, y1=TOP, x2=at, y2=bottom, class_="axis" if tick == 0.0 else "grid"))
-        elements.append(words(at, bottom + 15.0, _label(tick), "tick middle"))
-    elements.append(words(0.5 * (NAMES + WIDTH), height - 8.0, name, "name middle"))
-    for i, (what, at, one_sigma, band) in enumerate(rows):
-        y = TOP + row * (i + 0.5)
-        elements.append(words(NAMES - 6.0, y + 3.5, short(what), "tick end"))
-        if np.isfinite(band):
-            left, right = x(-band), x(band)
-            elements.append(tag("rect", x=left, y=y - 6.0, width=right - left, height=12.0, class_="band"))
-        known = bool(np.isfinite(one_sigma))
-        if known:
-            elements.append(tag("line", x1=x(at - one_sigma), y1=y, x2=x(at + one_sigma), y2=y, class_="whisker"))
-        dot = f"M{coordinate(x(at))} {coordinate(y)}h0"
-        elements.append(tag("path", d=dot, class_=f"dots large {'a' if known else 'b'}"))
-    return framed(caption, WIDTH, height, *elements)
-
-
-def matrix(rows: Sequence[str], columns: Sequence[str], values: Floats, caption: str) -> Chart:
-    """A matrix of values from -1 to 1: blue where negative, orange where positive, strong where large.
-
-    Args:
-        rows: Names of the rows.
-        columns: Names of the columns.
-        values: Shape (rows, columns); nan for empty cells.
-        caption: Of the chart.
-    """
-    cell, side = 14.0, 78.0 if max(map(len, rows), default=0) <= 14 else 150.0
-    elements = [words(side - 4.0, cell * (i + 1) - 1.5, short(name, 28), "tick end") for i, name in enumerate(rows)]
-    foot = 6.0 + cell * len(rows)
-    for j, name in enumerate(columns):
-        x = side + cell * (j + 0.5) + 3.0
-        turned = f"rotate(-90 {coordinate(x)} {coordinate(foot)})"
-        elements.append(words(x, foot, short(name), "tick end", transform=turned))
-    for (i, j), value in np.ndenumerate(values):
-        if np.isfinite(value) and abs(value) > 0.02:
-            about = title(f"{rows[i]}, {columns[j]}: {value:+.2f}") if abs(value) > 0.5 else ""
-            box = {"x": side + cell * j, "y": 2.0 + cell * i, "width": cell - 1.0, "height": cell - 1.0}
-            kind = "plus" if value > 0.0 else "minus"
-            elements.append(tag("rect", about, **box, class_=kind, opacity=f"{min(1.0, abs(value)):.2f}"))
-    return framed(caption, side + cell * len(columns) + 6.0, foot + 80.0, *elements)
-
-
-def legend(low: float, high: float, unit: str, caption: str) -> Chart:
-    """The colours of the ramp from a low to a high value."""
-    wide, length = (WIDTH - 20.0) / len(RAMP), WIDTH - 20.0
-    boxes = [tag("rect", x=10.0 + wide * k, y=4.0, width=wide + 0.5, height=16.0, fill=c) for k, c in enumerate(RAMP)]
-    places = ("tick", *["tick middle"] * 3, "tick end")
-    ticks = [
-        words(10.0 + length * k / 4.0, 36.0, f"{low + (high - low) * k / 4.0:.3g}{f' {unit}' * (k == 4)}", place)
-        for k, place in enumerate(places)
-    ]
-    return framed(caption, WIDTH, 50.0, *boxes, *ticks)
+def _labels(scale: Scale, powers: bool = False) -> list[tuple[float, str]]:
+    """Round values along an axis, and what stands at them."""
+    labels = ((value, f"{value:.6g}" if value else "0") for value in scale.ticks())
+    return [(value, f"1e{value:.3g}" if powers else word.replace("-", "\N{MINUS SIGN}")) for value, word in labels]
 
 
 def colour(share: float) -> str:
@@ -308,21 +218,17 @@ def short(name: str, most: int = 14) -> str:
     return name if len(name) <= most else f"{name[: most - 8]}…{name[-7:]}"
 
 
-def _label(value: float) -> str:
-    return (f"{value:.6g}" if value else "0").replace("-", "\N{MINUS SIGN}")
-
-
 def standalone(charts: Sequence[Chart]) -> str:
     """Charts below each other as one SVG file."""
-    width, gap, y = max(chart.width for chart in charts), 34.0, 0.0
-    elements = [tag("style", resource("style.css")), tag("rect", width="100%", height="100%", class_="paper")]
+    y, elements = 0.0, [tag("style", resource("style.css")), tag("rect", width="100%", height="100%", class_="paper")]
     for chart in charts:
-        place = f'<svg x="0" y="{coordinate(y + 20.0)}" width="{coordinate(chart.width)}" '
-        elements.append(words(0.0, y + 14.0, chart.caption, "tick"))
-        elements.append(chart.svg.replace("<svg ", f'{place}height="{coordinate(chart.height)}" ', 1))
-        y += chart.height + gap
-    box = f"0 0 {coordinate(width)} {coordinate(y)}"
-    return tag("svg", "".join(elements), xmlns="http://www.w3.org/2000/svg", viewBox=box, width=2.0 * width) + "\n"
+        place = f'<svg x="0" y="{y + 20.0:g}" width="{chart.width:g}" height="{chart.height:g}" '
+        elements.append(tag("text", escape(escaped(chart.caption)), x=0.0, y=y + 14.0, class_="tick"))
+        elements.append(chart.svg.replace("<svg ", place, 1))
+        y += chart.height + 34.0
+    width = max(chart.width for chart in charts)
+    box, space = f"0 0 {width:g} {y:g}", "http://www.w3.org/2000/svg"
+    return tag("svg", "".join(elements), xmlns=space, viewBox=box, width=2.0 * width) + "\n"
 
 
 def resource(name: str) -> str:

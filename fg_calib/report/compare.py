@@ -8,39 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Group, RenderableType
+from rich.console import Group
 from rich.text import Text
 
 from fg_calib import __version__
-from fg_calib.baseline import ESTIMATORS as DESCRIPTIONS
-from fg_calib.baseline import Comparison, Estimate, RealErrors
+from fg_calib.baseline import ESTIMATORS, Comparison, Estimate, RealErrors
 from fg_calib.diagnostics import probability
 from fg_calib.inputs import InputError, checked
 from fg_calib.io import Result, Run, fill_folder, write_text
-from fg_calib.report.tables import (
-    SHOWN,
-    WIDTH,
-    figure,
-    in_order,
-    in_words,
-    indented,
-    json_text,
-    line,
-    plain,
-    plain_text,
-    rounded,
-    section,
-    table_of,
-)
+from fg_calib.report import tables
+from fg_calib.report.tables import figure, in_words, line, quantities, section, table_of
 from fg_calib.report.text import summary
 
-ESTIMATORS = {
-    "graph": "graph",
-    "graph-keep": "graph kept",
-    "gauss-newton": "plain GN",
-    "weighted-gauss-newton": "weighted GN",
-    "scipy": "scipy",
-}
+HEADINGS = {"graph": "graph", "graph-keep": "graph kept", "gauss-newton": "plain GN", "scipy": "scipy"}
 """Headings of the estimators."""
 
 POSE_ERRORS = {
@@ -57,24 +37,27 @@ INDEPENDENT = (
 
 
 @checked
-def format_comparison(comparison: Comparison, width: int = WIDTH) -> str:
+def format_comparison(comparison: Comparison, width: int = tables.WIDTH) -> str:
     """`build_comparison_report` as plain text."""
-    return plain_text(build_comparison_report(comparison), width)
+    return tables.plain_text(build_comparison_report(comparison), width)
 
 
-def build_comparison_report(comparison: Comparison) -> RenderableType:
+def build_comparison_report(comparison: Comparison) -> Group:
     """Estimators compared: errors, residuals, effort, then the parameters of each."""
-    job, names = comparison.job, [ESTIMATORS[e.name] for e in comparison.estimates]
-    title = f"{job.robot.name}: {job.model}, judged at {comparison.n_judged} {comparison.judged_on} configurations"
-    parts: list[RenderableType] = [line(title)]
-    parts += [line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings]
-    parts += [line(""), table_of(("", "", "nominal", *names), _accuracy(comparison), left="ll")]
-    headings = ("", "", *(["truth"] if job.truth is not None else []), *names)
-    parts += section("Corrections (± sigma)", table_of(headings, _corrections(comparison), left="ll", wrap=True))
-    estimators = [(f"  {ESTIMATORS[e.name]}", f"{DESCRIPTIONS[e.name]}; {e.message}") for e in comparison.estimates]
+    job, names = comparison.job, [HEADINGS[e.name] for e in comparison.estimates]
+    judged = f"judged at {comparison.n_judged} {comparison.judged_on} configurations"
     nominal = ("  nominal", "the arm before the calibration, tool and measurement frame fitted where unknown")
-    parts += section("Estimators", table_of(("", ""), [nominal, *estimators], left="ll", wrap=True))
-    return Group(*parts, *section("Notes", *indented(_comparison_notes(comparison))))
+    estimators = [(f"  {HEADINGS[e.name]}", f"{ESTIMATORS[e.name]}; {e.message}") for e in comparison.estimates]
+    headings = ("", "", *["truth"] * (job.truth is not None), *names)
+    return tables.report(
+        line(f"{job.robot.name}: {job.model}, {judged}"),
+        *(line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings),
+        line(""),
+        table_of(("", "", "nominal", *names), _accuracy(comparison), left="ll"),
+        *section("Corrections (± sigma)", table_of(headings, _corrections(comparison), left="ll", wrap=True)),
+        *section("Estimators", table_of(("", ""), [nominal, *estimators], left="ll", wrap=True)),
+        *section("Notes", *_comparison_notes(comparison)),
+    )
 
 
 def _accuracy(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
@@ -85,8 +68,7 @@ def _accuracy(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
         return line(text, "bold"), *[""] * (len(estimates) + 2)
 
     def row(label: str, unit: str, values: Iterable[float | None]) -> tuple[str, ...]:
-        factor, shown, decimals = SHOWN[unit]
-        return (f"  {label}", shown, *("-" if v is None else _large(v * factor, decimals - 1) for v in values))
+        return (f"  {label}", tables.unit_shown(unit), *(_large(v, unit) for v in values))
 
     errors = [comparison.errors_before, *(e.errors for e in estimates)]
     for key, words in (("base", "in the base frame"), ("fitted", "after the best rigid fit")):
@@ -101,9 +83,9 @@ def _accuracy(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
     for split, before in (estimates[0].residual_rms or {}).items():
         if before:
             yield heading(f"Residuals, {split} rows (RMS)")
-        for family in in_order(before):
-            after = [None if e.residual_rms is None else e.residual_rms[split][family]["after"] for e in estimates]
-            yield row(family, comparison.units[family], [before[family]["before"], *after])
+        for kind in tables.in_order(before):
+            after = [None if e.residual_rms is None else e.residual_rms[split][kind]["after"] for e in estimates]
+            yield row(kind, comparison.units[kind], [before[kind]["before"], *after])
     yield heading("Effort")
     efforts = {
         "parameters": ("", [f"{len(e.sigma)}" for e in estimates]),
@@ -119,22 +101,21 @@ def _corrections(comparison: Comparison) -> Iterator[tuple[str, ...]]:
     """The correction of each parameter by each estimator, with its sigma."""
     truth = comparison.job.truth
     for p in (p for p in comparison.job.robot.parameters if p.estimated):
-        factor, unit, decimals = SHOWN[p.unit]
-        cells = [] if truth is None else [_large(comparison.correction(truth, p.name) * factor, decimals - 1, "+")]
+        cells = [] if truth is None else [_large(comparison.correction(truth, p.name), p.unit, "+")]
         for e in comparison.estimates:
-            sigma = e.sigma.get(p.name)
-            if e.robot is None or sigma is None:
+            if e.robot is None or p.name not in e.sigma:
                 cells.append("-" if e.robot is None else "fixed")
-                continue
-            shown = _large(sigma * factor, decimals - 1) if np.isfinite(sigma) else "unknown"
-            correction = _large(comparison.correction(e.robot, p.name) * factor, decimals - 1, "+")
-            cells.append(f"{correction} ±{shown}")
-        yield p.name, unit, *cells
+            else:
+                sigma = _large(e.sigma[p.name], p.unit, none="unknown")
+                cells.append(f"{_large(comparison.correction(e.robot, p.name), p.unit, '+')} ±{sigma}")
+        yield p.name, tables.unit_shown(p.unit), *cells
 
 
-def _large(value: float, decimals: int, sign: str = "") -> str:
-    """A value with `decimals`, or in powers of ten where an estimate diverged."""
-    return rounded(value, decimals, sign) if abs(value) < 1e5 else f"{value:{sign}.1e}"
+def _large(value: float | None, unit: str, sign: str = "", none: str = "-") -> str:
+    """A value with a decimal less than usual, or in powers of ten where an estimate diverged."""
+    _, _, decimals = tables.SHOWN.get(unit, (1.0, unit, 6))
+    large = value is not None and abs(value) * tables.factor(unit) >= 1e5
+    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{decimals - 1}f", none)
 
 
 def _comparison_notes(comparison: Comparison) -> Iterator[str]:
@@ -169,7 +150,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     job, first = comparison.job, comparison.estimates[0]
     pairs = next((table for table in job.tables if table.uses_pairs), None)
     measured = pairs is not None and pairs.measurements.pairs is not None
-    document: dict[str, Any] = plain(
+    document: dict[str, Any] = tables.plain(
         {
             "schema": "fg-calib/comparison/1",
             "version": __version__,
@@ -188,24 +169,24 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
 
 
 def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
-    job, robot = comparison.job, e.robot
+    robot, truth = e.robot, comparison.job.truth
     parameters = [
         {
             "name": p.name,
             "unit": p.unit,
             "nominal": p.nominal,
-            "true": None if job.truth is None else job.truth.parameters[i].nominal,
+            "true": None if truth is None else truth.parameters[i].nominal,
             "estimate": robot.parameters[i].nominal,
             "correction": comparison.correction(robot, p.name),
             "sigma": e.sigma.get(p.name),
             "held": p.name not in e.sigma,
         }
-        for i, p in enumerate(job.robot.parameters if robot is not None else ())
+        for i, p in enumerate(comparison.job.robot.parameters)
         if robot is not None and p.estimated
     ]
     return {
         **{key: getattr(e, key) for key in ("name", "converged", "message", "iterations", "seconds")},
-        "description": DESCRIPTIONS[e.name],
+        "description": ESTIMATORS[e.name],
         "ran": robot is not None,
         "n_estimated": len(e.sigma),
         "residual_rms": _rms(e, "after"),
@@ -221,7 +202,7 @@ def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | 
     rms = estimate.residual_rms
     if rms is None:
         return None
-    kinds = dict.fromkeys(("position", "orientation", "distance", "angle", *rms["train"], *rms["test"]))
+    kinds = dict.fromkeys((*tables.USUAL_KINDS[:4], *rms["train"], *rms["test"]))
     return {split: {kind: rms[split].get(kind, {}).get(when) for kind in kinds} for split in ("train", "test")}
 
 
@@ -237,7 +218,7 @@ def write_comparison(folder: Path | str, comparison: Comparison) -> None:
         InputError: The folder cannot be written.
     """
     own = {"comparison.json": b'{\n "schema": "fg-calib/comparison/'}
-    text = json_text(comparison_document(comparison))
+    text = tables.json_text(comparison_document(comparison))
     fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text), own)
 
 
@@ -272,25 +253,31 @@ def changes_document(old: Result, new: Result, folders: tuple[Path, Path]) -> di
     return {"schema": "fg-calib/changes/1", **named, "parameters": changes(old, new)}
 
 
-def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -> RenderableType:
+def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -> Group:
     """Two calibrations for the terminal."""
-    parts: list[RenderableType] = []
-    for name, result, folder in (("OLD", old, folders[0]), ("NEW", new, folders[1])):
-        parts += [line(f"{name}  {folder}", "bold"), *indented(summary(result)), line("")]
     rms = [
         (kind, split, *(in_words(result.rms_after(split).get(kind), result.unit_of(kind)) for result in (old, new)))
         for split in ("test", "train")
         for kind in dict.fromkeys((*old.rms_after(split), *new.rms_after(split)))
     ]
-    parts += section("Residuals after the calibration (RMS)", table_of(("", "rows", "old", "new"), rms, left="ll"))
     rows = []
     for one in changes(old, new):
-        values = (figure(one[key], one["unit"]) for key in ("old", "new"))
-        change, sigma = figure(one["change"], one["unit"], "+"), figure(one["sigma"], one["unit"])
-        z = "" if one["in_sigma"] is None else f"{one['in_sigma']:+z.1f}"
-        rows.append((one["name"], SHOWN[one["unit"]][1], *values, change, sigma, z))
-    table = table_of(("", "", "old", "new", "change", "sigma of it", "in sigma"), rows, left="ll")
-    return Group(*parts, *section("Parameters", table), *indented([INDEPENDENT]))
+        unit = one["unit"]
+        change, z = figure(one["change"], unit, "+"), figure(one["in_sigma"], "", "+z.1f", none="")
+        rows.append((one["name"], *quantities(unit, one["old"], one["new"]), change, figure(one["sigma"], unit), z))
+    titles = (line(f"{name}  {folder}", "bold") for name, folder in zip(("OLD", "NEW"), folders, strict=True))
+    first, second = titles
+    headings = ("", "", "old", "new", "change", "sigma of it", "in sigma")
+    return tables.report(
+        first,
+        *summary(old),
+        line(""),
+        second,
+        *summary(new),
+        line(""),
+        *section("Residuals after the calibration (RMS)", table_of(("", "rows", "old", "new"), rms, left="ll")),
+        *section("Parameters", table_of(headings, rows, left="ll"), INDEPENDENT),
+    )
 
 
 def _largest_change(before: Run, run: Run) -> dict[str, Any] | None:
@@ -310,16 +297,16 @@ def history_document(robot: str, runs: Sequence[Run]) -> dict[str, Any]:
     return {"schema": "fg-calib/history/1", "robot": robot, "runs": listed}
 
 
-def build_history(robot: str, runs: Sequence[Run]) -> RenderableType:
+def build_history(robot: str, runs: Sequence[Run]) -> Group:
     """The runs of a calibration for the terminal."""
     rows = []
     for run, one in zip(runs, history_document(robot, runs)["runs"], strict=True):
-        p, most = "" if run.p_value is None else probability(run.p_value), ("", "", "")
-        if moved := one["moved"]:
-            sigmas = "unknown" if moved["in_sigma"] is None else f"{moved['in_sigma']:.1f}"
-            change = f"{figure(moved['change'], moved['unit'], '+')} {SHOWN[moved['unit']][1]}"
-            most = moved["name"], change, sigmas
-        rows.append((run.date[:10], f"{run.n_residuals}", f"{run.chi2:.6g}", f"{run.dof}", p, run.verdict, *most))
+        p, moved = "" if run.p_value is None else probability(run.p_value), one["moved"]
+        most = ("", "", "")
+        if moved:
+            change = in_words(moved["change"], moved["unit"], "+")
+            most = moved["name"], change, figure(moved["in_sigma"], "", ".1f")
+        rows.append((run.date[:10], run.n_residuals, f"{run.chi2:.6g}", run.dof, p, run.verdict, *most))
     headings = ("date", "residuals", "chi-square", "of", "p-value", "", "changed most", "by", "in sigma")
     title = line(f"{robot}: {len(runs)} run{'s' * (len(runs) > 1)}", "bold")
-    return Group(title, *section("Runs", table_of(headings, rows, left="lrrrrllrr")))
+    return tables.report(title, *section("Runs", table_of(headings, rows, left="lrrrrllrr")))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -12,26 +12,18 @@ from typing import Any
 
 import numpy as np
 import yaml
-from rich.console import Group, RenderableType
+from rich.console import Group
+from rich.table import Table as Shown
 
 from fg_calib.designs import Design
 from fg_calib.inputs import Floats, InputError
-from fg_calib.io import (
-    Units,
-    exists,
-    fill_folder,
-    read_bytes,
-    read_text,
-    write_csv,
-    write_robot,
-    write_text,
-    write_urdf,
-)
+from fg_calib.io import Units, exists, fill_folder, read_text, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import Table
 from fg_calib.observability import missing_motions
 from fg_calib.prediction import PoseRms
+from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
-from fg_calib.report.tables import SHOWN, indented, json_text, line, plain, rounded, section, table_of
+from fg_calib.report.tables import figure, in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
 from fg_calib.simulation import RandomReadings, instrument_keys, is_filled_in, table_columns, to_fill_in
 
@@ -46,7 +38,7 @@ UNKNOWN_ABOVE = 10.0
 
 def design_document(design: Design) -> dict[str, Any]:
     """A design for programs, in [m] and [rad]; null for what is unknown."""
-    document: dict[str, Any] = plain(
+    document: dict[str, Any] = tables.plain(
         {
             "schema": SCHEMA,
             "robot": design.pool.robot.name,
@@ -71,22 +63,22 @@ def design_document(design: Design) -> dict[str, Any]:
     return document
 
 
-def build_design_report(design: Design) -> RenderableType:
+def build_design_report(design: Design) -> Group:
     """A design for the terminal."""
     words = {"star": "each with the first", "chain": "each with the one before", "all": "all that can be formed"}
-    pairs = [(name, _figure(error), words[name]) for name, error in design.pairings.items()]
+    pairs = [(name, _size(error), words[name]) for name, error in design.pairings.items()]
     curve = [
-        (f"{p.n}", _figure(p.designed), _figure(p.random[1]), f"{_figure(p.random[0])} to {_figure(p.random[2])}")
+        (f"{p.n}", *map(_size, (p.designed, p.random[1])), " to ".join(map(_size, (p.random[0], p.random[2]))))
         for p in design.curve
     ]
     headings = ("poses", "designed mm", "random mm", "80 % of random")
-    return Group(
+    return tables.report(
         line(_headline(design), "bold"),
-        *section("Expected", *indented(_expected(design))),
+        *section("Expected", *_expected(design)),
         *section("Poses and accuracy", table_of(headings, curve, left="r")),
-        *(section("Which pairs", table_of(("pairs", "expected mm", ""), pairs, left="lrl")) if pairs else []),
+        *section("Which pairs", table_of(("pairs", "expected mm", ""), pairs, left="lrl")),
         *section("Where to measure", _poses(design)),
-        *section("Notes", *indented(_notes(design))),
+        *section("Notes", *_notes(design)),
     )
 
 
@@ -111,19 +103,14 @@ def _expected(design: Design) -> Iterator[str]:
         yield f"{equal} designed poses are as good as {last} random ones"
 
 
-def _poses(design: Design) -> RenderableType:
-    joints, own = design.pool.robot.joints, bool(np.any(design.group != ""))
-    chosen = zip(design.ids.tolist(), design.group.tolist(), design.readings.tolist(), strict=True)
-    rows = [
-        (
-            name,
-            *(rounded(v * SHOWN[joint.unit][0], 1) for v, joint in zip(q, joints, strict=True)),
-            *([group or "all others"] if own else []),
-        )
-        for name, group, q in list(chosen)[:MAX_POSES_LISTED]
-    ]
-    names = [f"{joint.name} {SHOWN[joint.unit][1]}" for joint in joints]
-    return table_of(("pose", *names, *["table"] * own), rows, left=f"l{'r' * len(names)}l")
+def _poses(design: Design) -> Shown:
+    joints, with_table = design.pool.robot.joints, bool(np.any(design.group != ""))
+    rows = []
+    for name, group, q in list(zip(design.ids, design.group, design.readings, strict=True))[:MAX_POSES_LISTED]:
+        shown = (figure(v, joint.unit, "z.1f") for v, joint in zip(q, joints, strict=True))
+        rows.append((name, *shown, *[group or "all others"] * with_table))
+    names = [f"{joint.name} {tables.unit_shown(joint.unit)}" for joint in joints]
+    return table_of(("pose", *names, *["table"] * with_table), rows, left=f"l{'r' * len(names)}l")
 
 
 def _notes(design: Design) -> Iterator[str]:
@@ -131,8 +118,6 @@ def _notes(design: Design) -> Iterator[str]:
         yield f"candidates{f' of {name}' if name else ''}: {one.reasons()}"
     for name in sorted(set(design.pool.group.tolist()).difference(design.group.tolist(), [""])):
         yield f"{name}: none of its own poses was chosen, and it gets no table"
-    for name, (low, high) in _lengths(design).items():
-        yield f"{name}: lengths of {_mm(low)} to {_mm(high)}"
     yield from map(str, missing_motions(design.pool.robot))
     scenario = design.pool.scenario
     free = scenario is not None and isinstance(scenario.configurations, RandomReadings)
@@ -159,37 +144,19 @@ def _notes(design: Design) -> Iterator[str]:
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
 
 
-def _lengths(design: Design) -> dict[str, tuple[float, float]]:
-    """The shortest and the longest length that each instrument would measure, [m]: of ball bars and wires."""
-    found = {}
-    for table in design.tables:
-        m = table.measurements
-        between = m.pairs if m.groups is None else m.groups.pairs
-        lengths = m.length if between is None else between.distance
-        if lengths is not None and table.model != "plane" and np.nan_to_num(lengths).any():
-            found[Path(m.source).stem] = (float(np.nanmin(lengths)), float(np.nanmax(lengths)))
-    return found
-
-
 def _pose(error: PoseRms) -> str:
-    turn = "unknown" if error.orientation is None else f"{math.degrees(error.orientation):.4f} deg"
-    return f"{_mm(error.position)}, {turn}"
+    return f"{_mm(error.position)}, {in_words(error.orientation, 'rad', '.4f')}"
 
 
 def _mm(value: float | None) -> str:
-    return "unknown" if value is None or not math.isfinite(value) else f"{_figure(value)} mm"
+    return in_words(None if value is None or value >= UNKNOWN_ABOVE else value, "m")
 
 
-def _figure(value: float) -> str:
-    if value >= UNKNOWN_ABOVE:
-        return "unknown"
-    return f"{value * 1e3:.3g}" if value < 0.9995 else f"{value * 1e3:.0f}"
+def _size(value: float) -> str:
+    return _mm(value).removesuffix(" mm")
 
 
 CONFIGURATIONS, _DOCUMENT = "configurations.csv", "design.json"
-
-_BEGINS = f'{{\n "schema": "{SCHEMA}"'.encode()
-"""How the document of a plan begins."""
 
 _JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib "
 _CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
@@ -237,48 +204,46 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             have been filled in.
     """
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
-    tables = design.tables if design.pool.scenario is not None else ()
+    measured = design.tables if design.pool.scenario is not None else ()
     filled = {
-        name: to_fill_in(dict(columns) | _told(t.measurements.readings, robot, units, columns), touched=_is_touched(t))
-        for t in tables
+        name: to_fill_in(dict(columns) | _rounded(t.measurements.readings, robot, units), touched=_is_touched(t))
+        for t in measured
         for name, columns in table_columns(t, robot, units).items()
     }
-    urdf = "robot.urdf" if robot.urdf is not None and tables else None
-    job = ("robot.yaml", "calibration.yaml") if tables else ()
-    names = (CONFIGURATIONS, _DOCUMENT, "design.svg", *filled, *job, *([urdf] if urdf else []))
+    urdf = "robot.urdf" if robot.urdf is not None and measured else None
+    job = ("robot.yaml", "calibration.yaml") if measured else ()
+    names = (_DOCUMENT, CONFIGURATIONS, "design.svg", *filled, *job, *([urdf] if urdf else []))
     earlier = _files_before(folder)
-    for name in (*filled, *earlier):
-        if name in (CONFIGURATIONS, "robot.yaml", "calibration.yaml") and name in filled:
-            raise InputError(f"instruments: {Path(name).stem}", "the name of a file of the design", "another name")
+    for name in earlier:
         if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
             raise InputError(str(folder / name), "a table that has been filled in", "another folder")
 
     def write(into: Path) -> None:
         write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
-        write_text(into / _DOCUMENT, json_text(design_document(design) | {"files": names}))
+        write_text(into / _DOCUMENT, tables.json_text(design_document(design) | {"files": names}))
         write_charts(into, {"design": [draw_design(design)]})
         for name, columns in filled.items():
             write_csv(into / name, columns)
         if urdf is not None:
             write_urdf(into / urdf, robot)
-        if tables:
+        if measured:
             write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
             then = _CALIBRATE if design.pool.before is None else _UPDATE
-            write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, tables, units))
+            write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, measured, units))
 
-    whose = {_DOCUMENT: _BEGINS}  # first: it says of the others whose they are
-    own = whose | dict.fromkeys([*earlier, *names], b"") | {"calibration.yaml": _JOB_BEGINS.encode()} | whose
-    fill_folder(folder, write, own)
+    fill_folder(
+        folder, write, {name: b"" if name in earlier else b"none" for name in dict.fromkeys((*names, *earlier))}
+    )
     return names
 
 
 def _files_before(folder: Path) -> list[str]:
     """Names of the files of an earlier design in a folder; none where there was none."""
     path = folder / _DOCUMENT
-    if not exists(path) or not read_bytes(path).startswith(_BEGINS):
-        return []
-    with suppress(ValueError, TypeError, AttributeError):  # changed by hand
-        return [name for name in json.loads(read_text(path)).get("files", ()) if Path(name).name == name]
+    with suppress(ValueError, TypeError, KeyError, AttributeError, InputError):  # none, or changed manually
+        document = json.loads(read_text(path)) if exists(path) else {}
+        if document["schema"] == SCHEMA:
+            return [name for name in document["files"] if Path(name).name == name]
     return []
 
 
@@ -291,41 +256,31 @@ def _is_touched(table: Table) -> bool:
 
 def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
     """Where to go, in order, and where the tool then is by the arm as it is known."""
-    at = pose(design.pool.robot, design.readings).position
-    names = [f"q{i + 1}" for i in range(robot.n_joints)]
-    tables = {"table": np.where(design.group == "", "all", design.group)} if np.any(design.group != "") else {}
-    tool = {f"tool_{axis}": _shortened(at[:, k], units.factor("m"), "m") for k, axis in enumerate("xyz")}
-    return {"id": design.ids, **_told(design.readings, robot, units, names), **tables, **tool}
+    at = pose(design.pool.robot, design.readings).position / units.factor("m")
+    group = {"table": np.where(design.group == "", "all", design.group)} if np.any(design.group != "") else {}
+    tool = {f"tool_{axis}": np.round(at[:, k], DECIMALS) for k, axis in enumerate("xyz")}
+    return {"id": design.ids, **_rounded(design.readings, robot, units), **group, **tool}
 
 
-def _told(readings: Floats, robot: Robot, units: Units, names: Collection[str]) -> dict[str, Floats]:
-    """The columns of joint readings among these names, shortened; such as would be beyond a limit then are whole."""
-    found = {}
-    for i, (joint, (lower, upper)) in enumerate(zip(robot.joints, robot.limits, strict=True)):
-        q, factor = readings[:, i], units.factor(joint.unit)
-        short = _shortened(q, factor, joint.unit)
-        found[f"q{i + 1}"] = np.where((short < lower / factor) | (short > upper / factor), q / factor, short)
-    return {name: column for name, column in found.items() if name in names}
+def _rounded(readings: Floats, robot: Robot, units: Units) -> dict[str, Floats]:
+    """The columns of joint readings, rounded, within the limits."""
+    factors = np.array([units.factor(joint.unit) for joint in robot.joints])
+    shown = np.clip(np.round(readings / factors, DECIMALS), *(robot.limits / factors[:, None]).T)
+    return {f"q{i + 1}": column for i, column in enumerate(shown.T)}
 
 
-def _shortened(values: Floats, factor: float, unit: str) -> Floats:
-    """Values in another unit, in as many decimals as `FINEST` needs."""
-    out: Floats = np.round(values / factor, round(math.log10(factor / FINEST[unit])))
-    return out
+DECIMALS = 7
+"""Decimals of joint readings and positions in the tables: far below what encoders and trackers resolve."""
 
 
-FINEST = {"rad": 1e-8, "m": 1e-9}
-"""What a figure that an arm is to be moved by is rounded to: far below what encoders and trackers tell apart."""
-
-
-def _job_text(design: Design, tables: Sequence[Table], units: Units) -> str:
+def _job_text(design: Design, measured: Sequence[Table], units: Units) -> str:
     """The job of the tables that are to be filled in."""
     scenario = design.pool.scenario
     assert scenario is not None
-    robot, sigma = design.pool.robot, tables[0].measurements.sigma_joint
+    robot, sigma = design.pool.robot, measured[0].measurements.sigma_joint
     joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
     keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
     job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
     job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
-    job |= instrument_keys(tables, units)
+    job |= instrument_keys(measured, units)
     return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)

@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fg_calib.inputs import Booleans, Floats
-from fg_calib.io import Result
 from fg_calib.observability import Identifiability
-from fg_calib.prediction import PredictedErrors, ToolPoseUncertainty, predict_errors
-from fg_calib.report.charts import (
-    BOTTOM,
-    LEFT,
-    RIGHT,
-    TOP,
-    WIDTH,
-    Chart,
-    Plot,
-    Whisker,
-    bars,
-    colour,
-    legend,
-    limits_of,
-    matrix,
-    short,
-    whiskers,
-)
-from fg_calib.report.tables import SHOWN, in_words
-from fg_calib.robot import Robot
+from fg_calib.report import charts
+from fg_calib.report.charts import Chart, Plot, limits_of
+from fg_calib.report.tables import factor, in_words, unit_shown
+from fg_calib.report.text import ReportData
 from fg_calib.simulation import link_points
-from fg_calib.statistics import TangentCovariance
 
 if TYPE_CHECKING:
     import polars as pl
@@ -57,167 +37,128 @@ MIN_WIDTH_M = 1e-3
 """Least width of a slice."""
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """What figures are made of.
-
-    Attributes:
-        result: The result.
-        robot: The calibrated robot.
-        posterior: The covariance of its parameters.
-        configurations: Every measured configuration; None if they were not saved.
-        residuals: Every scalar residual; None if they were not saved.
-    """
-
-    result: Result
-    robot: Robot
-    posterior: TangentCovariance
-    configurations: pl.DataFrame | None
-    residuals: pl.DataFrame | None
-
-    @property
-    def split(self) -> str:
-        """The rows that accuracy is shown of: `test` if there are any, else `train`."""
-        return "test" if self.result.rms_after("test") else "train"
-
-    @cached_property
-    def readings(self) -> Floats:
-        """Readings of the measured configurations, shape (n, n_joints), [rad] (prismatic: [m])."""
-        assert self.configurations is not None
-        return self.configurations.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
-
-    @cached_property
-    def held_out(self) -> Booleans:
-        """Which configurations were held out, shape (n,)."""
-        assert self.configurations is not None
-        return (self.configurations["split"] == "test").to_numpy()
-
-    @cached_property
-    def workspace(self) -> PredictedErrors | None:
-        """Expected errors over the workspace; None where nothing says what was measured."""
-        if self.configurations is None or not len(self.configurations):
-            return None
-        model = ToolPoseUncertainty.of(self.posterior, self.readings)
-        return predict_errors(self.robot, model, self.readings, fitted=self.result.free_of_frame)
-
-    @cached_property
-    def rms(self) -> tuple[str, Floats] | None:
-        """The kind of residual that is nearest to the tool's position, and its RMS by configuration, shape (n,)."""
-        if self.configurations is None:
-            return None
-        kinds = [name.removeprefix("rms_") for name in self.configurations.columns if name.startswith("rms_")]
-        for kind in sorted(kinds, key=lambda k: ["position", "distance", "point", "pixel", k].index(k)):
-            values = self.configurations[f"rms_{kind}"].cast(float).fill_null(np.nan).to_numpy()
-            if np.isfinite(values).any():
-                return kind, values
-        return None
-
-
-def figures_of(drawn: Drawn) -> dict[str, Sequence[Chart]]:
+def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
     """All figures of a calibration by name; those that its tables lack are left out."""
-    correlations, space = correlation_matrix(drawn), drawn.workspace
-    if drawn.result.evaluated_only or (space is not None and space.unknown == 1.0):
-        space = None
+    space = None if data.result.evaluated_only else data.workspace
+    slices = [] if space is None else error_slices(space.errors.position, space.expected[:, 0], space.measured)
     every: dict[str, Sequence[Chart]] = {
-        "accuracy": [accuracy_bars(drawn)],
-        "joints": error_over_joints(drawn),
-        "parameters": parameter_whiskers(drawn.result),
-        "correlations": [] if correlations is None else [correlations],
-        "residuals": residual_charts(drawn),
-        "workspace": error_slices(space.errors.position, space.expected[:, 0], space.measured) if space else [],
+        "accuracy": [accuracy_bars(data)],
+        "joints": error_over_joints(data),
+        "parameters": parameter_whiskers(data),
+        "correlations": correlation_matrix(data),
+        "residuals": residual_charts(data),
+        "workspace": slices,
     }
-    return {name: charts for name, charts in every.items() if charts}
+    return {name: of_name for name, of_name in every.items() if of_name}
 
 
-def accuracy_bars(drawn: Drawn) -> Chart:
+def accuracy_bars(data: ReportData) -> Chart:
     """RMS residuals before and after, by kind."""
-    rows = []
-    for kind, rms in drawn.result.residual_rms[drawn.split].items():
-        if rms is not None:
-            unit = drawn.result.unit_of(kind)
-            values = (("before", rms.before), ("after", rms.after))
-            rows.append((kind, [(when, np.nan if v is None else v, in_words(v, unit)) for when, v in values]))
-    return bars(rows, f"RMS residuals of {drawn.split} rows before and after the calibration")
+    bars = [
+        (f"{kind} {when}", value, value / (max(rms.before or 0.0, rms.after or 0.0) or 1.0), data.result.unit_of(kind))
+        for kind, rms in data.result.residual_rms[data.split].items()
+        if rms is not None
+        for when, value in (("before", rms.before), ("after", rms.after))
+        if value is not None
+    ]
+    plot = Plot((0.0, 1.3), [name for name, *_ in bars] or [""], ("of the larger of both", ""))
+    for k, (name, value, share, unit) in enumerate(bars):
+        plot.box((0.0, share), (k - 0.4, k + 0.4), class_="after" if name.endswith("after") else "before")
+        plot.words(share, k, in_words(value, unit))
+    return plot.chart(f"RMS residuals of {data.split} rows before and after the calibration")
 
 
-def error_over_joints(drawn: Drawn) -> list[Chart]:
+def error_over_joints(data: ReportData) -> list[Chart]:
     """Residuals of configurations over the reading of each joint."""
-    if drawn.rms is None or drawn.configurations is None:
+    if data.rms is None or data.configurations is None:
         return []
-    kind, values = drawn.rms
-    factor, unit, _ = SHOWN.get(drawn.result.unit_of(kind), (1.0, "", 3))
-    rms, test = values * factor, drawn.held_out
-    worst = np.argsort(-np.nan_to_num(rms))[:WORST].tolist()
-    charts = []
-    for i, joint in enumerate(drawn.robot.joints):
-        of_reading, shown, _ = SHOWN[joint.unit]
-        q = drawn.readings[:, i] * of_reading
-        names = f"{short(joint.name, 40)} [{shown}]", f"{kind} residual [{unit}]"
+    (kind, rms), test, ids = data.rms, data.held_out, data.configurations["id"]
+    unit = unit_shown(data.result.unit_of(kind))
+    worst = [k for k in np.argsort(-np.nan_to_num(rms))[:WORST].tolist() if np.isfinite(rms[k])]
+    found = []
+    for joint, readings in zip(data.robot.joints, data.readings.T, strict=True):
+        q = readings * factor(joint.unit)
+        names = f"{charts.short(joint.name, 40)} [{unit_shown(joint.unit)}]", f"{kind} residual [{unit}]"
         plot = Plot(limits_of(q), limits_of(rms, with_zero=True), names)
         plot.dots(q[~test], rms[~test], "a")
         plot.dots(q[test], rms[test], "b")
         for k in worst:
-            if np.isfinite(rms[k]):
-                plot.ring(q[k], rms[k], f"{drawn.configurations['id'][k]}: {rms[k]:.3g} {unit}")
-        charts.append(plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest"))
-    return charts
+            plot.ring(q[k], rms[k], f"{ids[k]}: {rms[k]:.3g} {unit}")
+        found.append(plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest"))
+    return found
 
 
 def _colours(test: Booleans) -> str:
     return ", ".join(["blue fitted"] * (not test.all()) + ["orange held out"] * bool(test.any()))
 
 
-def parameter_whiskers(result: Result) -> list[Chart]:
+def parameter_whiskers(data: ReportData) -> list[Chart]:
     """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
-    charts = []
+    found = []
     for unit, what in (("m", "Lengths"), ("rad", "Angles")):
-        factor, name, _ = SHOWN[unit]
-        rows = [
-            Whisker(p.name, *(np.nan if v is None else v * factor for v in (p.correction, p.sigma, p.prior_sigma)))
-            for p in result.estimated
-            if p.unit == unit
-        ]
-        if rows:
-            charts.append(whiskers(rows, f"{what}: correction [{name}]", f"[{name}]"))
-    return charts
+        shown = [p for p in data.result.estimated if p.unit == unit]
+        if not shown:
+            continue
+        columns = [[p.correction for p in shown], [p.sigma for p in shown], [p.prior_sigma for p in shown]]
+        value, sigma, prior = np.array(columns, dtype=np.float64) * factor(unit)
+        name, spread, row = f"[{unit_shown(unit)}]", np.nan_to_num(sigma), np.arange(float(len(shown)))
+        limits = limits_of(value - spread, value + spread, [0.0], prior, -prior)
+        plot = Plot(limits, [p.name for p in shown], (name, ""))
+        for k in np.flatnonzero(np.isfinite(prior)).tolist():
+            plot.box((-prior[k], prior[k]), (k - 0.4, k + 0.4), class_="band")
+        for k in np.flatnonzero(np.isfinite(sigma)).tolist():
+            plot.line((value[k] - sigma[k], value[k] + sigma[k]), k, "whisker")
+        for known, kind in ((np.isfinite(sigma), "large a"), (np.isnan(sigma), "large b")):
+            plot.dots(value[known], row[known], kind)
+        found.append(plot.chart(f"{what}: correction {name}"))
+    return found
 
 
-def correlation_matrix(drawn: Drawn) -> Chart | None:
-    """Correlations of the errors of parameters; None of fewer than two."""
-    names, C = drawn.result.covariance.names, drawn.result.covariance.matrix
+def correlation_matrix(data: ReportData) -> list[Chart]:
+    """Correlations of the errors of parameters; none of fewer than two."""
+    names, C = data.result.covariance.names, data.result.covariance.matrix
     variance = C.reshape(len(names), len(names)).diagonal()
     known = np.flatnonzero(np.isfinite(variance) & (variance > 0.0))
     if len(known) < 2:
-        return None
+        return []
     sigma = np.sqrt(variance[known])
-    rho = C[np.ix_(known, known)] / np.outer(sigma, sigma)
-    most = np.max(np.abs(np.where(np.eye(len(known)), 0.0, np.nan_to_num(rho))), axis=1)
+    rho = np.tril(C[np.ix_(known, known)] / np.outer(sigma, sigma), -1)
+    most = np.max(np.abs(np.nan_to_num(rho + rho.T)), axis=1)
     chosen = np.sort(np.argsort(-most, kind="stable")[:MAX_PARAMETERS])
     more = "" if len(chosen) == len(known) else f"; the {len(chosen)} most correlated of {len(known)}"
-    below = np.where(np.tri(len(chosen), k=-1, dtype=np.bool_), rho[np.ix_(chosen, chosen)], np.nan)
-    labels = [names[known[k]] for k in chosen]
-    return matrix(labels, labels, below, f"Correlations of the errors: orange positive, blue negative{more}")
+    labels, caption = [names[known[k]] for k in chosen], "Correlations of the errors: orange positive, blue negative"
+    return [_matrix(labels, labels, rho[np.ix_(chosen, chosen)], caption + more)]
 
 
-def residual_charts(drawn: Drawn) -> list[Chart]:
+def _matrix(rows: Sequence[str], columns: Sequence[str], values: Floats, caption: str) -> Chart:
+    """A matrix of values from -1 to 1: blue where negative, orange where positive, strong where large."""
+    plot = Plot(columns, rows, ("", ""))
+    for (i, j), value in np.ndenumerate(values):
+        if abs(value) > 0.02:
+            about = f"{rows[i]}, {columns[j]}: {value:+.2f}" if abs(value) > 0.5 else ""
+            sides = (j - 0.46, j + 0.46), (i - 0.46, i + 0.46)
+            kind = "plus" if value > 0.0 else "minus"
+            plot.box(*sides, about, class_=kind, opacity=f"{min(1.0, abs(value)):.2f}")
+    return plot.chart(caption)
+
+
+def residual_charts(data: ReportData) -> list[Chart]:
     """Studentised residuals: their distribution by kind, and row by row."""
-    if drawn.residuals is None:
+    if data.residuals is None:
         return []
-    rows = drawn.residuals.filter(drawn.residuals["excluded"].is_null()).with_row_index("number")
+    rows = data.residuals.filter(data.residuals["excluded"].is_null()).with_row_index("number")
     values, test = rows["studentised"].cast(float).fill_null(np.nan).to_numpy(), (rows["split"] == "test").to_numpy()
-    if not np.isfinite(values).any():
-        return []
-    charts, kinds = [], np.array([kind.partition(".")[0] for kind in rows["kind"].to_list()])
+    found, kinds = [], np.array([kind.partition(".")[0] for kind in rows["kind"].to_list()])
     for kind in dict.fromkeys(kinds.tolist()):
-        mine = (kinds == kind) & np.isfinite(values)
-        fitted = mine & ~test  # rows that were held out share the errors of the estimate
-        chosen, which = (fitted, "fitted") if fitted.any() else (mine, "held-out")
+        of_kind = (kinds == kind) & np.isfinite(values)
+        fitted = of_kind & ~test  # rows that were held out share the errors of the estimate
+        chosen, which = (fitted, "fitted") if fitted.any() else (of_kind, "held-out")
         if chosen.any():
             beyond = int(np.sum(np.abs(values[chosen]) > MAX_SIGMA))
             more = f"; {beyond} beyond {MAX_SIGMA:g} are in the columns at the ends" if beyond else ""
             caption = f"{kind}: {int(chosen.sum())} {which} rows, and the normal distribution{more}"
-            charts.append(_histogram(values[chosen], caption))
-    return [*charts, _row_by_row(rows, values, test)]
+            found.append(_histogram(values[chosen], caption))
+    return [*found, _row_by_row(rows, values, test)] if found else []
 
 
 def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans, most: float = 12.0) -> Chart:
@@ -238,20 +179,17 @@ def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans, most: float 
 
 def _histogram(values: Floats, caption: str) -> Chart:
     """The distribution of residuals; a column at each end holds those beyond `MAX_SIGMA`."""
-    most, end = MAX_SIGMA, 0.5
-    edges, beyond = np.linspace(-most, most, 41), np.abs(values) > most
-    density = np.histogram(values[~beyond], edges)[0] / (len(values) * (edges[1] - edges[0]))
-    ends = [float(np.mean(beyond & (np.sign(values) == sign))) / end for sign in (-1.0, 1.0)]
-    heights = limits_of(density, ends, [0.45], with_zero=True)
-    plot = Plot((-most - end, most + end), heights, ("residual, in its sigma", "share per sigma"))
-    for low, high, height in zip(edges[:-1].tolist(), edges[1:].tolist(), density.tolist(), strict=True):
-        if height > 0.0:
-            plot.box(low, 0.0, high, height, class_="column")
-    for sign, height in zip((-1.0, 1.0), ends, strict=True):
-        if height > 0.0:
-            plot.box(sign * most, 0.0, sign * (most + end), height, class_="beyond")
-    x = np.linspace(-most, most, 81)
-    plot.curve(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi), "curve")
+    inner = np.linspace(-MAX_SIGMA, MAX_SIGMA, 41)
+    edges = np.array([-MAX_SIGMA - 0.5, *inner, MAX_SIGMA + 0.5])
+    counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
+    density = counts / (len(values) * np.diff(edges))
+    limits = limits_of(density, [0.45], with_zero=True)
+    plot = Plot((float(edges[0]), float(edges[-1])), limits, ("residual, in its sigma", "share per sigma"))
+    for k in np.flatnonzero(density).tolist():
+        kind = "column" if 0 < k < len(density) - 1 else "beyond"
+        plot.box((edges[k], edges[k + 1]), (0.0, density[k]), class_=kind)
+    x = np.linspace(-MAX_SIGMA, MAX_SIGMA, 81)
+    plot.curve(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi))
     return plot.chart(caption)
 
 
@@ -263,82 +201,80 @@ def error_slices(position: Floats, error: Floats, measured: Floats) -> list[Char
         error: Expected error of each, shape (n,), [m]; nan where it is unknown.
         measured: Measured tool positions, shape (m, 3), [m].
     """
-    middle = np.median(measured, axis=0)
-    low, high = position.min(axis=0), position.max(axis=0)
+    if np.isnan(error).all():
+        return []
+    middle, low, high = np.median(measured, axis=0), position.min(axis=0), position.max(axis=0)
     width = max(float((high - low).max()), MIN_WIDTH_M)
-    thick = SLAB * width
+    half = SLAB * width / 2.0
     low, high = (0.5 * (low + high) + sign * 0.52 * width for sign in (-1.0, 1.0))  # all axes on one scale
     ends = np.nanquantile(error, [0.05, 0.95]) * 1e3
-    charts = []
+    found = []
     for across, up, through in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
-        inside = np.abs(position[:, through] - middle[through]) < thick / 2.0
-        x, y = ((float(low[axis]), float(high[axis])) for axis in (across, up))
+        inside, near = (np.abs(p[:, through] - middle[through]) < half for p in (position, measured))
         names = f"{'xyz'[across]} [m]", f"{'xyz'[up]} [m]"
-        plot = Plot(x, y, names, (WIDTH, WIDTH - LEFT - RIGHT + TOP + BOTTOM))
+        square = charts.WIDTH - charts.LEFT - charts.RIGHT + charts.TOP + charts.BOTTOM
+        plot = Plot((low[across], high[across]), (low[up], high[up]), names, height=square)
         _draw_cells(plot, position[inside][:, [across, up]], error[inside] * 1e3, ends)
-        near = np.abs(measured[:, through] - middle[through]) < thick / 2.0
         for kind in ("halo", "measured"):
             plot.dots(measured[near, across], measured[near, up], kind)
-        where = f"{'xyz'[through]} = {middle[through]:.3g} m, within {thick / 2.0:.2g} m"
-        charts.append(plot.chart(f"Expected error at {where}; dots: measured"))
-    caption = "Colours of the expected error of the tool's position (RMS)"
-    return [*charts, legend(float(ends[0]), float(ends[1]), "mm", caption)]
+        where = f"{'xyz'[through]} = {middle[through]:.3g} m, within {half:.2g} m"
+        found.append(plot.chart(f"Expected error at {where}; dots: measured"))
+    edges = np.linspace(ends[0], ends[1], len(charts.RAMP) + 1)
+    legend = Plot((edges[0], edges[-1] or 1.0), [""], ("[mm]", ""))
+    for colour, low_edge, high_edge in zip(charts.RAMP, edges[:-1], edges[1:], strict=True):
+        legend.box((low_edge, high_edge), (-0.5, 0.5), fill=colour)
+    return [*found, legend.chart("Colours of the expected error of the tool's position (RMS)")]
 
 
 def _draw_cells(plot: Plot, at: Floats, error: Floats, ends: Floats) -> None:
     """A coloured cell at each place that configurations reach, by the RMS of their errors."""
-    known = np.isfinite(error)
-    edges = [np.linspace(s.low, s.high, CELLS + 1) for s in (plot.x, plot.y)]
-    n, _, _ = np.histogram2d(at[known, 0], at[known, 1], edges)
-    squares, _, _ = np.histogram2d(at[known, 0], at[known, 1], edges, weights=error[known] ** 2)
+    at, error = at[np.isfinite(error)], error[np.isfinite(error)]
+    x, y = (np.linspace(s.low, s.high, CELLS + 1) for s in (plot.x, plot.y))
+    n, squares = (np.histogram2d(at[:, 0], at[:, 1], [x, y], weights=w)[0] for w in (np.ones(len(at)), error**2))
     for i, j in np.argwhere(n > 0).tolist():
         share = (np.sqrt(squares[i, j] / n[i, j]) - ends[0]) / (ends[1] - ends[0] or 1.0)
-        x, y = edges[0][i : i + 2].tolist(), edges[1][j : j + 2].tolist()
-        plot.box(x[0], y[0], x[1], y[1], fill=colour(float(share)))
+        plot.box((x[i], x[i + 1]), (y[j], y[j + 1]), fill=charts.colour(float(share)))
 
 
 def draw_observability(found: Identifiability) -> dict[str, Sequence[Chart]]:
     """The singular values and the null-space directions."""
     o = found.observability
-    s = np.maximum(o.singular_values / (o.singular_values.max(initial=0.0) or 1.0), 1e-18)
-    number, kept = np.arange(1.0, len(s) + 1.0), np.arange(len(s)) < o.rank
-    plot = Plot((0.0, len(s) + 1.0), limits_of(np.log10(s)), ("number", "singular value / largest"), powers=True)
-    plot.dots(number[kept], np.log10(s[kept]), "large a")
-    plot.dots(number[~kept], np.log10(s[~kept]), "large b")
+    s = np.log10(np.maximum(o.singular_values / (o.singular_values.max(initial=0.0) or 1.0), 1e-18))
+    number = np.arange(1.0, len(s) + 1.0)
+    plot = Plot((0.0, len(s) + 1.0), limits_of(s), ("number", "singular value / largest"), powers=True)
+    for rows, kind in ((slice(o.rank), "large a"), (slice(o.rank, None), "large b")):
+        plot.dots(number[rows], s[rows], kind)
     rank = plot.chart(f"rank {o.rank} of {len(o.names)}: blue determined, orange not")
     figures: dict[str, Sequence[Chart]] = {"singular_values": [rank]}
     if found.lost:
         names = [name for name in o.names if any(name in lost.relation for lost in found.lost)]
-        changes = np.array([[lost.relation.get(name, np.nan) for name in names] for lost in found.lost])
+        changes = np.array([[lost.relation.get(name, 0.0) for name in names] for lost in found.lost])
         reasons = [lost.reason.partition(":")[0] for lost in found.lost]
         caption = "Null-space directions: change of each parameter [m], [rad], orange positive, blue negative"
-        figures["groups"] = [matrix(reasons, names, changes, caption)]
+        figures["groups"] = [_matrix(reasons, names, changes, caption)]
     return figures
 
 
-def arm_scene(drawn: Drawn, most: int = 300) -> Mapping[str, Any] | None:
+def arm_scene(data: ReportData, most: int = 300) -> Mapping[str, Any] | None:
     """What `arm.js` draws: the measured configurations with the arm's shape and residual; None where unknown.
 
     Args:
-        drawn: The calibration.
+        data: The calibration.
         most: Configurations that are shown; of more, as many that are evenly spaced, and the worst.
     """
-    if drawn.rms is None or drawn.configurations is None or not len(drawn.configurations):
+    if data.rms is None or data.configurations is None:
         return None
-    kind, rms = drawn.rms
+    kind, rms = data.rms
     evenly = np.linspace(0, len(rms) - 1, min(most, len(rms))).astype(np.int64)
     chosen = np.unique(np.concatenate([evenly, np.argsort(-np.nan_to_num(rms))[:20]]))
-    factor, unit, _ = SHOWN.get(drawn.result.unit_of(kind), (1.0, "", 3))
-    values, links = rms[chosen] * factor, link_points(drawn.robot, drawn.readings[chosen])
-    known = values[np.isfinite(values)]
-    low, high = (float(v) for v in np.quantile(known, [0.0, 0.98])) if len(known) else (0.0, 1.0)
+    low, high = np.nanquantile(rms[chosen], [0.0, 0.98]).tolist()
     items = [
         {
-            "id": drawn.configurations["id"][k],
-            "test": bool(drawn.held_out[k]),
-            "value": float(f"{value:.4g}") if np.isfinite(value) else None,
+            "id": data.configurations["id"][k],
+            "test": bool(data.held_out[k]),
+            "value": float(f"{rms[k]:.4g}") if np.isfinite(rms[k]) else None,
             "links": np.round(points, 4).tolist(),
         }
-        for k, value, points in zip(chosen.tolist(), values.tolist(), links, strict=True)
+        for k, points in zip(chosen.tolist(), link_points(data.robot, data.readings[chosen]), strict=True)
     ]
-    return {"unit": unit, "family": kind, "low": low, "high": high, "items": items}
+    return {"unit": unit_shown(data.result.unit_of(kind)), "family": kind, "low": low, "high": high, "items": items}

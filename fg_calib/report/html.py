@@ -7,36 +7,23 @@ from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from fg_calib.inputs import escaped
 from fg_calib.io import Result
-from fg_calib.prediction import PredictedErrors
+from fg_calib.report import text
 from fg_calib.report.charts import RAMP, resource, standalone
-from fg_calib.report.figures import Drawn, arm_scene, figures_of
+from fg_calib.report.figures import arm_scene, figures_of
 from fg_calib.report.predict import percentages, size_table
-from fg_calib.report.tables import SHOWN, Section, in_words, indented, section, shortened
-from fg_calib.report.text import (
-    NOTES,
-    PARAMETERS,
-    RESIDUALS,
-    build_sections,
-    judged,
-    parameter_table,
-    summary,
-    verdict_word,
-)
+from fg_calib.report.tables import POSE_KINDS, Section, in_words, section, shortened
 
 if TYPE_CHECKING:
     from jinja2 import Environment
-    from rich.console import RenderableType
 
 MAX_ROWS = 40
 """Suspicious rows that the page lists; the table of residuals has all."""
 
 FIGURES = {
-    "accuracy": RESIDUALS,
-    "parameters": PARAMETERS,
+    "accuracy": text.RESIDUALS,
+    "parameters": text.PARAMETERS,
     "residuals": "Studentised residuals",
     "joints": "Error over joint space",
     "correlations": "Correlations",
@@ -74,34 +61,31 @@ def _environment() -> Environment:
     return environment
 
 
-def build_page(drawn: Drawn) -> str:
+def build_page(data: text.ReportData) -> str:
     """The page of a calibration, as HTML."""
-    result, charts = drawn.result, figures_of(drawn)
-    sections = sorted(build_sections(drawn, MAX_ROWS), key=lambda one: one.title != NOTES)
-    known, space = {one.title for one in sections}, drawn.workspace
+    result, charts, space = data.result, figures_of(data), data.workspace
+    sections = sorted(text.build_sections(data, MAX_ROWS), key=lambda one: one.title != text.NOTES)
+    known = {one.title for one in sections}
     for name, title in FIGURES.items():
         if name in charts and title not in known:
-            content: list[RenderableType] = []
-            if name == "joints" and space is not None:
-                content = indented(_gaps(space))
-            elif name == "workspace" and space is not None:
-                content = [size_table(space), *indented(percentages(space))]
-            sections.append(Section(title, tuple(content)))
-    files = {"configurations": drawn.configurations, "residuals": drawn.residuals}
+            sections.append(Section(title))
+            if name == "workspace" and space is not None:
+                sections[-1:] = section(title, size_table(space), *percentages(space))
+    files = {"configurations": data.configurations, "residuals": data.residuals}
     return (
         _environment()
         .get_template("page.html")
         .render(
             result=result,
-            drawn=drawn,
+            n_configurations=0 if data.configurations is None else len(data.configurations),
             sections=sections,
             figures={FIGURES[name]: (EXPLANATIONS[name], of_name) for name, of_name in charts.items()},
             missing=[name for name, table in files.items() if table is None],
-            arm=arm_scene(drawn),
+            arm=arm_scene(data),
             ramp=RAMP,
-            verdict=verdict_word(result),
-            limits=[] if result.acceptance is None else judged(result.acceptance.judgements),
-            tiles=list(_tiles(drawn)),
+            verdict=text.verdict_word(result),
+            limits=[] if result.acceptance is None else text.judged(result.acceptance.judgements),
+            tiles=list(_tiles(data)),
             command=_command(result),
             options=list(_options(result)),
         )
@@ -110,41 +94,31 @@ def build_page(drawn: Drawn) -> str:
 
 def parameter_table_html(result: Result) -> str:
     """The summary and the parameters as HTML, for a notebook."""
-    (table,) = section(PARAMETERS, parameter_table(result))
-    return _environment().get_template("notebook.html").render(lines=summary(result), section=table)
+    (table,) = section(text.PARAMETERS, text.parameter_table(result))
+    return _environment().get_template("notebook.html").render(lines=text.summary(result), section=table)
 
 
-def draw_figures(drawn: Drawn) -> dict[str, str]:
+def draw_figures(data: text.ReportData) -> dict[str, str]:
     """The figures of the page as SVG files: text by name."""
-    return {f"{name}.svg": standalone(charts) for name, charts in figures_of(drawn).items()}
+    return {f"{name}.svg": standalone(charts) for name, charts in figures_of(data).items()}
 
 
-def _tiles(drawn: Drawn) -> Iterator[tuple[str, str]]:
+def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:
     """The most important values, and their meaning."""
-    result = drawn.result
-    rows = "of an evaluation" if result.evaluated_only else "held out" if drawn.split == "test" else "fitted"
-    for kind, rms in result.residual_rms[drawn.split].items():
+    result = data.result
+    rows = "of an evaluation" if result.evaluated_only else "held out" if data.split == "test" else "fitted"
+    for kind, rms in result.residual_rms[data.split].items():
         if rms is not None and ", table" not in kind:
             unit = result.unit_of(kind)
             yield in_words(rms.after, unit), f"{kind}, rows {rows}; before: {in_words(rms.before, unit)}"
     if result.expected_error is not None:
         where = "after the best rigid fit" if result.free_of_frame else "in the base frame"
         both = result.expected_error.fitted if result.free_of_frame else result.expected_error.base
-        for kind, unit in (("position", "m"), ("orientation", "rad")):
+        for kind, unit in POSE_KINDS.items():
             yield in_words(getattr(both, kind), unit), f"tool {kind} error expected from the covariance, {where} (RMS)"
     known = sum(p.sigma is not None for p in result.estimated)
     yield f"{result.n_configurations}", "configurations" if result.evaluated_only else "configurations fitted"
     yield f"{known} of {len(result.estimated)}", "parameters estimated with a known uncertainty"
-
-
-def _gaps(space: PredictedErrors) -> Iterator[str]:
-    """The widest part of each joint's range without a reading, where it is wide."""
-    for joint in space.joints:
-        factor, unit, _ = SHOWN[joint.unit]
-        low, high = (v * factor for v in joint.gap)
-        ends = [v * factor for v in (*joint.range, *joint.limits) if np.isfinite(v)]
-        if max(ends) > min(ends) and high - low > 0.25 * (max(ends) - min(ends)):
-            yield f"{joint.name}: nothing between {low:.4g} and {high:.4g} {unit}; measure there"
 
 
 def _command(result: Result) -> str:

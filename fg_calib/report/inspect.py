@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
-from rich.console import Group, RenderableType
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from fg_calib import __version__
 from fg_calib.diagnostics import MAX_ROWS, NEAR_SIGMAS, Disagreements, Inspection, SetupCheck
@@ -20,23 +20,10 @@ from fg_calib.io import fill_folder, write_text
 from fg_calib.io import in_words as table_in_words
 from fg_calib.job import Job
 from fg_calib.observability import CORRELATED, Identifiability, Observability
+from fg_calib.report import tables
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import draw_observability
-from fg_calib.report.tables import (
-    SHOWN,
-    WEAK,
-    WIDTH,
-    figure,
-    indented,
-    line,
-    lost_directions,
-    plain,
-    plain_text,
-    section,
-    table_of,
-    unit_of,
-    weak_directions,
-)
+from fg_calib.report.tables import Section, line, quantities, section, table_of
 from fg_calib.report.text import expected_tool_error
 
 FILES = {
@@ -69,102 +56,96 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
 
 
 @checked
-def format_identifiability(found: Identifiability, width: int = WIDTH) -> str:
+def format_identifiability(found: Identifiability, width: int = tables.WIDTH) -> str:
     """`build_identifiability_report` as plain text."""
-    return plain_text(build_identifiability_report(found), width)
+    return tables.plain_text(build_identifiability_report(found), width)
 
 
-def build_identifiability_report(found: Identifiability) -> RenderableType:
+def build_identifiability_report(found: Identifiability) -> Group:
     """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
     where = "random configurations" if found.kind == "structural" else "configurations"
     model = f"{found.model}, as poses of the board" if found.model == "pixels" else found.model
-    title = f"{found.robot}: {model}, {found.kind}, {found.n_configurations} {where}"
-    parts: list[RenderableType] = [line(title, "bold")]
-    parts += (line(f"NOT MODELLED: {m}", "bold red") for m in found.missing)
-    parts += _classes(found)
-    if found.with_fixed_known is not None:
-        parts += [line(""), line(f"With {', '.join(found.fixed)} known, as the robot's file says", "bold")]
-        parts += _classes(found.with_fixed_known)
-    return Group(*parts)
+    known = f"With {', '.join(found.fixed)} known, as the robot's file says"
+    return tables.report(
+        line(f"{found.robot}: {model}, {found.kind}, {found.n_configurations} {where}", "bold"),
+        *(line(f"NOT MODELLED: {m}", "bold red") for m in found.missing),
+        *_classes(found),
+        *([] if found.with_fixed_known is None else [line(""), line(known, "bold"), *_classes(found.with_fixed_known)]),
+    )
 
 
-def _classes(found: Identifiability) -> list[RenderableType]:
+def _classes(found: Identifiability) -> list[Table | Text | Section]:
     o = found.observability
-    relations = [f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations]
     classes = {
         "Independent": o.named("independent"),
-        "Relative": relations,
+        "Relative": [f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations],
         "Ineffective": o.named("ineffective"),
         "Kept": o.kept,
     }
     rows = [(name, ", ".join(members) or "None") for name, members in classes.items()]
     table = table_of(("Identifiability", "Kinematic parameters"), rows, left="ll", wrap=True)
     glossary = "independent: identifiable alone; relative: only in combination; ineffective: not identifiable"
-    parts: list[RenderableType] = [line(f"rank {o.rank} of {len(o.names)} ({glossary})"), line(""), table]
-    parts += section("Null-space directions", lost_directions(found.lost))
-    practical = found.kind == "practical"
-    parts += section("Singular values" + (" (signal-to-noise ratios)" if practical else ""), *_singular_values(o))
-    if practical:
-        indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
-        parts += section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))
-        parts += section(f"Weak directions ({WEAK})", weak_directions(o))
-        parts += section("Sigma of the kept parameters, the others at nominal", _sigmas(o))
-        correlated = [(f"{a}, {b}:", f"{rho:+.3f}") for a, b, rho in o.correlations]
-        parts += section(f"Correlations above {CORRELATED:g}", table_of(("", ""), correlated))
-    return parts
-
-
-def _singular_values(o: Observability) -> Iterator[RenderableType]:
     kept, dropped = o.singular_values[: o.rank], o.singular_values[o.rank :]
-    yield line(" ".join(f"{v:.3g}" for v in kept) or "none")
-    if len(dropped):
-        yield line(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")
-
-
-def _sigmas(o: Observability) -> Table:
-    combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
-    rows = [
-        (name, figure(sigma, unit_of(name)), SHOWN[unit_of(name)][1], combined.get(name, ""))
-        for name, sigma in o.sigma.items()
+    gap = [line(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")] if len(dropped) else []
+    values = [line(" ".join(f"{v:.3g}" for v in kept) or "none"), *gap]
+    practical = found.kind == "practical"
+    return [
+        *(line(f"rank {o.rank} of {len(o.names)} ({glossary})"), line(""), table),
+        *section("Null-space directions", tables.lost_directions(found.lost)),
+        *section("Singular values" + " (signal-to-noise ratios)" * practical, *values),
+        *(_practical(o) if practical else []),
     ]
-    return table_of(("", "sigma", "", "stands for"), rows, left="lrll")
+
+
+def _practical(o: Observability) -> list[Section]:
+    """What is known of these configurations alone: indices, weak directions, sigmas."""
+    indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
+    combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
+    rows = []
+    for name, sigma in o.sigma.items():
+        unit, shown = quantities(tables.unit_of(name), sigma)
+        rows.append((name, shown, unit, combined.get(name, "")))
+    correlated = [(f"{a}, {b}:", f"{rho:+.3f}") for a, b, rho in o.correlations]
+    sigmas = table_of(("", "sigma", "", "stands for"), rows, left="lrll")
+    return [
+        *section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}")),
+        *section(f"Weak directions ({tables.WEAK})", tables.weak_directions(o)),
+        *section("Sigma of the kept parameters, the others at nominal", sigmas),
+        *section(f"Correlations above {CORRELATED:g}", table_of(("", ""), correlated)),
+    ]
 
 
 @checked
-def format_inspection(found: Inspection, job: Job, width: int = WIDTH) -> str:
+def format_inspection(found: Inspection, job: Job, width: int = tables.WIDTH) -> str:
     """`build_inspection_report` as plain text."""
-    return plain_text(build_inspection_report(found, job), width)
+    return tables.plain_text(build_inspection_report(found, job), width)
 
 
-def build_inspection_report(found: Inspection, job: Job) -> RenderableType:
+def build_inspection_report(found: Inspection, job: Job) -> Group:
     """What looks wrong, then what the tables hold and what they can determine."""
     words = [table_in_words(table) for table in job.tables]
     if len(words) > 1:
         words = [f"{table.measurements.source} ({of})" for table, of in zip(job.tables, words, strict=True)]
-    parts: list[RenderableType] = [line(f"{found.robot}: {'; '.join(words)}")]
-    parts += [line(f"LOOK AT THIS FIRST: {finding}", "bold red") for finding in found.findings]
-    if found.ready:
-        what = "nothing speaks against calibrating this job" + ", see the notes" * bool(found.cautions)
-        parts.append(line(f"READY: {what}", "bold green"))
-    if found.evaluated:
-        parts.append(line("all rows are test rows: the arm is evaluated as it is, nothing would be calibrated"))
+    ready = f"READY: nothing speaks against calibrating this job{', see the notes' * bool(found.cautions)}"
+    evaluated = "all rows are test rows: the arm is evaluated as it is, nothing would be calibrated"
     o = found.identifiability.observability
     counts = f"{found.n_residuals} residuals and {found.n_priors} priors on {found.n_unknowns} unknowns"
-    residuals = (
-        f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
-    )
+    nominal = f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
     determined = f"What these rows can determine: {o.rank} of {len(o.names)} parameters"
-    return Group(
-        *parts,
-        *section("Tables", _tables(found), *indented(_excluded_pairs(found))),
+    return tables.report(
+        line(f"{found.robot}: {'; '.join(words)}"),
+        *(line(f"LOOK AT THIS FIRST: {finding}", "bold red") for finding in found.findings),
+        *([line(ready, "bold green")] if found.ready else []),
+        *([line(evaluated)] if found.evaluated else []),
+        *section("Tables", _tables(found), *_excluded_pairs(found)),
         *section("Joint readings", _joints(found)),
-        *section(residuals, _residuals(found)),
+        *section(nominal, _residuals(found)),
         *section("Rows that disagree with the nominal arm", *_disagreements(found.disagreements)),
         *section(determined, line(f"{counts}: {found.dof} degrees of freedom"), _determined(o)),
-        *section("Not identifiable from these rows", lost_directions(found.identifiability.lost)),
-        *section(f"Weakly determined ({WEAK})", weak_directions(o)),
+        *section("Not identifiable from these rows", tables.lost_directions(found.identifiability.lost)),
+        *section(tables.WEAKLY, tables.weak_directions(o)),
         *expected_tool_error(found.expected_error),
-        *section("Notes", *indented(found.cautions)),
+        *section("Notes", *found.cautions),
     )
 
 
@@ -200,12 +181,12 @@ def _excluded_pairs(found: Inspection) -> Iterator[str]:
 def _joints(found: Inspection) -> Table:
     rows = []
     for joint in found.joints:
-        factor, unit, _ = SHOWN[joint.unit]
-        low, high = (f"{v * factor:.1f}" if math.isfinite(v) else "-" for v in joint.limits)
+        unit, least, most, low, high = quantities(
+            joint.unit, joint.least, joint.most, *joint.limits, form="z.1f", none="-"
+        )
         used = "" if joint.share is None else f"{100.0 * joint.share:.0f} %"
         outside = f"outside in {joint.n_outside} configurations" if joint.n_outside else ""
-        ends = (f"{v * factor:z.1f}" for v in (joint.least, joint.most))
-        rows.append((joint.name, *ends, unit, low, high, used, outside or "hardly moves" * joint.still))
+        rows.append((joint.name, least, most, unit, low, high, used, outside or "hardly moves" * joint.still))
     return table_of(("", "from", "to", "", "limits", "", "used", ""), rows, left="lrrlrrrl")
 
 
@@ -214,9 +195,9 @@ def _residuals(found: Inspection) -> Table:
     rows = []
     for check in found.setups:
         for one in check.residuals:
-            values = (f"{v * SHOWN[one.unit][0]:.3g}" for v in (one.size, one.expected))
+            values = quantities(one.unit, one.size, one.expected, form=".3g")
             name = f"{one.kind} of {check.table}" if check.table else one.kind
-            rows.append((name, SHOWN[one.unit][1], *values, f"{one.excess:.3g}", _judged(check, one.excess)))
+            rows.append((name, *values, f"{one.excess:.3g}", _judged(check, one.excess)))
     return table_of(("", "", "observed", "predicted", "ratio", ""), rows, left="llrrrl")
 
 
@@ -226,17 +207,15 @@ def _judged(check: SetupCheck, excess: float) -> str:
     return "as noise and priors allow" if excess <= 2.0 else "larger than predicted, but not by far"
 
 
-def _disagreements(found: Disagreements, most: int = 5) -> Iterator[RenderableType]:
+def _disagreements(found: Disagreements, most: int = 5) -> list[Table | str]:
     """Rows that disagree with the nominal arm, the farthest first."""
     rows = []
     for one in found.found[:most]:
-        values = (f"{v * SHOWN[one.unit][0]:.3g}" for v in (one.size, one.expected))
-        names = "-".join(one.ends), one.table, one.of, one.kind
-        rows.append((*names, *values, SHOWN[one.unit][1], "test" * one.test))
-    if rows:
-        yield table_of(("", "table", "of", "", "off by", "expected", "", ""), rows, left="llllrrll")
-        more = [f"and {len(found.found) - most} more"] if len(found.found) > most else []
-        yield from indented([*more, *([f"{found.n} of {found.of} were compared"] if found.n < found.of else [])])
+        unit, *values = quantities(one.unit, one.size, one.expected, form=".3g")
+        rows.append(("-".join(one.ends), one.table, one.of, one.kind, *values, unit, "test" * one.test))
+    more = [f"and {len(found.found) - most} more"] if len(found.found) > most else []
+    compared = [f"{found.n} of {found.of} were compared"] if rows and found.n < found.of else []
+    return [table_of(("", "table", "of", "", "off by", "expected", "", ""), rows, left="llllrrll"), *more, *compared]
 
 
 def _determined(o: Observability) -> Table:
@@ -266,12 +245,12 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
     counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
     keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "expected_error", *counts)
     keys_of_residuals = ("kind", "unit", "size", "expected", "excess", "n")
-    document: dict[str, Any] = plain(
+    document: dict[str, Any] = tables.plain(
         {
             "schema": "fg-calib/inspection/1",
             "version": __version__,
             **{key: getattr(found, key) for key in keys},
-            "joints": [plain(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
+            "joints": [tables.plain(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
             "residuals": [
                 {"table": check.table, **{key: getattr(one, key) for key in keys_of_residuals}}
                 for check in found.setups

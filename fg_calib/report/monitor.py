@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from rich.console import Group, RenderableType
+from rich.console import Group
+from rich.table import Table
 
 from fg_calib.diagnostics import probability
 from fg_calib.monitoring import Check, Explanation
 from fg_calib.options import LIMITED
-from fg_calib.report.tables import SHOWN, figure, indented, line, plain, section, table_of
+from fg_calib.report import tables
+from fg_calib.report.tables import Content, figure, in_words, line, quantities, section, table_of
 
 WORDS = {"pass": ("PASS", "bold green"), "fail": ("FAIL", "bold red")}
 """Word and style of each verdict."""
@@ -39,7 +40,7 @@ def named(parameters: Sequence[str]) -> str:
 
 def check_document(found: Check) -> dict[str, Any]:
     """A check for programs, in [m] and [rad]."""
-    document: dict[str, Any] = {"schema": "fg-calib/check/1", **plain(found)}
+    document: dict[str, Any] = {"schema": "fg-calib/check/1", **tables.plain(found)}
     for e in document["explanations"]:
         for key in ("told_apart_from", "not_told_apart_from"):
             e[key] = [named(names) for names in e[key]]
@@ -48,49 +49,52 @@ def check_document(found: Check) -> dict[str, Any]:
     return document
 
 
-def build_check_report(found: Check, joint_units: Sequence[str]) -> RenderableType:
+def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
     """A check for the terminal.
 
     Args:
         found: The check.
         joint_units: `rad` or `m` of each joint.
     """
-    parts: list[RenderableType] = [line(*WORDS.get(found.verdict, ("NOT EVALUATED", "bold yellow")))]
     p = "" if found.p_value is None else f", p-value {probability(found.p_value)}"
     chi2 = f"chi-square {found.chi2:.5g} with {found.dof} degrees of freedom{p}, {found.n} measurements"
-    parts += indented([*found.reasons, *found.cautions, chi2])
-    parts += section("Errors of the calibrated arm (RMS)", _errors(found))
-    if found.verdict != "not_evaluated":
-        sizes = (
-            f"{name} none" if size is None else f"{name} {size * SHOWN[unit][0]:.2g} {SHOWN[unit][1]}"
-            for (name, size), unit in zip(found.detectable.items(), joint_units, strict=True)
-        )
-        parts += section("Joint offset changes that these rows show in 9 of 10 cases", *indented([", ".join(sizes)]))
+    sizes = [
+        f"{name} {'none' if size is None else in_words(size, unit, '.2g')}"
+        for (name, size), unit in zip(found.detectable.items(), joint_units, strict=True)
+    ]
+    explained: list[Content] = []
     if found.explanations:
-        parts += section("What changed", _changes(found.explanations), *indented(_conclusions(found)))
-    if found.advice is not None:
-        parts += section("What to measure", *_advice(found, joint_units))
-    return Group(*parts)
+        explained = [_changes(found.explanations), *_conclusions(found)]
+    return tables.report(
+        line(*WORDS.get(found.verdict, ("NOT EVALUATED", "bold yellow"))),
+        *(*found.reasons, *found.cautions, chi2),
+        *section("Errors of the calibrated arm (RMS)", _errors(found)),
+        *section(
+            "Joint offset changes that these rows show in 9 of 10 cases",
+            *([] if found.verdict == "not_evaluated" else [", ".join(sizes)]),
+        ),
+        *section("What changed", *explained),
+        *section("What to measure", *_advice(found, joint_units)),
+    )
 
 
-def _errors(found: Check) -> RenderableType:
+def _errors(found: Check) -> Table:
     rows = []
     for kind, rms in found.rms.items():
         unit = LIMITED.get(kind) or ("px" if kind == "pixel" else "m")
-        values = (rms, found.noise[kind], found.limits.get(kind))
-        rows.append((kind, SHOWN[unit][1], *(figure(value, unit, none="") for value in values)))
+        rows.append((kind, *quantities(unit, rms, found.noise[kind], found.limits.get(kind), none="")))
     return table_of(("", "", "error", "specified noise", "limit"), rows, left="ll")
 
 
-def _changes(explanations: Sequence[Explanation]) -> RenderableType:
+def _changes(explanations: Sequence[Explanation]) -> Table:
     rows = []
     for e in explanations:
         word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "is not: distinguishable"
-        several = zip(e.change, e.sigma, e.units, strict=True) if len(e.change) < 3 else ()
-        both = [(f"{figure(c, unit, '+')} {SHOWN[unit][1]}", figure(s, unit)) for c, s, unit in several]
-        amounts = (", ".join(change for change, _ in both), ", ".join(sigma for _, sigma in both))
+        several = list(zip(e.change, e.sigma, e.units, strict=True)) if len(e.change) < 3 else []
+        change = ", ".join(in_words(c, unit, "+") for c, _, unit in several)
+        sigma = ", ".join(figure(s, unit) for _, s, unit in several)
         p = probability(e.p_value)
-        rows.append((named(e.parameters), KINDS[e.kind], *amounts, f"{e.chi2_drop:.4g}", p, word))
+        rows.append((named(e.parameters), KINDS[e.kind], change, sigma, f"{e.chi2_drop:.4g}", p, word))
     headings = ("", "", "change", "sigma", "chi-square falls by", "p-value", "")
     return table_of(headings, rows, left="llrrrrl", wrap=True)
 
@@ -111,20 +115,24 @@ def _conclusions(found: Check) -> list[str]:
     return lines
 
 
-def _advice(found: Check, joint_units: Sequence[str]) -> list[RenderableType]:
+def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
     advice = found.advice
-    assert advice is not None
-    factors = np.array([SHOWN[unit][0] for unit in joint_units])
-    names = [f"q{i + 1} [{SHOWN[unit][1]}]" for i, unit in enumerate(joint_units)]
+    if advice is None:
+        return []
     rows = [
-        (*(f"{x:.2f}" for x in q * factors), f"{apart * 1e3:.3f}", f"{sigma:.1f}")
+        (
+            *(figure(x, unit, ".2f") for x, unit in zip(q, joint_units, strict=True)),
+            figure(apart, "m", ".3f"),
+            f"{sigma:.1f}",
+        )
         for q, apart, sigma in zip(advice.readings, advice.apart, advice.sigma, strict=True)
     ]
-    table = table_of((*names, "apart [mm]", "together [sigma]"), rows, left="r")
+    names = [f"q{i} [{tables.unit_shown(unit)}]" for i, unit in enumerate(joint_units, start=1)]
     said = (
         "measured like the rest, in the same table, these distinguish the changes"
         if advice.enough
         else "not even these distinguish all of them: measure more, spread over the whole workspace"
     )
-    a, b = (named(parameters) for parameters in advice.between)
-    return [table, *indented([f"{said} ({advice.needed:.1f} sigma are needed; least apart are {a} and {b})"])]
+    a, b = map(named, advice.between)
+    least = f"{said} ({advice.needed:.1f} sigma are needed; least apart are {a} and {b})"
+    return [table_of((*names, "apart [mm]", "together [sigma]"), rows, left="r"), least]

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Group, RenderableType
+from rich.console import Group
+from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
 from fg_calib.inputs import Floats
-from fg_calib.io import Result, Units, joint_columns, require_own_csv, write_csv
+from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
 from fg_calib.options import LengthUnit
 from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, WorstConfiguration, summed_up
-from fg_calib.report.tables import SHOWN, figure, indented, line, plain, section, shortened, table_of
+from fg_calib.report import tables
+from fg_calib.report.charts import write_charts
+from fg_calib.report.figures import error_slices
+from fg_calib.report.tables import POSE_KINDS, figure, in_words, line, quantities, section, table_of
 from fg_calib.report.text import verdict_word
 from fg_calib.robot import Robot
 
@@ -24,7 +28,6 @@ MAX_LISTED = 20
 """Configurations, or targets, that a report lists; the tables have all."""
 
 FRAMES = {"base": "in the base frame", "fitted": "after the best rigid fit"}
-KINDS = (("position", "m"), ("orientation", "rad"))
 SIZES = {"rms": "RMS", "median": "median", "p95": "95 % below", "largest": "largest"}
 
 ERRORS = {
@@ -49,29 +52,31 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
         ids: Names of the configurations, where they were given.
     """
     names, errors, worst = _names(found, ids), found.errors, found.worst
-    sizes = {"base": errors.base, "fitted": errors.fitted, "joint_noise": errors.joint_noise}
+    sizes = {**_frames(errors), "total": found.with_joint_noise}
     of_worst: dict[str, Any] | None = None
     if worst is not None:
         of_worst = _configuration(worst.errors, 0, "" if worst.row is None else names[worst.row], near=not worst.far)
         of_worst |= {"axes": worst.axes, "sigma": worst.sigma, "responsible": _shares(worst.responsible, result)}
-    each = range(len(names)) if found.given else ()
-    document: dict[str, Any] = plain(
+    document: dict[str, Any] = tables.plain(
         {
             "schema": "fg-calib/predict/1",
             "version": __version__,
-            "robot": result.robot,
             "trustworthy": not result.findings,
-            "findings": result.findings,
-            "reservations": result.reservations,
+            **{key: getattr(result, key) for key in ("robot", "findings", "reservations")},
             "at": "configurations" if found.given else "workspace",
             "n": len(errors.readings),
             "counts": "fitted" if found.fitted else "base",
-            "expected": {key: _sizes(values) for key, values in (sizes | {"total": found.with_joint_noise}).items()},
-            "far": float(np.mean(found.far)),
+            "expected": {
+                key: None if of is None else {kind: summed_up(of[:, k]) for k, kind in enumerate(POSE_KINDS)}
+                for key, of in sizes.items()
+            },
+            "far": np.mean(found.far),
             **{key: getattr(found, key) for key in ("unknown", "undetermined", "limit", "within")},
             "worst": of_worst,
             "responsible": _shares(found.responsible, result),
-            "configurations": [_configuration(errors, k, names[k], near=not found.far[k]) for k in each],
+            "configurations": [
+                _configuration(errors, k, name, near=not found.far[k]) for k, name in enumerate(names) if found.given
+            ],
         }
     )
     return document
@@ -82,61 +87,71 @@ def _names(found: PredictedErrors, ids: Sequence[str]) -> tuple[str, ...]:
     return tuple(ids) or tuple(map(str, range(len(found.errors.readings))))
 
 
-def _sizes(errors: Floats | None) -> dict[str, Any] | None:
-    if errors is None:
-        return None
-    return {kind: summed_up(column) for column, (kind, _) in zip(errors.T, KINDS, strict=True)}
+def _frames(errors: ToolErrors) -> Mapping[str, Floats | None]:
+    return {"base": errors.base, "fitted": errors.fitted, "joint_noise": errors.joint_noise}
 
 
 def _configuration(errors: ToolErrors, k: int, name: str, *, near: bool) -> dict[str, Any]:
-    def both(values: Floats | None) -> dict[str, float] | None:
-        return None if values is None else {"position": values[k, 0], "orientation": values[k, 1]}
-
-    kinds = {key: both(getattr(errors, key)) for key in ("base", "fitted", "joint_noise")}
-    return {"id": name, "readings": errors.readings[k], "position": errors.position[k], **kinds, "near": bool(near)}
+    kinds = {
+        key: None if of is None else dict(zip(POSE_KINDS, of[k], strict=True)) for key, of in _frames(errors).items()
+    }
+    return {"id": name, "readings": errors.readings[k], "position": errors.position[k], **kinds, "near": near}
 
 
 def _shares(found: Sequence[Responsible], result: Result) -> list[dict[str, Any]]:
     classes = {p.name: p.identifiability for p in result.parameters}
-    keys = ("name", "unit", "share", "change")
-    return [{key: getattr(p, key) for key in keys} | {"identifiability": classes[p.name]} for p in found]
+    return [vars(p) | {"identifiability": classes[p.name]} for p in found]
 
 
-def write_prediction_table(
-    path: Path, found: PredictedErrors, robot: Robot, units: Units, ids: Sequence[str] = ()
+FILES = {"predict.json": b'{\n "schema": "fg-calib/predict/', "predict.csv": b"id,", "predict.svg": b"<svg"}
+"""What `write_prediction` may write, and how it begins."""
+
+
+def write_prediction(
+    folder: Path,
+    found: PredictedErrors,
+    result: Result,
+    robot: Robot,
+    ids: Sequence[str] = (),
+    units: Units | None = None,
 ) -> None:
-    """Write `predict.csv`, a row a configuration; NaN is what is not known.
+    """Write `predict.json` and `predict.csv` into a folder, all or none; over the workspace also its picture.
 
     Args:
-        path: The CSV.
+        folder: Where to.
         found: The prediction.
-        robot: Whose joints they are of.
-        units: Of joint values and positions; errors are in mm and deg, as their columns say.
+        result: The result of the calibration.
+        robot: The calibrated robot.
         ids: Names of the configurations, where they were given.
+        units: Of joint values and positions in the table, m and rad if None; errors are in mm and deg.
 
     Raises:
-        InputError: It cannot be written.
+        InputError: The folder cannot be written.
     """
-    errors = found.errors
+    errors, units = found.errors, units or Units()
     readings = errors.readings / [units.factor(joint.unit) for joint in robot.joints]
     columns: dict[str, Any] = {
         "id": np.array(_names(found, ids), dtype=np.str_),
         **dict(zip(joint_columns(robot), readings.T, strict=True)),
         **dict(zip("xyz", errors.position.T / units.factor("m"), strict=True)),
     }
-    for name in ("base", "fitted", "joint_noise"):
-        of_both = getattr(errors, name)
-        if of_both is not None:
-            for column, (kind, unit) in zip(of_both.T, KINDS, strict=True):
-                factor, shown, _ = SHOWN[unit]
-                columns[f"{name}_{kind}_{shown}"] = column * factor
+    for name, of in _frames(errors).items():
+        for column, (kind, unit) in zip(() if of is None else of.T, POSE_KINDS.items(), strict=False):
+            columns[f"{name}_{kind}_{tables.unit_shown(unit)}"] = column * tables.factor(unit)
     columns["measured_near"] = np.where(found.far, "no", "yes")
-    write_csv(path, columns)
+
+    def write(into: Path) -> None:
+        write_text(into / "predict.json", tables.json_text(prediction_document(found, result, ids)))
+        write_csv(into / "predict.csv", columns)
+        if not found.given and found.unknown < 1.0:
+            write_charts(into, {"predict": error_slices(errors.position, found.expected[:, 0], found.measured)})
+
+    fill_folder(folder, write, FILES)
 
 
 def build_prediction_report(
     found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = (), length: LengthUnit = "m"
-) -> RenderableType:
+) -> Group:
     """A prediction for the terminal.
 
     Args:
@@ -146,38 +161,38 @@ def build_prediction_report(
         ids: Names of the configurations, where they were given.
         length: Unit of positions; errors are in mm.
     """
-    n = len(found.errors.readings)
+    n, worst = len(found.errors.readings), found.worst
     where = f"at {n} configurations" if found.given else "over the workspace"
-    style = "bold red" if result.findings else "bold green"
-    parts: list[RenderableType] = [line(f"{result.robot}: expected error of the tool {where}", "bold")]
-    parts += [line(f"the calibration was {verdict_word(result)}", style)]
-    parts += indented([*result.findings, *result.reservations])
-    title = "Expected error, by the covariance of the calibration"
-    parts += section(title, size_table(found), *indented(percentages(found)))
-    if found.worst is not None:
-        title = "Where it is largest" + ", as far as it is known" * bool(found.unknown)
-        parts += section(title, *indented(_worst_in_words(found.worst, robot, _names(found, ids), length)))
-    if found.responsible:
-        parts += section("Parameters that it comes from", _responsible(found, result))
-        parts += indented(["the mean square falls by that share where the parameter alone is known exactly"])
-    if found.given:
-        parts += section("Configurations", _configurations(found, robot, _names(found, ids)))
-        parts += indented([f"and {n - MAX_LISTED} more: --out writes them all"] if n > MAX_LISTED else [])
-    return Group(*parts, *section("Notes", *indented(_prediction_notes(found))))
+    in_part = ", as far as it is known" * bool(found.unknown)
+    share = "the mean square falls by that share where the parameter alone is known exactly"
+    listed = [_configurations(found, robot, _names(found, ids))] if found.given else []
+    more = [f"and {n - MAX_LISTED} more: --out writes them all"] if found.given and n > MAX_LISTED else []
+    return tables.report(
+        line(f"{result.robot}: expected error of the tool {where}", "bold"),
+        line(f"the calibration was {verdict_word(result)}", "bold red" if result.findings else "bold green"),
+        *result.findings,
+        *result.reservations,
+        *section("Expected error, by the covariance of the calibration", size_table(found), *percentages(found)),
+        *section(
+            f"Where it is largest{in_part}",
+            *([] if worst is None else _worst_in_words(worst, robot, _names(found, ids), length)),
+        ),
+        *(section("Parameters that it comes from", _responsible(found, result), share) if found.responsible else []),
+        *section("Configurations", *listed, *more),
+        *section("Notes", *_prediction_notes(found, robot)),
+    )
 
 
-def size_table(found: PredictedErrors) -> RenderableType:
+def size_table(found: PredictedErrors) -> Table:
     """RMS and quantiles, in both frames, with joint noise and without."""
     order = ("fitted", "base") if found.fitted else ("base", "fitted")
-    errors = {FRAMES[name]: found.errors.of(name == "fitted") for name in order}
-    if found.with_joint_noise is not None:
-        errors[f"{FRAMES[order[0]]}, with joint noise"] = found.with_joint_noise
+    errors: dict[str, Floats | None] = {FRAMES[name]: found.errors.of(name == "fitted") for name in order}
+    errors[f"{FRAMES[order[0]]}, with joint noise"] = found.with_joint_noise
     rows = []
-    for frame, of_frame in errors.items():
-        for column, (kind, unit) in zip(of_frame.T, KINDS, strict=True):
+    for frame, of in errors.items():
+        for column, (kind, unit) in zip(() if of is None else of.T, POSE_KINDS.items(), strict=False):
             sizes = summed_up(column)
-            name = frame if kind == "position" else ""
-            rows.append((name, SHOWN[unit][1], *(figure(sizes[key], unit) for key in SIZES)))
+            rows.append((frame if kind == "position" else "", *quantities(unit, *(sizes[key] for key in SIZES))))
     return table_of(("", "", *SIZES.values()), rows, left="ll", wrap=True)
 
 
@@ -199,59 +214,76 @@ def _percent(share: float) -> str:
 
 
 def _worst_in_words(worst: WorstConfiguration, robot: Robot, names: Sequence[str], length: LengthUnit) -> Iterator[str]:
-    errors, factor = worst.errors, Units(length).factor("m")
-    decimals = max(0, 4 + round(math.log10(factor)))
-    x, y, z = (f"{v / factor:.{decimals}f}" for v in errors.position[0].tolist())
+    unit = Units(length).factor("m")
+    decimals = max(0, 4 + round(math.log10(unit)))
+    x, y, z = (f"{v / unit:.{decimals}f}" for v in worst.errors.position[0])
     at = "" if worst.row is None else f"{names[worst.row]}: "
-    size = figure(float(np.sqrt(np.sum(worst.sigma**2))), "m")
+    size = figure(float(np.linalg.norm(worst.sigma)), "m")
     yield f"{at}{size} mm with the tool at x {x}, y {y}, z {z} {length} from the base"
-    readings = zip(robot.joints, errors.readings[0].tolist(), strict=True)
-    shown = ((joint.name, value * SHOWN[joint.unit][0], SHOWN[joint.unit][1]) for joint, value in readings)
-    yield f"joints: {', '.join(f'{name} {value:.2f} {unit}' for name, value, unit in shown)}"
-    axis, sigma = ", ".join(f"{v:+.2f}" for v in worst.axes[0].tolist()), [figure(v, "m") for v in worst.sigma.tolist()]
-    yield f"1 sigma is {sigma[0]} mm along ({axis}), {sigma[1]} and {sigma[2]} mm across"
+    readings = zip(robot.joints, worst.errors.readings[0], strict=True)
+    joints = (f"{joint.name} {in_words(q, joint.unit, '.2f')}" for joint, q in readings)
+    yield f"joints: {', '.join(joints)}"
+    axis, (first, *across) = ", ".join(f"{v:+.2f}" for v in worst.axes[0]), [figure(v, "m") for v in worst.sigma]
+    yield f"1 sigma is {first} mm along ({axis}), {' and '.join(across)} mm across"
     if worst.responsible:
-        changes = ((p.name, (p.change or 0.0) * SHOWN[p.unit][0], SHOWN[p.unit][1]) for p in worst.responsible)
-        yield f"with 1 sigma along it go {', '.join(f'{name} {value:+.3g} {unit}' for name, value, unit in changes)}"
+        changes = (f"{p.name} {in_words(p.change, p.unit, '+.3g')}" for p in worst.responsible)
+        yield f"with 1 sigma along it go {', '.join(changes)}"
     if worst.far:
         yield "nothing was measured near it"
 
 
-def _responsible(found: PredictedErrors, result: Result) -> RenderableType:
+def _responsible(found: PredictedErrors, result: Result) -> Table:
     """The shares of parameters over all configurations and at the worst."""
     classes = {p.name: p.identifiability for p in result.parameters}
-    worst = {} if found.worst is None else {p.name: p.share for p in found.worst.responsible}
-    everywhere = {p.name: p.share for p in found.responsible}
-    rows = []
-    for name in dict.fromkeys([*everywhere, *worst]):
-        shares = ["-" if name not in of else f"{100.0 * of[name]:.0f} %" for of in (everywhere, worst)]
-        rows.append((name, *shares, classes[name]))
+    every, worst = (
+        {p.name: f"{100.0 * p.share:.0f} %" for p in of}
+        for of in (found.responsible, found.worst.responsible if found.worst is not None else ())
+    )
+    rows = [(name, every.get(name, "-"), worst.get(name, "-"), classes[name]) for name in every | worst]
     return table_of(("", "of all", "where largest", "class"), rows, left="lrrl")
 
 
-def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> RenderableType:
+def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Table:
     """The worst of the given configurations, in their order."""
     error = np.where(np.isnan(found.expected[:, 0]), np.inf, found.expected[:, 0])
-    joints = [f"{joint.name} {SHOWN[joint.unit][1]}" for joint in robot.joints]
     rows = []
     for k in np.sort(np.argsort(-error, kind="stable")[:MAX_LISTED]).tolist():
-        readings = zip(found.errors.readings[k].tolist(), robot.joints, strict=True)
-        q = [f"{v * SHOWN[joint.unit][0]:.2f}" for v, joint in readings]
-        errors = [figure(v, unit) for v, (_, unit) in zip(found.expected[k].tolist(), KINDS, strict=True)]
-        rows.append((names[k], *q, *errors, "no" if found.far[k] else "yes"))
-    return table_of(("", *joints, *(SHOWN[unit][1] for _, unit in KINDS), "near"), rows, wrap=True)
+        errors = [figure(v, unit) for v, unit in zip(found.expected[k], POSE_KINDS.values(), strict=True)]
+        rows.append(
+            (names[k], *_readings(robot, found.errors.readings[k], ".2f"), *errors, "no" if found.far[k] else "yes")
+        )
+    return table_of(("", *_joint_headings(robot), "mm", "deg", "near"), rows, wrap=True)
 
 
-def _prediction_notes(found: PredictedErrors) -> Iterator[str]:
+def _joint_headings(robot: Robot) -> list[str]:
+    return [f"{joint.name} {tables.unit_shown(joint.unit)}" for joint in robot.joints]
+
+
+def _readings(robot: Robot, readings: Floats, form: str = "") -> list[str]:
+    return [figure(q, joint.unit, form) for q, joint in zip(readings, robot.joints, strict=True)]
+
+
+def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
     yield "Errors are RMS, from the specified noise and prior sigmas. Unmodelled effects are not included."
     if not found.given:
-        unlimited = [j.name for j in found.joints if not np.isfinite(j.limits).all()]
+        unlimited = [j.name for j in robot.joints if not np.isfinite(j.upper - j.lower)]
         instead = f" ({', '.join(unlimited)} without any: +-180 deg, or what was read)" if unlimited else ""
         yield f"{len(found.errors.readings)} configurations were drawn within the joint limits{instead}."
     if found.fitted:
         yield "Nothing was measured in the base frame: errors count after the best rigid fit to all measurements."
     if found.errors.joint_noise is None:
         yield "The job specifies no joint noise: the repeatability of the arm is not in these errors."
+
+
+def _quaternions(correction: Correction) -> Floats:
+    """Orientations to command, shape (n, 4), x y z w."""
+    return np.asarray(Rotation.from_matrix(correction.rotation.copy()).as_quat(canonical=True))
+
+
+def _errors(correction: Correction) -> dict[str, dict[str, Floats]]:
+    """Errors at the targets by what they are of, then by kind, shape (n,); orientations only where they are wanted."""
+    kinds = {of: list(POSE_KINDS)[: 2 if correction.turns or of == "expected" else 1] for of in ERRORS}
+    return {of: dict(zip(kinds[of], getattr(correction, of).T, strict=False)) for of in ERRORS}
 
 
 def correction_document(name: str, ids: Sequence[str], correction: Correction) -> dict[str, Any]:
@@ -262,29 +294,23 @@ def correction_document(name: str, ids: Sequence[str], correction: Correction) -
         ids: The targets' names.
         correction: The commands.
     """
-    quaternion = Rotation.from_matrix(correction.rotation.copy()).as_quat(canonical=True)
-
-    def errors(of: str, i: int) -> dict[str, float]:
-        kinds = ("position", "orientation") if correction.turns or of == "expected" else ("position",)
-        return dict(zip(kinds, getattr(correction, of)[i].tolist(), strict=False))
-
+    quaternion, errors = _quaternions(correction), _errors(correction)
     targets = [
         {
             "id": target,
-            "reached": bool(correction.reached[i]),
-            **{key: getattr(correction, key)[i] for key in ("readings", "nominal_readings", "position")},
+            **{key: getattr(correction, key)[i] for key in ("reached", "readings", "nominal_readings", "position")},
             "quaternion_xyzw": quaternion[i],
-            **{of: errors(of, i) for of in ERRORS},
+            **{of: {kind: values[i] for kind, values in kinds.items()} for of, kinds in errors.items()},
         }
         for i, target in enumerate(ids)
     ]
     counts = {"n_targets": len(ids), "n_reached": int(correction.reached.sum())}
     head = {"schema": "fg-calib/correct/1", "robot": name, **counts, "expected_fitted": correction.expected_fitted}
-    document: dict[str, Any] = plain(head | {"targets": targets})
+    document: dict[str, Any] = tables.plain(head | {"targets": targets})
     return document
 
 
-def build_correction_report(ids: Sequence[str], correction: Correction, robot: Robot) -> RenderableType:
+def build_correction_report(ids: Sequence[str], correction: Correction, robot: Robot) -> Group:
     """Commands for the terminal.
 
     Args:
@@ -293,38 +319,37 @@ def build_correction_report(ids: Sequence[str], correction: Correction, robot: R
         robot: The calibrated robot.
     """
     n, reached = len(ids), int(correction.reached.sum())
-    parts: list[RenderableType] = [line(f"{robot.name}: {reached} of {n} targets can be reached", "bold"), line("")]
-    parts += [_target_errors(correction)]
-    shown = np.concatenate([np.flatnonzero(~correction.reached), np.flatnonzero(correction.reached)])[:MAX_LISTED]
+    shown = np.argsort(correction.reached, kind="stable")[:MAX_LISTED]
     more = [f"and {n - len(shown)} more: --out writes them all"] if n > len(shown) else []
-    table = _commands(ids, correction, robot, np.sort(shown).tolist())
-    parts += section("Joint positions to command", table, *indented(more))
-    return Group(*parts, *section("Notes", *indented(_correction_notes(ids, correction))))
+    return tables.report(
+        line(f"{robot.name}: {reached} of {n} targets can be reached", "bold"),
+        line(""),
+        _target_errors(correction),
+        *section("Joint positions to command", _commands(ids, correction, robot, np.sort(shown).tolist()), *more),
+        *section("Notes", *_correction_notes(ids, correction)),
+    )
 
 
-def _target_errors(correction: Correction) -> RenderableType:
+def _target_errors(correction: Correction) -> Table:
     rows = []
-    for of, words in ERRORS.items():
-        for k, unit in enumerate(("m", "rad") if correction.turns or of == "expected" else ("m",)):
-            values = getattr(correction, of)[:, k]
+    for of, kinds in _errors(correction).items():
+        for kind, values in kinds.items():
             known = values[np.isfinite(values)]
-            sizes = (float(np.sqrt(np.mean(known**2))), float(known.max())) if len(known) else (np.nan, np.nan)
-            rows.append(("" if k else words, *(figure(size, unit, none="-") for size in sizes), SHOWN[unit][1]))
+            sizes = (np.sqrt(np.mean(known**2)), known.max()) if len(known) else (None, None)
+            unit, *shown = quantities(POSE_KINDS[kind], *sizes, none="-")
+            rows.append((ERRORS[of] if kind == "position" else "", *shown, unit))
     fitted = figure(correction.expected_fitted, "m", none="-")
     rows.append(("the same after the best rigid fit of all targets", fitted, "", "mm"))
     return table_of(("error at the targets", "RMS", "largest", ""), rows, left="lrrl", wrap=True)
 
 
-def _commands(ids: Sequence[str], correction: Correction, robot: Robot, chosen: Sequence[int]) -> RenderableType:
+def _commands(ids: Sequence[str], correction: Correction, robot: Robot, chosen: Sequence[int]) -> Table:
     """Joint positions and errors of some targets."""
     after, rows = np.hypot(correction.missed[:, 0], correction.expected[:, 0]), []
     for i in chosen:
-        readings = zip(correction.readings[i].tolist(), robot.joints, strict=True)
-        errors = (float(correction.uncorrected[i, 0]), float(after[i]))
-        commands = (figure(q, joint.unit) for q, joint in readings)
-        rows.append((ids[i], *commands, *(figure(e, "m", none="-") for e in errors)))
-    joints = [f"{joint.name} {SHOWN[joint.unit][1]}" for joint in robot.joints]
-    return table_of(("target", *joints, "before mm", "after mm"), rows, wrap=True)
+        errors = (figure(e, "m", none="-") for e in (correction.uncorrected[i, 0], after[i]))
+        rows.append((ids[i], *_readings(robot, correction.readings[i]), *errors))
+    return table_of(("target", *_joint_headings(robot), "before mm", "after mm"), rows, wrap=True)
 
 
 def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[str]:
@@ -334,7 +359,7 @@ def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[st
     )
 
     def named(rows: Any) -> str:
-        return shortened([ids[i] for i in np.flatnonzero(rows).tolist()], 5)
+        return tables.shortened([ids[i] for i in np.flatnonzero(rows).tolist()], 5)
 
     rotated = ~correction.reached & (correction.missed[:, 0] < 1e-9)
     if rotated.any():
@@ -382,20 +407,15 @@ def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, rob
     Raises:
         InputError: It cannot be written, or is another file.
     """
-    length, angle = units.factor("m"), units.factor("rad")
-    quaternion = Rotation.from_matrix(correction.rotation.copy()).as_quat(canonical=True)
     readings = correction.readings / [units.factor(joint.unit) for joint in robot.joints]
     columns: dict[str, Any] = {
         "id": np.array(ids, dtype=np.str_),
         "reached": np.where(correction.reached, "yes", "no"),
         **dict(zip(joint_columns(robot), readings.T, strict=True)),
-        **dict(zip("xyz", correction.position.T / length, strict=True)),
-        **{f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")},
+        **dict(zip("xyz", correction.position.T / units.factor("m"), strict=True)),
+        **dict(zip(("qx", "qy", "qz", "qw"), _quaternions(correction).T, strict=True)),
     }
-    for name in ("uncorrected", "missed", "expected"):
-        errors = getattr(correction, name)
-        columns[f"{name}_position"] = errors[:, 0] / length
-        if correction.turns or name == "expected":
-            columns[f"{name}_orientation"] = errors[:, 1] / angle
+    for of, kinds in _errors(correction).items():
+        columns |= {f"{of}_{kind}": values / units.factor(POSE_KINDS[kind]) for kind, values in kinds.items()}
     require_commands(path)
     write_csv(path, columns)

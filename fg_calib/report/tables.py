@@ -20,6 +20,7 @@ from fg_calib.observability import LostDirection, Observability
 from fg_calib.robot import AXIS_OF_KIND, Axis
 
 WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"
+WEAKLY = f"Weakly determined ({WEAK})"
 """The definition of a weak direction, for headings."""
 
 WIDTH = 100
@@ -28,14 +29,16 @@ WIDTH = 100
 SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5), "px": (1.0, "px", 3)}
 """Factor, unit and decimals in which a quantity is shown."""
 
-FAMILY_UNIT = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
-"""Unit of the usual kinds of residual, in the order in which reports show them."""
+POSE_KINDS = {"position": "m", "orientation": "rad"}
+"""The two kinds of error of a pose, and their units."""
+
+USUAL_KINDS = ("position", "orientation", "distance", "angle", "point", "pixel")
+"""The usual kinds of residual, in the order in which reports show them."""
 
 
-def in_order(families: Iterable[str]) -> list[str]:
+def in_order(kinds: Iterable[str]) -> list[str]:
     """Kinds of residual in the order in which reports show them."""
-    there = list(families)
-    return [f for f in FAMILY_UNIT if f in there] + [f for f in there if f not in FAMILY_UNIT]
+    return sorted(kinds, key=lambda kind: USUAL_KINDS.index(kind) if kind in USUAL_KINDS else len(USUAL_KINDS))
 
 
 def plain_text(report: RenderableType, width: int = WIDTH) -> str:
@@ -59,21 +62,25 @@ def line(text: str, style: str = "") -> Text:
     return Text(escaped(text), style=style)
 
 
+Content = Table | Text | str
+"""What a section holds: tables, lines with a style, and sentences."""
+
+
 @dataclass(frozen=True)
 class Section:
     """A part of a report, which the terminal and the page show alike.
 
     Attributes:
         title: Its heading.
-        content: Tables and sentences.
+        content: Tables, sentences (strings), and lines with a style.
     """
 
     title: str
-    content: tuple[RenderableType, ...]
+    content: tuple[Content, ...] = ()
 
     def __rich__(self) -> Group:
         """The section for the terminal: a heading after a blank line, and its content."""
-        return Group(line(""), line(self.title, "bold"), *self.content)
+        return Group(line(""), line(self.title, "bold"), *map(_part, self.content))
 
     @property
     def tables(self) -> Iterator[tuple[list[str], list[tuple[str, ...]], list[str]]]:
@@ -84,22 +91,24 @@ class Section:
             yield headings, list(zip(*cells, strict=True)), [column.justify for column in table.columns]
 
     @property
-    def sentences(self) -> Iterator[str]:
+    def sentences(self) -> list[str]:
         """Its sentences."""
-        for part in self.content:
-            if isinstance(part, Text | Padding):
-                yield str(part.renderable if isinstance(part, Padding) else part)
+        return [str(part) for part in self.content if not isinstance(part, Table)]
 
 
-def section(title: str, *content: RenderableType) -> list[Section]:
+def _part(content: Content) -> RenderableType:
+    return Padding(line(content), (0, 0, 0, 2)) if isinstance(content, str) else content
+
+
+def section(title: str, *content: Content) -> list[Section]:
     """A section of its content without empty tables; none where nothing is left."""
-    there = tuple(part for part in content if not isinstance(part, Table) or part.row_count)
-    return [Section(title, there)] if there else []
+    filled = tuple(part for part in content if not isinstance(part, Table) or part.row_count)
+    return [Section(title, filled)] if filled else []
 
 
-def indented(lines: Iterable[str]) -> list[RenderableType]:
-    """Sentences below a heading or a table."""
-    return [Padding(line(text), (0, 0, 0, 2)) for text in lines]
+def report(*parts: Section | Content) -> Group:
+    """A report of sections and, before the first, of lines and sentences."""
+    return Group(*(part if isinstance(part, Section) else _part(part) for part in parts))
 
 
 def table_of(headings: Iterable[str], rows: Iterable[Iterable[object]], *, left: str = "", wrap: bool = False) -> Table:
@@ -122,23 +131,40 @@ def table_of(headings: Iterable[str], rows: Iterable[Iterable[object]], *, left:
     return table
 
 
-def rounded(value: float, decimals: int, sign: str = "") -> str:
-    """A value with `decimals`; one that rounds to zero has no minus."""
-    return f"{value:{sign}z.{decimals}f}"
+def factor(unit: str) -> float:
+    """The factor from [m], [rad] or [px] to the unit in which a quantity is shown."""
+    return SHOWN.get(unit, (1.0, unit, 6))[0]
 
 
-def figure(value: float | None, unit: str, sign: str = "", none: str = "unknown") -> str:
-    """A value in the unit that is shown, without the unit's name."""
+def unit_shown(unit: str) -> str:
+    """The name of the unit in which a quantity is shown: `mm`, `deg`, `px`, or its own."""
+    return SHOWN.get(unit, (1.0, unit, 6))[1]
+
+
+def figure(value: float | None, unit: str, form: str = "", none: str = "unknown") -> str:
+    """A value in the unit that is shown, without the unit's name.
+
+    Args:
+        value: The value, [m], [rad] or [px]; None or not finite if it is unknown.
+        unit: Its unit.
+        form: `+` for a sign, and digits such as `.3g` instead of the decimals of the unit.
+        none: What an unknown value is shown as.
+    """
     if value is None or not np.isfinite(value):
         return none
     factor, _, decimals = SHOWN.get(unit, (1.0, unit, 6))
-    return rounded(value * factor, decimals, sign)
+    return f"{value * factor:{form if '.' in form else f'{form}z.{decimals}f'}}"
 
 
-def in_words(value: float | None, unit: str) -> str:
+def quantities(unit: str, *values: float | None, form: str = "", none: str = "unknown") -> tuple[str, ...]:
+    """Cells: the unit that is shown, and values in it."""
+    return unit_shown(unit), *(figure(value, unit, form, none) for value in values)
+
+
+def in_words(value: float | None, unit: str, form: str = ".3g") -> str:
     """A value with its unit, in three digits."""
-    factor, name, _ = SHOWN.get(unit, (1.0, unit, 3))
-    return "unknown" if value is None or not np.isfinite(value) else f"{value * factor:.3g} {name}"
+    shown = figure(value, unit, form)
+    return shown if shown == "unknown" else f"{shown} {unit_shown(unit)}"
 
 
 def shortened(names: list[str], most: int) -> str:

@@ -5,39 +5,26 @@ It is made of a typed result and its tables, so that a loaded calibration prints
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Group, RenderableType
+from rich.console import Group
 from rich.table import Table
+from rich.text import Text
 
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph import Solution
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Booleans, Floats
 from fg_calib.io import Result, key_of
 from fg_calib.measurements import LANDMARKS
 from fg_calib.options import LIMITED
-from fg_calib.prediction import ExpectedError
-from fg_calib.report.tables import (
-    SHOWN,
-    WEAK,
-    WIDTH,
-    Section,
-    figure,
-    in_order,
-    in_words,
-    indented,
-    line,
-    lost_directions,
-    plain_text,
-    section,
-    shortened,
-    table_of,
-    weak_directions,
-)
+from fg_calib.prediction import ExpectedError, PredictedErrors, ToolPoseUncertainty, predict_errors
+from fg_calib.report import tables
+from fg_calib.report.tables import Section, figure, in_order, in_words, line, quantities, section, shortened, table_of
 from fg_calib.robot import Robot
 from fg_calib.statistics import (
     OUTLIER_WEIGHT,
@@ -45,49 +32,87 @@ from fg_calib.statistics import (
     VERDICTS,
     Judgement,
     KindFit,
-    LandmarkEstimate,
     ParameterEstimate,
+    TangentCovariance,
 )
 
 if TYPE_CHECKING:
     import polars as pl
 
-
 UNMOVED = 1e-9
 """How far an estimate that no step meant to move may be from its start, [m] and [rad]."""
 
 
-class Calibrated(Protocol):
-    """What a report is made of: see `calibration.Calibration`."""
+@dataclass(frozen=True)
+class ReportData:
+    """What the report, the page and the figures of a calibration are made of.
+
+    Attributes:
+        result: The result.
+        robot: The calibrated robot.
+        posterior: The covariance of its parameters.
+        configurations: Every measured configuration; None if they were not saved.
+        residuals: Every scalar residual; None if they were not saved.
+    """
+
+    result: Result
+    robot: Robot
+    posterior: TangentCovariance
+    configurations: pl.DataFrame | None
+    residuals: pl.DataFrame | None
 
     @property
-    def result(self) -> Result:
-        """The typed result."""
+    def split(self) -> str:
+        """The rows that accuracy is shown of: `test` if there are any, else `train`."""
+        return "test" if self.result.rms_after("test") else "train"
 
-    @property
-    def robot(self) -> Robot:
-        """The calibrated robot."""
+    @cached_property
+    def readings(self) -> Floats:
+        """Readings of the measured configurations, shape (n, n_joints), [rad] (prismatic: [m])."""
+        assert self.configurations is not None
+        return self.configurations.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
 
-    @property
-    def residuals(self) -> pl.DataFrame | None:
-        """Every scalar residual."""
+    @cached_property
+    def held_out(self) -> Booleans:
+        """Which configurations were held out, shape (n,)."""
+        assert self.configurations is not None
+        return (self.configurations["split"] == "test").to_numpy()
 
-    @property
-    def configurations(self) -> pl.DataFrame | None:
-        """Every measured configuration."""
+    @cached_property
+    def workspace(self) -> PredictedErrors | None:
+        """Expected errors over the workspace; None where nothing says what was measured."""
+        if self.configurations is None or not len(self.configurations):
+            return None
+        model = ToolPoseUncertainty.of(self.posterior, self.readings)
+        return predict_errors(self.robot, model, self.readings, fitted=self.result.free_of_frame)
+
+    @cached_property
+    def rms(self) -> tuple[str, Floats] | None:
+        """The kind of residual that is nearest to the tool's position, and its RMS by configuration in the unit shown.
+
+        Shape (n,), nan where a configuration has none; None where there is no such kind.
+        """
+        if self.configurations is None:
+            return None
+        kinds = [name.removeprefix("rms_") for name in self.configurations.columns if name.startswith("rms_")]
+        for kind in sorted(kinds, key=lambda k: ["position", "distance", "point", "pixel", k].index(k)):
+            values = self.configurations[f"rms_{kind}"].cast(float).fill_null(np.nan).to_numpy()
+            if np.isfinite(values).any():
+                return kind, values * tables.factor(self.result.unit_of(kind))
+        return None
 
 
-def format_result(found: Calibrated, width: int = WIDTH) -> str:
+def format_result(found: ReportData, width: int = tables.WIDTH) -> str:
     """The report as plain text."""
-    return plain_text(build_report(found), width)
+    return tables.plain_text(build_report(found), width)
 
 
-def build_report(found: Calibrated) -> RenderableType:
+def build_report(found: ReportData) -> Group:
     """The report, to be printed by rich."""
-    return Group(*_verdict(found.result), *build_sections(found))
+    return tables.report(*_verdict(found.result), *build_sections(found))
 
 
-def build_sections(found: Calibrated, most: int = 5) -> list[Section]:
+def build_sections(found: ReportData, most: int = 5) -> list[Section]:
     """The sections of the report, for the terminal and the page.
 
     Args:
@@ -96,8 +121,8 @@ def build_sections(found: Calibrated, most: int = 5) -> list[Section]:
     """
     result = found.result
     joint_noise = ", with joint noise" if np.any(result.sigma_joint > 0.0) else ""
-    scales = "Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)"
     notes = [*(text for text in result.cautions if result.findings or text not in result.reservations), *result.notes]
+    parameters = parameter_table(result) if result.estimated or not result.evaluated_only else ""
     return [
         *section("Fit statistics", _statistics(result)),
         *section(f"Goodness of fit (1 sigma of a row{joint_noise})", *_goodness(result, found.robot)),
@@ -105,17 +130,17 @@ def build_sections(found: Calibrated, most: int = 5) -> list[Section]:
         *_cross_validation(result),
         *expected_tool_error(result.expected_error),
         *section(RESIDUALS, _residuals(result)),
-        *(section(PARAMETERS, parameter_table(result)) if result.estimated or not result.evaluated_only else []),
-        *section(scales, _tolerances(result)),
+        *section(PARAMETERS, *([parameters] if parameters else [])),
+        *section("Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)", _tolerances(result)),
         *section("Combinations that the kept parameters stand for", _combinations(result)),
-        *_suspicious_rows(found.residuals, result, most),
-        *_suspicious_configurations(result),
+        *_suspicious_rows(found.residuals, most),
+        *section("Suspicious configurations", *_suspicious_configurations(result)),
         *_joint_values(found),
         *_frames(result),
-        *_landmarks(result.groups),
-        *section("Not identifiable from these data", lost_directions(result.observability.lost)),
-        *section(f"Weakly determined ({WEAK})", weak_directions(result.observability.observability, most)),
-        *section(NOTES, *indented(notes)),
+        *_landmarks(result),
+        *section("Not identifiable from these data", tables.lost_directions(result.observability.lost)),
+        *section(tables.WEAKLY, tables.weak_directions(result.observability.observability, most)),
+        *section(NOTES, *notes),
     ]
 
 
@@ -140,18 +165,18 @@ def judged(judgements: Iterable[Judgement]) -> list[str]:
     return lines
 
 
-def _verdict(result: Result) -> Iterator[RenderableType]:
+def _verdict(result: Result) -> Iterator[Text | str]:
     several = len(result.tables) > 1
-    tables = "; ".join(f"{label} ({words})" if several else words for label, words in result.tables)
+    measured = "; ".join(f"{label} ({words})" if several else words for label, words in result.tables)
     joints = ", joint positions estimated" if result.joint_values is not None else ""
     loss = "" if result.loss == "none" else f", loss {result.loss}"
-    yield line(f"{result.robot}: {tables}{joints}{loss}")
+    yield line(f"{result.robot}: {measured}{joints}{loss}")
     if result.evaluated_only:
         yield line("EVALUATED ONLY: all rows are test rows, nothing of the arm was calibrated")
     yield from (line(f"DOUBTFUL: {finding}", "bold red") for finding in result.findings)
     if not result.findings:
         yield line(f"{verdict_word(result)}: {result.solver.message}", "bold green")
-        yield from indented(result.reservations)
+        yield from result.reservations
     if result.acceptance is not None:
         colour = {"pass": "bold green", "fail": "bold red"}.get(result.acceptance.verdict, "bold yellow")
         yield from (line(text, colour) for text in judged(result.acceptance.judgements))
@@ -162,68 +187,57 @@ def _verdict(result: Result) -> Iterator[RenderableType]:
 
 
 def _statistics(result: Result) -> Table:
-    low, high = result.chi2_bounds
-    p = "" if result.chi2_p_value is None else f", p-value {probability(result.chi2_p_value)}"
-    reduced = "unknown" if result.reduced_chi2 is None else f"{result.reduced_chi2:.4g}"
-    good = f" (good from {low:.3g} to {high:.3g})" if result.reduced_chi2 is not None else ""
-    solver = result.solver
-    rows = [
-        ("configurations", f"{result.n_configurations}"),
-        *([("pairs", f"{result.n_pairs}")] if result.n_pairs else []),
-        ("residuals", f"{result.n_residuals}, and {result.n_priors} priors"),
-        ("estimated", f"{result.n_unknowns} unknowns, {result.n_determined} directions determined"),
-        ("chi-square", f"{result.chi2:.6g} with {result.dof} degrees of freedom"),
-        ("reduced chi-square", f"{reduced}{good}{p}"),
-        (
-            "solver",
-            f"{solver.iterations} iterations, {solver.seconds:.2f} s, cost {solver.initial_cost:.6g} ->"
-            f" {solver.cost:.6g}",
-        ),
-    ]
-    return table_of(("", ""), rows, left="ll")
+    (low, high), reduced, solver = result.chi2_bounds, "unknown", result.solver
+    if result.reduced_chi2 is not None:
+        p = "" if result.chi2_p_value is None else f", p-value {probability(result.chi2_p_value)}"
+        reduced = f"{result.reduced_chi2:.4g} (good from {low:.3g} to {high:.3g}){p}"
+    cost = f"cost {solver.initial_cost:.6g} -> {solver.cost:.6g}"
+    rows = {
+        "configurations": f"{result.n_configurations}",
+        "pairs": f"{result.n_pairs or ''}",
+        "residuals": f"{result.n_residuals}, and {result.n_priors} priors",
+        "estimated": f"{result.n_unknowns} unknowns, {result.n_determined} directions determined",
+        "chi-square": f"{result.chi2:.6g} with {result.dof} degrees of freedom",
+        "reduced chi-square": reduced,
+        "solver": f"{solver.iterations} iterations, {solver.seconds:.2f} s, {cost}",
+    }
+    return table_of(("", ""), [row for row in rows.items() if row[1]], left="ll")
 
 
 def _named(result: Result, fit: KindFit) -> str:
     return fit.kind if len(result.tables) == 1 else f"{fit.kind} of {result.tables[fit.table][0]}"
 
 
-def _goodness(result: Result, robot: Robot) -> list[RenderableType]:
+def _p_value(p: float | None) -> str:
+    return "-" if p is None else probability(p)
+
+
+def _goodness(result: Result, robot: Robot) -> list[Table | str]:
     """Specified and estimated noise by kind, and what their ratio means."""
     factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[str, ...]]()
     for fit in fits:
         specified, ratio, words = fit.stated_sigma_rms, fit.seen_over_stated, VERDICTS[fit.verdict]
         if factors is not None:
             specified, ratio, words = fit.own_sigma_rms, fit.own_factor, _estimated_noise(result, key_of(fit, fits))
-        known = np.isfinite(ratio)
-        rows.append(
-            (
-                _named(result, fit),
-                SHOWN[fit.unit][1],
-                figure(specified, fit.unit),
-                figure(ratio * specified, fit.unit, none="-"),
-                f"{ratio:.3f}" if known else "-",
-                "-" if fit.p_value is None else probability(fit.p_value),
-                words,
-            )
-        )
-    rows += _joint_noise(result, robot)
-    estimated = "observed" if factors is None else "estimated"
-    headings = ("", "", "specified", estimated, "ratio", "p-value", "")
-    table = table_of(headings, rows, left="llrrrrl", wrap=True)
-    suspicious = bool(result.suspect_configurations) or any(fit.n_beyond for fit in fits)
+        sigmas = quantities(fit.unit, specified, ratio * specified, none="-")
+        rows.append((_named(result, fit), *sigmas, _ratio(ratio), _p_value(fit.p_value), words))
+    joint = (factors or {}).get("joint")
+    for unit in dict.fromkeys(one.unit for one in robot.joints) if joint is not None else ():
+        sigma = result.sigma_joint[[one.unit == unit for one in robot.joints]]
+        rms = np.sqrt(np.mean(sigma[sigma > 0.0] ** 2)) if np.any(sigma > 0.0) else np.nan
+        words = _estimated_noise(result, "joint")
+        rows.append(("joint readings", *quantities(unit, rms / (joint or 1.0), rms), f"{joint:.3f}", "-", words))
+    headings = ("", "", "specified", "observed" if factors is None else "estimated", "ratio", "p-value", "")
     level = f"no row (|studentised residual| above {result.suspect_level:.2f}) and no configuration is suspicious"
-    return [table, *indented([] if suspicious or not np.isfinite(result.suspect_level) else [level])]
+    none = not result.suspect_configurations and not any(fit.n_beyond for fit in fits)
+    return [
+        table_of(headings, rows, left="llrrrrl", wrap=True),
+        *([level] if none and np.isfinite(result.suspect_level) else []),
+    ]
 
 
-def _joint_noise(result: Result, robot: Robot) -> Iterator[tuple[str, ...]]:
-    """A row for the noise of joint readings where noise was estimated; revolute and prismatic joints apart."""
-    ratio = (result.noise_factors or {}).get("joint")
-    for unit in dict.fromkeys(joint.unit for joint in robot.joints) if ratio is not None else ():
-        sigma = np.array([s for s, joint in zip(result.sigma_joint, robot.joints, strict=True) if joint.unit == unit])
-        if ratio is not None and np.any(sigma > 0.0):
-            rms = float(np.sqrt(np.mean(sigma[sigma > 0.0] ** 2)))
-            values = figure(rms / ratio, unit), figure(rms, unit), f"{ratio:.3f}"
-            yield ("joint readings", SHOWN[unit][1], *values, "-", _estimated_noise(result, "joint"))
+def _ratio(value: float) -> str:
+    return f"{value:.3f}" if np.isfinite(value) else "-"
 
 
 def _estimated_noise(result: Result, key: str) -> str:
@@ -234,23 +248,18 @@ def _estimated_noise(result: Result, key: str) -> str:
 
 def _prediction(result: Result) -> list[Section]:
     """How well the test rows are predicted, by kind."""
-    fit = result.test
+    fit, rows, notes = result.test, [], []
     if fit is None:
         return []
-    rows = []
     for kind in fit.kinds:
-        ratio = kind.seen_over_stated / kind.factor
-        cells = f"{kind.n}", f"{kind.chi2:.4g}", f"{kind.expected:.4g}", "-" if np.isnan(ratio) else f"{ratio:.3f}"
-        p = "-" if kind.p_value is None else probability(kind.p_value)
-        rows.append((_named(result, kind), *cells, p, PREDICTION_VERDICTS[kind.verdict]))
-    headings = ("", "rows", "chi-square", "expected", "ratio", "p-value", "")
-    notes = []
+        cells = f"{kind.n}", f"{kind.chi2:.4g}", f"{kind.expected:.4g}", _ratio(kind.seen_over_stated / kind.factor)
+        rows.append((_named(result, kind), *cells, _p_value(kind.p_value), PREDICTION_VERDICTS[kind.verdict]))
     if fit.outliers.test:
         notes.append(f"{fit.outliers.test} of {fit.outliers.n_test} measurements do not count: outliers by the loss")
     if fit.n_unknown:
         notes.append(f"{fit.n_unknown} rows are not judged: they depend on what is not determined")
-    table = table_of(headings, rows, left="lrrrrrl", wrap=True)
-    return section("Prediction of the test rows", table, *indented(notes))
+    headings = ("", "rows", "chi-square", "expected", "ratio", "p-value", "")
+    return section("Prediction of the test rows", table_of(headings, rows, left="lrrrrrl", wrap=True), *notes)
 
 
 def _cross_validation(result: Result) -> list[Section]:
@@ -260,11 +269,9 @@ def _cross_validation(result: Result) -> list[Section]:
         return []
     rows = []
     for kind in in_order(found.kinds):
-        held, unit = found.kinds[kind], result.unit_of(kind)
-        values = (f"{v * SHOWN[unit][0]:.4f}" for v in (held.before, held.after, held.noise))
-        rows.append((kind, SHOWN[unit][1], f"{held.n}", *values))
-    table = table_of(("", "", "held out", "before", "after", "specified noise"), rows, left="ll")
-    title = f"Cross-validation ({found.n} folds of configurations, each predicted without it; RMS)"
+        held = found.kinds[kind]
+        unit, *values = quantities(result.unit_of(kind), held.before, held.after, held.noise, form=".4f")
+        rows.append((kind, unit, f"{held.n}", *values))
     lines, (ratio, wide) = [], found.beyond({p.name: p.sigma for p in result.estimated})
     if ratio:
         median = f"{np.median(list(ratio.values())):.2f}" + " (pairs: expect 1.4 to 1.7)" * found.of_pairs
@@ -274,21 +281,21 @@ def _cross_validation(result: Result) -> list[Section]:
         lines.append(f"spread significantly larger than sigma: {named}; the model lacks an effect, or rows are wrong")
     if found.not_converged:
         lines.append(f"{found.not_converged} of {found.n} calibrations did not converge")
-    return section(title, table, *indented(lines))
+    title = f"Cross-validation ({found.n} folds of configurations, each predicted without it; RMS)"
+    return section(title, table_of(("", "", "held out", "before", "after", "specified noise"), rows, left="ll"), *lines)
 
 
 def expected_tool_error(expected: ExpectedError | None) -> list[Section]:
     """The section on the expected error of the tool, by the covariance; none for an evaluation."""
     if expected is None:
         return []
-    both = (expected.base, expected.fitted)
     rows = [
-        (kind, SHOWN[unit][1], *(figure(getattr(rms, kind), unit) for rms in both))
-        for kind, unit in (("position", "m"), ("orientation", "rad"))
+        (kind, *quantities(unit, *(getattr(rms, kind) for rms in (expected.base, expected.fitted))))
+        for kind, unit in tables.POSE_KINDS.items()
     ]
-    table = table_of(("", "", "in the base frame", "after the best rigid fit"), rows, left="ll")
     which = "" if expected.n == expected.of else f" of {expected.of}"
-    return section(f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)", table)
+    title = f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)"
+    return section(title, table_of(("", "", "in the base frame", "after the best rigid fit"), rows, left="ll"))
 
 
 def _residuals(result: Result) -> Table:
@@ -297,10 +304,9 @@ def _residuals(result: Result) -> Table:
     for kind in in_order(name for name in names if ", table" not in name):
         for name in [name for name in names if name.startswith(f"{kind}, table ")] or [kind]:
             both = [result.residual_rms[split].get(name) for split in ("train", "test")]
+            values = (getattr(rms, when, None) for rms in both for when in ("before", "after"))
             if any(both):
-                factor, unit, _ = SHOWN[result.unit_of(kind)]
-                values = (getattr(rms, when, None) for rms in both for when in ("before", "after"))
-                rows.append((name, unit, *("-" if v is None else f"{v * factor:.4f}" for v in values)))
+                rows.append((name, *quantities(result.unit_of(kind), *values, form=".4f", none="-")))
     return table_of(("", "", "train before", "after", "test before", "after"), rows, left="ll")
 
 
@@ -308,39 +314,36 @@ def parameter_table(result: Result) -> Table:
     """Every parameter; base and tool fixed at zero are left out, and all fixed ones of an evaluation."""
     rows: list[tuple[str, ...]] = []
     for p in result.parameters:
-        unit = SHOWN[p.unit][1]
+        unit, estimate, sigma, nominal = quantities(p.unit, p.estimate, p.sigma, p.nominal)
         if p.identifiability != "fixed":
-            cells = figure(p.estimate, p.unit), figure(p.sigma, p.unit), unit, figure(p.correction, p.unit, "+")
-            prior = figure(p.prior_sigma, p.unit, none="")
-            rows.append((p.name, *cells, figure(p.nominal, p.unit), prior, p.identifiability))
+            more = figure(p.correction, p.unit, "+"), nominal, figure(p.prior_sigma, p.unit, none="")
+            rows.append((p.name, estimate, sigma, unit, *more, p.identifiability))
         elif not result.evaluated_only and (p.nominal != 0.0 or not p.name.startswith(("base.", "tool."))):
-            rows.append((p.name, figure(p.estimate, p.unit), "", unit, "", "", "", "fixed"))
+            rows.append((p.name, estimate, "", unit, "", "", "", "fixed"))
     headings = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
     return table_of(headings, rows, left="lrrlrrrl")
 
 
 def _tolerances(result: Result) -> Table:
     """Each scale of prior sigmas; these themselves only where those of a scale are all the same."""
-    by_name = {p.name: p for p in result.parameters}
-    rows: list[tuple[str, ...]] = []
+    sigma_of, rows = {p.name: (p.unit, p.prior_sigma) for p in result.parameters}, []
     for one in result.tolerance_scales or ():
-        members = [by_name[name] for name in one.parameters]
-        first = members[0].prior_sigma
-        same = len({(p.unit, f"{p.prior_sigma or 0.0:.6g}") for p in members}) == 1
-        factor, unit, _ = SHOWN[members[0].unit]
-        sigmas = (f"{first / one.scale * factor:.3g}", f"{first * factor:.3g}", unit) if same and first else ("",) * 3
+        (unit, sigma), *others = {sigma_of[name] for name in one.parameters}
+        same = not others and sigma is not None
+        shown, specified, estimated = quantities(unit, *((sigma or 0.0) / s for s in (one.scale, 1.0)), form=".3g")
+        cells = (specified, estimated, shown) if same else ("", "", "")
         ratios = f"{one.scale:.3g}", f"{one.low:.2g}", f"{one.high:.2g}", f"{one.seen:.1f} of {len(one.parameters)}"
-        rows.append((one.group, *sigmas, *ratios))
+        rows.append((one.group, *cells, *ratios))
     headings = ("", "specified", "estimated", "", "ratio", "from", "to", "corrections that count")
     return table_of(headings, rows, left="rrrl")
 
 
 def _combinations(result: Result) -> Table:
-    rows = [
-        (p.name, figure(p.sigma_of_combination, p.unit), SHOWN[p.unit][1], format_combination(p.stands_for))
-        for p in result.parameters
-        if p.stands_for
-    ]
+    rows = []
+    for p in result.parameters:
+        unit, sigma = quantities(p.unit, p.sigma_of_combination)
+        if p.stands_for:
+            rows.append((p.name, sigma, unit, format_combination(p.stands_for)))
     return table_of(("", "sigma", "", "of the sum"), rows, left="lrll", wrap=True)
 
 
@@ -351,83 +354,36 @@ def format_combination(factors: Mapping[str, float]) -> str:
     return " ".join(terms).removeprefix("+ ")
 
 
-def _suspicious_rows(residuals: pl.DataFrame | None, result: Result, most: int) -> list[Section]:
+def _suspicious_rows(residuals: pl.DataFrame | None, most: int) -> list[Section]:
     """The fitted rows that are larger than noise, then the test rows, the worst first; none if they were not saved."""
     sections: list[Section] = []
-    if residuals is None:
-        return sections
     for split, word in (("train", ""), ("test", "test ")):
-        judged = residuals.filter((residuals["split"] == split) & residuals["excluded"].is_null())
-        suspects = judged.filter(judged["suspect"])
+        if residuals is None:
+            break
+        suspects = residuals.filter(residuals["suspect"] & (residuals["split"] == split))
         suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
-        lines = [*_poses_in_common(judged, suspects, result), *_labels_in_common(judged, suspects)]
-        sections += section(f"Suspicious {word}rows", *indented(lines), _suspects(suspects, most))
+        more = [name for name in ("table", "of") if name in suspects.columns]
+        rows: list[tuple[Any, ...]] = []
+        for row in suspects.head(most).fill_null("").iter_rows(named=True):
+            residual = figure(row["residual"], row["unit"], "+"), tables.unit_shown(row["unit"])
+            names = row["a"], row["b"], row["kind"], *(row[name] for name in more)
+            rows.append((*names, *residual, f"{row['studentised']:+.1f}", row["flag"]))
+        if len(suspects) > most:
+            rows.append(("", "", f"and {len(suspects) - most} more", *[""] * (4 + len(more))))
+        headings = ("a", "b", "", *more, "residual", "", "in its sigma", "")
+        sections += section(f"Suspicious {word}rows", table_of(headings, rows, left=f"lll{'l' * len(more)}rlrl"))
     return sections
 
 
-def _suspects(suspects: pl.DataFrame, most: int) -> Table:
-    more = [name for name in ("table", "of") if name in suspects.columns]
-    rows: list[tuple[Any, ...]] = []
-    for row in suspects.head(most).fill_null("").iter_rows(named=True):
-        residual = figure(row["residual"], row["unit"], "+"), SHOWN[row["unit"]][1]
-        names = row["a"], row["b"], row["kind"], *(row[name] for name in more)
-        rows.append((*names, *residual, f"{row['studentised']:+.1f}", row["flag"]))
-    if len(suspects) > most:
-        rows.append(("", "", f"and {len(suspects) - most} more", *[""] * (4 + len(more))))
-    headings = ("a", "b", "", *more, "residual", "", "in its sigma", "")
-    return table_of(headings, rows, left=f"lll{'l' * len(more)}rlrl")
-
-
-def _poses_in_common(judged: pl.DataFrame, suspects: pl.DataFrame, result: Result, limit: int = 5) -> Iterator[str]:
-    """The poses that most of their formed pairs are suspicious of: one wrong pose makes all its pairs suspicious.
-
-    The pose in most suspicious pairs comes first; each next one counts the pairs that those before do not explain. A
-    single suspicious pair does not say which of its two poses is wrong.
-    """
-    if result.pairing in (None, "measured"):
-        return
-    pairs = [set(frame.select("a", "b").unique().drop_nulls().iter_rows()) for frame in (judged, suspects)]
-    in_all, left, lines = Counter(name for pair in pairs[0] for name in pair), pairs[1], []
-    n_suspicious = len(left)
-    while left:
-        of_pose = Counter(name for pair in left for name in pair)
-        wrong = [name for name, n in of_pose.items() if n > 1 and 2 * n > in_all[name]]
-        if not wrong:
-            break
-        worst = min(wrong, key=lambda name: (-of_pose[name], name))
-        words = f"{of_pose[worst]} of {n_suspicious} suspicious pairs, and in {in_all[worst]} pairs in all"
-        lines.append(f"pose {worst} is in {words}")
-        left = {pair for pair in left if worst not in pair}
-    yield from lines[:limit]
-    if len(lines) > limit:
-        yield f"and {len(lines) - limit} more such poses"
-
-
-def _labels_in_common(judged: pl.DataFrame, suspects: pl.DataFrame) -> Iterator[str]:
-    """The target, anchor, corner or table that most suspicious rows are of, but less than half as many others."""
-    for column in ("of", "table"):
-        if column not in suspects.columns or len(suspects.select("a", "b", column).unique()) < 2:
-            continue
-        counts = suspects[column].drop_nulls().value_counts(sort=True)
-        if not len(counts):
-            continue
-        name, found = counts.row(0)
-        n, of_all = len(suspects), int((judged[column] == name).sum())
-        if 2 * found > n and 2.0 * of_all / len(judged) * n <= found:
-            count = f"{found} of {n}" if found < n else "both" if n == 2 else f"all {n}"
-            yield f"{count} suspicious rows are of {name}, as are {of_all} of all {len(judged)} rows"
-
-
-def _suspicious_configurations(result: Result, most: int = 8) -> list[Section]:
+def _suspicious_configurations(result: Result, most: int = 8) -> list[Table | str]:
     """The configurations whose residuals together are larger than noise."""
     found = result.suspect_configurations
-    rows = [(c.id, f"{c.n}", f"{c.chi2:.4g}", f"{c.expected:.4g}") for c in found[:most]]
-    table = table_of(("", "rows", "chi-square", "expected"), rows)
+    rows = [(c.id, c.n, f"{c.chi2:.4g}", f"{c.expected:.4g}") for c in found[:most]]
     more = [f"and {shortened([c.id for c in found[most:]], 8)}"] if len(found) > most else []
-    return section("Suspicious configurations", table, *indented(more))
+    return [table_of(("", "rows", "chi-square", "expected"), rows), *more]
 
 
-def _joint_values(found: Calibrated, most: int = 5) -> list[Section]:
+def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
     """Estimated joint positions compared with the readings, joint by joint, and the suspicious readings."""
     values, configurations = found.result.joint_values, found.configurations
     if values is None:
@@ -436,13 +392,13 @@ def _joint_values(found: Calibrated, most: int = 5) -> list[Section]:
     sigma = "specified" if (found.result.noise_factors or {}).get("joint", 1.0) == 1.0 else "estimated"
     rows, wrong = [], []
     for k, (name, unit) in enumerate(zip(values.names, units, strict=True)):
-        scatter = "-" if np.isnan(values.scatter[k]) else f"{values.scatter[k]:.3f}"
-        rows.append((name, figure(values.sigma[k], unit), SHOWN[unit][1], f"{values.mean[k]:+z.3f}", scatter))
+        shown, size = quantities(unit, values.sigma[k])
+        rows.append((name, size, shown, f"{values.mean[k]:+z.3f}", _ratio(values.scatter[k])))
     for i, k in values.suspects[:most]:
-        at, unit = int(values.configurations[i]), units[k]
+        at = int(values.configurations[i])
         name = str(at) if configurations is None else configurations["id"][at]
-        error = figure(values.error[i, k], unit, "+"), SHOWN[unit][1]
-        wrong.append((name, values.names[k], *error, f"{values.studentised[i, k]:+.1f}"))
+        shown, error = quantities(units[k], values.error[i, k], form="+")
+        wrong.append((name, values.names[k], error, shown, f"{values.studentised[i, k]:+.1f}"))
     if len(values.suspects) > most:
         wrong.append(("", f"and {len(values.suspects) - most} more", "", "", ""))
     title = f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})"
@@ -452,15 +408,15 @@ def _joint_values(found: Calibrated, most: int = 5) -> list[Section]:
     ]
 
 
-def _landmarks(landmarks: Sequence[LandmarkEstimate], most: int = 8) -> list[Section]:
+def _landmarks(result: Result, most: int = 8) -> list[Section]:
     """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
     sections: list[Section] = []
     for kind, title in ((kind.name, kind.heading) for kind in LANDMARKS.values() if kind.heading):
-        chosen, rows = [p for p in landmarks if p.kind == kind], []
+        chosen, rows = [p for p in result.groups if p.kind == kind], []
         for p in chosen[:most]:
             units = ["" if kind == "unknown" else unit for unit in p.units]
-            xyz, sigma = _vector(p.xyz, *units), _vector(p.sigma, *units)
-            rows.append((p.name, f"{p.n}", xyz, "±", sigma if p.sigma.any() else "known"))
+            sigma = _vector(p.sigma, *units) if p.sigma.any() else "known"
+            rows.append((p.name, f"{p.n}", _vector(p.xyz, *units), "±", sigma))
         if len(chosen) > most:
             rows.append((f"and {len(chosen) - most} more", "", "", "", ""))
         sections += section(title, table_of(("", "rows", "estimate", "", "sigma"), rows, left="lrrlr"))
@@ -507,7 +463,7 @@ def summary(result: Result, most: int = 3) -> list[str]:
         f"{len(result.estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
         *_rms_lines(result),
     ]
-    return [str(line(text if len(text) <= WIDTH else f"{text[: WIDTH - 4]} ...")) for text in lines]
+    return [str(line(text if len(text) <= tables.WIDTH else f"{text[: tables.WIDTH - 4]} ...")) for text in lines]
 
 
 def _rms_lines(result: Result) -> Iterator[str]:

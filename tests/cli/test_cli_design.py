@@ -12,7 +12,6 @@ from simulated import small_arm, true_robot
 
 from fg_calib.io.robot_file import write_robot
 from fg_calib.io.units import Units
-from fg_calib.report.design import FINEST
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 ARM = small_arm(tolerance=TOLERANCE)
@@ -170,9 +169,9 @@ def test_the_job_calibrates_when_it_is_filled_in(kind, plan, fg_calib, tmp_path)
     stops = pl.read_csv(out / "configurations.csv")
     assert stops["id"].to_list() == [stop["id"] for stop in document["stops"]]
     q = readings_in(out / "configurations.csv")
-    assert q == pytest.approx(np.array([stop["readings"] for stop in document["stops"]]), abs=FINEST["rad"])
+    assert q == pytest.approx(np.array([stop["readings"] for stop in document["stops"]]), abs=1e-8)
     at = np.array([1e3 * tool_pose(ARM, one)[:3, 3] for one in q])
-    moved = 1e3 * (4 * ARM.reach * FINEST["rad"] + FINEST["m"])  # by readings and by itself
+    moved = 1e3 * (4 * ARM.reach * 1e-8 + 1e-9)  # by readings and by itself
     assert stops.select("tool_x", "tool_y", "tool_z").to_numpy() == pytest.approx(at, abs=moved)
     rng = np.random.default_rng(1)
     true = ARM if kind == "sockets" else true_robot(ARM, rng)

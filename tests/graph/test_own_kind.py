@@ -461,7 +461,7 @@ def test_text_and_other_things_are_no_figures(change, said):
 def test_plain_least_squares_takes_it_too():
     robot, true, table = measured(5, n_test=10)
     found = compare(Job(None, robot, (table,), Options(), true))
-    _, keep, _, weighted, _ = found.estimates
+    _, keep, _, weighted = found.estimates
     assert weighted.converged
     for name, sigma in keep.sigma.items():
         values = [e.robot.nominal[robot.index(name)] for e in (keep, weighted)]

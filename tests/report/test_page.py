@@ -118,7 +118,7 @@ def test_it_is_one_file_that_loads_nothing(folder):
 
 def test_names_are_text_and_nothing_else():
     name = "<script>alert(1)</script>\x1b[31m"
-    page = html.fromstring(build_page(calibrated(replace(small_arm(TOLERANCE), name=name))._drawn))
+    page = html.fromstring(build_page(calibrated(replace(small_arm(TOLERANCE), name=name)).report_data))
     assert page.xpath("//h1")[0].text == "<script>alert(1)</script>\\x1b[31m"
     assert not any("alert" in (script.text or "") for script in page.xpath("//script[not(@type)]"))
 
@@ -133,7 +133,7 @@ def test_figures_are_svg_files_of_their_own(folder):
 def test_without_tables_the_page_says_what_is_missing(folder, tmp_path):
     for name in ("result.json", "robot_calibrated.yaml"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
-    page = text_of(html.fromstring(build_page(Calibration.load(tmp_path)._drawn)))
+    page = text_of(html.fromstring(build_page(Calibration.load(tmp_path).report_data)))
     assert "The folder holds no table of configurations: calibrate again with --out to have its charts." in page
     assert "no table of residuals: calibrate again with --out and without --residuals none" in page
 
@@ -146,7 +146,7 @@ def test_a_page_that_is_not_ours_is_not_replaced(folder, tmp_path, fg_calib):
 
 
 def test_cross_validation_is_a_table():
-    page = text_of(html.fromstring(build_page(calibrated(folds=3)._drawn)))
+    page = text_of(html.fromstring(build_page(calibrated(folds=3).report_data)))
     assert "Cross-validation (3 folds of configurations, each predicted without it; RMS) held out before" in page
 
 
@@ -154,14 +154,14 @@ def test_cross_validation_is_a_table():
 @pytest.mark.parametrize("instrument", ["anchor", "plane", "board", "targets"])
 def test_every_instrument_has_a_page(instrument):
     robot, tables = measured_by(instrument, np.random.default_rng(0))[:2]
-    assert "Residuals" in build_page(calibrate(robot, tables)._drawn)
+    assert "Residuals" in build_page(calibrate(robot, tables).report_data)
 
 
 def test_an_evaluation_says_that_it_is_one():
     rng = np.random.default_rng(4)
     robot = small_arm(TOLERANCE)
     m = replace(measure(robot, 12, rng), test=np.ones(12, dtype=bool))
-    page = text_of(html.fromstring(build_page(calibrate(robot, m, model="position")._drawn)))
+    page = text_of(html.fromstring(build_page(calibrate(robot, m, model="position").report_data)))
     assert "Evaluated only: all rows are test rows, nothing of the arm was calibrated." in page
     assert "± sigma" not in page
 
