@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import BytesIO, StringIO
+from itertools import islice
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +27,6 @@ from fg_calib.inputs import (
     Booleans,
     Floats,
     InputError,
-    Integers,
-    as_figures,
     as_frame,
     check_different,
     check_names,
@@ -35,7 +36,6 @@ from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
 from fg_calib.io.yaml import number_hint, shown
 from fg_calib.measurements import INSTRUMENTS
 from fg_calib.measurements.kinds import Column as ColumnSet
-from fg_calib.options import Model
 from fg_calib.parallel import require_polars
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -76,6 +76,9 @@ def names_of(sets: Iterable[ColumnSet]) -> frozenset[str]:
 KNOWN = names_of(OF_CONFIGURATIONS.values())
 """Names of the columns of a table of configurations, besides the joint readings."""
 
+_OF_WORDS = {"id", "split", "a", "b", "group", *(name for one in INSTRUMENTS.values() for name in one.labels)}
+"""Columns with a meaning that hold no numbers."""
+
 
 @dataclass(frozen=True)
 class Column:
@@ -97,12 +100,9 @@ class Column:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise InputError("columns: name", f"found {shown(self.name)}", "the name of a column")
-        for key in ("scale", "zero"):
-            number = as_figures(f"columns: {self.name}: {key}", getattr(self, key), "a number")
-            if number.ndim or not np.isfinite(number) or (key == "scale" and number == 0.0):
-                expected = "a finite number other than 0" if key == "scale" else "a finite number"
-                raise InputError(f"columns: {self.name}: {key}", f"found {shown(getattr(self, key))}", expected)
-            object.__setattr__(self, key, float(number))
+        for key, number, more in (("scale", self.scale, " other than 0"), ("zero", self.zero, "")):
+            if not isinstance(number, Real) or not math.isfinite(number) or (more and number == 0.0):
+                raise InputError(f"columns: {self.name}: {key}", f"found {shown(number)}", f"a finite number{more}")
 
 
 @dataclass(frozen=True)
@@ -112,18 +112,15 @@ class Table:
     Attributes:
         name: File name, or what a frame is called, for messages.
         columns: Names of all its columns, as they are known.
-        frame: The columns of use as they were read, without blank rows; those of a CSV are texts.
-        places: Where each row of `frame` stands: its line of a CSV, else its 0-based row, shape (n_rows,).
-        separator: The character between the cells of a CSV, empty for others. Where it is no comma, numbers may have
-            decimal commas.
+        frame: The columns, without blank rows. Those of a CSV are numbers or texts.
+        csv: The file that it was read from; None of others than CSV.
         renamed: By column, its conversion, where the table has its own name for it.
     """
 
     name: str
     columns: tuple[str, ...]
     frame: pl.DataFrame
-    places: Sequence[int]
-    separator: str = ""
+    csv: _Csv | None = None
     renamed: Mapping[str, Column] = field(default_factory=dict)
 
     @classmethod
@@ -136,58 +133,58 @@ class Table:
         joints: Iterable[str] = (),
         columns: Mapping[str, Column] | None = None,
     ) -> Table:
-        """Read the columns of a CSV, a Parquet file or a frame that have a known name.
+        """Read a CSV, a Parquet file or a frame.
 
         Args:
             table: The file, or a frame of polars or pandas, or a mapping of columns.
             name: What a frame is called in messages.
-            known: Names of columns that have a meaning, also if written in another case; None to read all columns.
+            known: Names of columns that have a meaning, also if written in another case; None if none has.
             joints: Names that the robot gives to columns.
             columns: By known name, what the table calls a column.
 
         Raises:
             InputError: It cannot be read, it has no rows, or `columns` does not fit.
         """
-        source = _open(table, name)
-        names = list(source.columns)
-        chosen = list(range(len(names)))
-        if known is not None:
-            known, joints = set(known), set(joints)
-            names = _understood(source.name, _rename(source, columns or {}, known | joints), known, joints)
-            chosen = [i for i, column in enumerate(names) if column in known or column in joints]
-        frame, places = source.read(chosen)
-        frame.columns = [names[i] for i in chosen]
-        if len(places) == 0 and chosen:
-            raise InputError(source.name, "no rows", "at least one")
-        return cls(source.name, tuple(names), frame, places, source.separator, dict(columns or {}))
+        require_polars(name)
+        given, of_csv = _as_frame_or_csv(table, name)
+        name = name if of_csv is None and not isinstance(table, os.PathLike | str) else Path(table).name
+        header = of_csv.header if of_csv is not None else given.columns
+        header = [column.strip() for column in header]
+        check_different(name if of_csv is None else f"{name}:1", header)
+        meant = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
+        if of_csv is not None:
+            numbers = {*(known or ()), *joints} - _OF_WORDS
+            with _one_line(name, "no table"):
+                given = of_csv.read([column in numbers for column in meant])
+        given.columns = meant
+        if not given.height:
+            raise InputError(name, "no rows", "at least one")
+        return cls(name, tuple(meant), given, of_csv, dict(columns or {}))
+
+    @property
+    def separator(self) -> str:
+        """The character between the cells of a CSV, empty for others."""
+        return "" if self.csv is None else self.csv.separator
 
     @property
     def n_rows(self) -> int:
         """Number of rows."""
-        return len(self.places)
+        return self.frame.height
 
     def present(self, *columns: str) -> tuple[str, ...]:
         """Those of `columns` that the table has."""
         return tuple(c for c in columns if c in self.columns)
 
-    def has(self, first: str, model: Model | None = None) -> bool:
-        """Whether the table has the columns that belong together, by the first, and the model reads them.
+    def has(self, *columns: str) -> bool:
+        """Whether the table has columns that belong together.
 
         Raises:
             InputError: It has some of them only.
         """
-        of = OF_CONFIGURATIONS[first]
-        if model is not None and of not in INSTRUMENTS[model].columns:
-            return False
-        if not self.present(*of.names):
-            return False
-        self.require_columns(of.names)
-        return True
-
-    def require_columns(self, columns: Sequence[str]) -> None:
-        """Raise where the table lacks one of columns that belong together."""
-        if missing := [name for name in columns if name not in self.columns]:
+        missing = [name for name in columns if name not in self.columns]
+        if missing and len(missing) < len(columns):
             raise InputError(self.name, f"no column {missing[0]}", f"{' '.join(columns)} together")
+        return not missing
 
     def numbers(self, columns: Sequence[str], *, optional: bool = False) -> Floats:
         """The columns as numbers, shape (n_rows, n_columns).
@@ -201,17 +198,20 @@ class Table:
         """
         import polars as pl
 
-        for column in columns:
-            kind = self.frame[column].dtype
-            if not (kind.is_numeric() or kind in (pl.String, pl.Null)):
-                raise InputError(f"{self.name}: {column}", f"type {kind}", "numbers")
-        # Columns are numbered, as polars takes names such as * for patterns.
-        given = pl.DataFrame([self.frame[column].alias(str(k)) for k, column in enumerate(columns)])
-        read = given.select(_number(name, kind, self.separator in (";", "\t")) for name, kind in given.schema.items())
-        finite = read.select(pl.all().is_finite().fill_null(optional)).to_numpy()
-        values: Floats = np.array(read.to_numpy(), dtype=np.float64).reshape(self.n_rows, len(columns))
+        values = np.empty((self.n_rows, len(columns)))
         for k, column in enumerate(columns):
-            self.require(finite[:, k], column, "a finite number")
+            cells = self.frame[column]
+            if cells.dtype == pl.String:
+                texts = self.texts(column)
+                if self.separator in (";", "\t"):
+                    texts = texts.str.replace(r"^([^.,]*),([^.,]*)$", "$1.$2")
+                cells = texts.cast(pl.Float64, strict=False)
+                cells = cells.set(cells.is_null() & texts.is_not_null(), np.nan)
+            elif not cells.dtype.is_numeric() and cells.dtype != pl.Null:
+                raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "numbers")
+            cells = cells.cast(pl.Float64)
+            self.require(cells.is_finite().fill_null(optional).to_numpy(), column, "a finite number")
+            values[:, k] = cells.to_numpy()
             if (own := self.renamed.get(column)) is not None:
                 values[:, k] = (values[:, k] - own.zero) * own.scale
             self.require(~(np.abs(values[:, k]) > MOST_SIZE), column, ORDINARY)
@@ -232,21 +232,21 @@ class Table:
         """
         import polars as pl
 
-        cells = self.frame[column].alias("cells")
+        cells = self.frame[column]
         if cells.dtype.is_nested() or cells.dtype == pl.Object:
             raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "text")
         if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
             cells = cells.cast(pl.Int64)
-        texts = cells.to_frame().select(_stripped(pl.col("cells").cast(pl.String)))["cells"]
+        texts = cells.cast(pl.String).str.strip_chars()
+        texts = texts.set(texts == "", None)
         if expected:
             self.require(texts.is_not_null().to_numpy(), column, expected)
         return texts
 
-    def names(self, column: str, expected: str) -> pl.Series:
-        """The column as texts, without a word such as NA that stands for nothing."""
-        names = self.texts(column)
-        nothing = names.str.to_lowercase().is_in(NOTHING).fill_null(False)
-        self.require(~nothing.to_numpy(), column, expected)
+    def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
+        """The column as texts, without a word such as NA that stands for nothing; null where a cell may be empty."""
+        names = self.texts(column, "" if optional else expected)
+        self.require(~names.str.to_lowercase().is_in(NOTHING).fill_null(False).to_numpy(), column, expected)
         return names
 
     def test_rows(self) -> Booleans:
@@ -261,177 +261,137 @@ class Table:
         """Raise for the first cell of `column` that is not `good`, shape (n_rows,)."""
         if not good.all():
             row = int(np.argmin(good))
-            cell = self.frame[column][row]
+            cell = self.frame[column][row] if self.csv is None else self.csv.row(row)[1][self.columns.index(column)]
             cell = cell.strip() if isinstance(cell, str) else cell
             found = "an empty cell" if cell in {None, ""} else shown(cell)
             raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, hint or number_hint(cell))
 
     def place(self, row: int) -> str:
         """File and line of a row of a CSV (the header is line 1); of a Parquet file or a frame the 0-based row."""
-        return f"{self.name}:{' row ' * (not self.separator)}{self.places[row]}"
-
-
-def _number(name: str, kind: pl.DataType, decimal_comma: bool) -> pl.Expr:
-    """A column as numbers: null where a cell is empty, nan where a text is no number."""
-    import polars as pl
-
-    column = pl.col(name)
-    if kind != pl.String:
-        return column.cast(pl.Float64)
-    text = _stripped(column)
-    digits = text.str.replace(r"^([^.,]*),([^.,]*)$", "$1.$2") if decimal_comma else text
-    return pl.when(text.is_not_null()).then(digits.cast(pl.Float64, strict=False).fill_null(float("nan"))).alias(name)
-
-
-def _stripped(column: pl.Expr) -> pl.Expr:
-    return column.str.strip_chars().replace("", None)
-
-
-_ENDINGS = (".csv", ".parquet", ".pq")
+        return f"{self.name}: row {row}" if self.csv is None else f"{self.name}:{self.csv.row(row)[0]}"
 
 
 @dataclass(frozen=True)
-class _Source:
-    """An open table: its columns, without blanks around their names, and how to read those of some numbers.
+class _Csv:
+    """A text of cells with a separator between, which its header tells.
 
     Raises:
-        InputError: It has no names of columns, or the same twice.
+        InputError: It is empty, or a quote is not closed.
     """
 
     name: str
-    place: str
-    columns: Sequence[str]
-    read: Callable[[list[int]], tuple[pl.DataFrame, Sequence[int]]]
-    separator: str = ""
+    text: str
+    separator: str = field(init=False)
+    header: Sequence[str] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "columns", [column.strip() for column in self.columns])
-        if len(self.columns) == 1 and "|" in self.columns[0]:
-            found = f"one column {shown(self.columns[0])}"
-            raise InputError(self.place, found, "columns with , ; or tab between", "not '|'")
-        check_different(self.place, self.columns)
+        if '"' in self.text and self.text.count('"') % 2:
+            line = next(i for i, one in enumerate(self.text.splitlines(), start=1) if one.count('"') % 2)
+            raise InputError(f"{self.name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
+        first = re.search(r"[^\r\n]*[^\s,;][^\r\n]*", self.text)
+        if first is None:
+            raise InputError(f"{self.name}:1", "an empty file", "a header and rows")
+        separator = max(",;\t", key=re.sub(r'"[^"]*"', "", first[0]).count)
+        header = next(csv.reader([first[0]], delimiter=separator))
+        header[0] = header[0].removeprefix("#")  # as numpy writes it
+        object.__setattr__(self, "separator", separator)
+        object.__setattr__(self, "header", header)
 
-
-def _open(table: Path | str | Any, name: str) -> _Source:
-    """Open a table and read the names of its columns.
-
-    Raises:
-        InputError: It is missing, or is no table, or has the same name twice.
-    """
-    import polars as pl
-
-    require_polars(name)
-    if not isinstance(table, os.PathLike | str):
-        with _one_line(name, "no table"):
-            frame = _as_polars(table, name)
-        return _Source(name, name, frame.columns, lambda chosen: (frame[:, chosen], range(frame.height)))
-    path = Path(table)
-    content = read_bytes(path)
-    if path.suffix.lower() not in _ENDINGS:
-        hint = "save the sheet as CSV" if path.suffix.lower() in (".xlsx", ".xls", ".ods") else ""
-        raise InputError(path.name, f"ending {path.suffix!r}", f"one of {', '.join(_ENDINGS)}", hint)
-    if path.suffix.lower() == ".csv":
-        return _open_csv(path.name, decoded(content, path.name))
-
-    def read(chosen: list[int]) -> tuple[pl.DataFrame, Sequence[int]]:
-        with _one_line(path.name, "not a Parquet file"):
-            found = pl.read_parquet(BytesIO(content), columns=chosen)
-        return found, range(found.height)
-
-    with _one_line(path.name, "not a Parquet file"):
-        names = list(pl.read_parquet_schema(BytesIO(content)))
-    return _Source(path.name, path.name, names, read)
-
-
-def _open_csv(name: str, text: str) -> _Source:
-    """Open a CSV, whose separator its header tells."""
-    if text.count('"') % 2:
-        line = next(i for i, one in enumerate(text.splitlines(), start=1) if one.count('"') % 2)
-        raise InputError(f"{name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
-    separator = max(",;\t", key=re.sub(r'"[^"]*"', "", text.lstrip("\r\n")).partition("\n")[0].count)
-    places, rows = _csv_rows(name, text, separator)
-    if not len(rows):
-        raise InputError(f"{name}:1", "an empty file", "a header and rows")
-    header = rows[0].split(_BETWEEN)
-
-    def read(chosen: list[int]) -> tuple[pl.DataFrame, Sequence[int]]:
-        wrong = (rows.str.count_matches(_BETWEEN, literal=True) != len(header) - 1).arg_true()
-        if len(wrong):
-            row = wrong[0]
-            n, expected = len(rows[row].split(_BETWEEN)), f"{len(header)} as in the header"
-            hint = "a quote joins it with lines below: is one missing?" if "\n" in rows[row] else ""
-            raise InputError(f"{name}:{places[row]}", f"{n} cell{'s' * (n != 1)}", expected, hint)
-        cells = rows[1:].str.split_exact(_BETWEEN, len(header) - 1).struct.unnest()
-        return cells[:, chosen], places[1:].tolist()
-
-    return _Source(name, f"{name}:{places[0]}", header, read, separator)
-
-
-_BETWEEN = "\x1f"
-"""What stands between cells once quotes are resolved: ASCII's own separator of units."""
-
-
-def _csv_rows(name: str, text: str, separator: str) -> tuple[Integers, pl.Series]:
-    """The line where each row of a CSV begins, and its cells with `_BETWEEN` between; rows of empty cells are left out.
-
-    Raises:
-        InputError: A cell in quotes is longer than any cell is.
-    """
-    import polars as pl
-
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    places = np.arange(1, len(lines) + 1)
-    rows = pl.Series(lines).str.replace_all(separator, _BETWEEN, literal=True)
-    if '"' in text:
-        reader = csv.reader(StringIO("\n".join(lines), newline=""), delimiter=separator)
-        begin, joined = [1], list[str]()
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """The line where each row begins, and its cells; the header first, rows of empty cells left out."""
+        reader = csv.reader(StringIO(self.text, newline=None), delimiter=self.separator)
+        line = 1
         try:
             for cells in reader:
-                joined.append(_BETWEEN.join(cells))
-                begin.append(reader.line_num + 1)
+                if any(cell.strip() for cell in cells):
+                    yield line, cells
+                line = reader.line_num + 1
         except csv.Error as error:
-            raise InputError(f"{name}:{begin[-1]}", f"not a CSV: {error}") from None
-        places, rows = np.array(begin[:-1]), pl.Series(joined, dtype=pl.String)
-    filled = rows.str.strip_chars(f" \t{_BETWEEN}") != ""
-    return places[filled.to_numpy()], rows.filter(filled)
+            raise InputError(f"{self.name}:{line}", f"not a CSV: {error}") from None
+
+    def row(self, row: int) -> tuple[int, list[str]]:
+        """The line and the cells of a row, the first one behind the header being 0."""
+        return next(islice(self.rows(), row + 1, None))
+
+    def read(self, are_numbers: Sequence[bool]) -> pl.DataFrame:
+        """The rows: numbers where all is plain, else texts, of which any may be no number.
+
+        Raises:
+            InputError: A row has more or fewer cells than the header.
+        """
+        import polars as pl
+
+        n, text = len(are_numbers), self.text
+        n_lines = text.count("\n") + (not text.endswith("\n"))
+        if (
+            '"' not in text
+            and text.count("\r") == text.count("\r\n")
+            and text.count(self.separator) == (n - 1) * n_lines
+        ):
+            schema = {str(i): pl.Float64 if is_number else pl.String for i, is_number in enumerate(are_numbers)}
+            with suppress(pl.exceptions.PolarsError):
+                frame = pl.read_csv(
+                    text.encode(), separator=self.separator, schema=schema, has_header=False, skip_rows=1
+                )
+                if frame.height == n_lines - 1 and not frame.select(pl.all_horizontal(pl.all().is_null()).any()).item():
+                    return frame
+        rows = list(self.rows())[1:]
+        for line, cells in rows:
+            if len(cells) != n:
+                found = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
+                raise InputError(f"{self.name}:{line}", found, f"{n} as in the header")
+        return pl.DataFrame([cells for _, cells in rows], {str(i): pl.String for i in range(n)}, orient="row")
 
 
-def _rename(source: _Source, columns: Mapping[str, Column], known: set[str]) -> list[str]:
-    """The names of a table's columns, those with an own name called as they are known.
+def _as_frame_or_csv(table: Path | str | Any, name: str) -> tuple[Any, _Csv | None]:
+    """The columns of a Parquet file or a frame, or else the text of a CSV.
 
     Raises:
-        InputError: A known name is not known, or the table has no such column.
+        InputError: It is missing, or is no table.
     """
-    place = f"{source.name}: columns"
-    check_names(place, columns, sorted(known), "column")
-    own = {name: column.name.strip() for name, column in columns.items()}
-    for name, given in own.items():
-        check_names(f"{place}: {name}", [given], source.columns, "column")
-    check_different(f"{place}: the table's", own.values())
-    meant = {given: name for name, given in own.items()}
-    return [meant.get(name) or f"{name} (the table's)" * (name in own) or name for name in source.columns]
+    import polars as pl
+
+    if not isinstance(table, os.PathLike | str):
+        with _one_line(name, "no table"):
+            return _as_polars(table, name), None
+    path = Path(table)
+    content, ending = read_bytes(path), path.suffix.lower()
+    if ending == ".csv":
+        return None, _Csv(path.name, decoded(content, path.name))
+    if ending not in (".parquet", ".pq"):
+        hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
+        raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
+    with _one_line(path.name, "not a Parquet file"):
+        return pl.read_parquet(BytesIO(content)), None
 
 
-def _understood(table: str, names: Sequence[str], known: set[str], joints: set[str]) -> list[str]:
-    """Names of columns, those of another case called as they are known; warns of names that only look known.
+def _understood(
+    table: str, header: Sequence[str], known: set[str], joints: set[str], columns: Mapping[str, Column]
+) -> list[str]:
+    """Names of columns as they are known: by `columns`, or in another case; warns of names that only look known.
 
     Raises:
-        InputError: A known name stands behind a #, as if the header were a comment.
+        InputError: A key of `columns` is not known, or the table has no such column.
     """
-    found, given = list(names), set(names)
+    place = f"{table}: columns"
+    check_names(place, columns, sorted(known | joints), "column")
+    for name, column in columns.items():
+        check_names(f"{place}: {name}", [column.name.strip()], header, "column")
+    check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
+    own = {column.name.strip(): name for name, column in columns.items()}
+    names = [own.get(name) or f"{name} (the table's)" * (name in columns) or name for name in header]
     for i, name in enumerate(names):
+        lower = name.lower()
         if name in known or name in joints:
             continue
-        if name.startswith("#") and (bare := name.lstrip("# ").lower()) in known:
-            raise InputError(table, f"column {shown(name)}", f"{bare}, or another name")
-        if name.lower() in known and name.lower() not in given:
-            found[i] = name.lower()
-        elif name.lower().startswith("sigma"):
+        if lower in known and lower not in names:
+            names[i] = lower
+        elif lower.startswith("sigma"):
             sigmas = ", ".join(sorted(column for column in known if column.startswith("sigma_")))
             _log.warning("%s: column %r is not used; sigmas are %s", table, name, sigmas)
-        elif hint := f"{name.lower()} is" if name.lower() in known else did_you_mean(name, known - given, 0.85):
+        elif hint := f"{lower} is" if lower in known else did_you_mean(name, known.difference(names), 0.85):
             _log.warning("%s: column %r is not used; %s", table, name, hint)
-    return found
+    return names
 
 
 def _as_polars(table: Any, name: str) -> pl.DataFrame:

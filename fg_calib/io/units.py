@@ -41,8 +41,8 @@ class Units:
         return self.length if unit == "m" else self.angle
 
     def factor(self, unit: str) -> float:
-        """What a figure of the file is multiplied by to be in `unit`, `m` or `rad`."""
-        return LENGTHS[self.length] if unit == "m" else ANGLES[self.angle]
+        """What a value of the file is multiplied by to be in `unit`: `m`, `rad`, or one that no file has another of."""
+        return {"m": LENGTHS[self.length], "rad": ANGLES[self.angle]}.get(unit, 1.0)
 
     def sigma(self, figure: float, unit: str, place: str) -> float:
         """A sigma or tolerance of the file, 0 or above, in `unit`, `m` or `rad`.

@@ -1,6 +1,6 @@
 from .build import Dataset, build_dataset, find_copies, start_frames, warn_of_copies
 from .checks import ANGLE_SLACK, check_readings, covariances
-from .dataset import Groups, Labels, Measurements, Noise, Pairs, form_pairs, no_pairs
+from .dataset import Groups, Labels, Measurements, Noise, Pairs, form_pairs, no_pairs, pairs_from_arrays
 from .kind import Frames, Kind
 from .kinds import GENERIC_COLUMNS, INSTRUMENTS, LANDMARKS, Camera
 from .kinds.board import COVARIANCE
@@ -54,6 +54,7 @@ __all__ = [
     "no_pairs",
     "outside_limits",
     "pack",
+    "pairs_from_arrays",
     "predict_measurements",
     "squares_along",
     "start_frames",

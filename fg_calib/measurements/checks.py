@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib.inputs import (
     LEAST_SIZE,
     NORM_TOLERANCE,
+    NOTHING,
     ORDINARY,
     Booleans,
     Floats,
@@ -247,18 +248,17 @@ def _names_of_ends(name: str, given: ArrayLike) -> NDArray[Any]:
     array = as_array(name, given, "iuUO", "ids")
     if array.ndim != 1 or array.dtype.kind in "iu":
         return array
+    if array.dtype.kind == "U" and not {"", *NOTHING}.intersection(map(str.lower, set(array.tolist()))):
+        return array
     return np.array(as_names(name, given), dtype=np.str_)
 
 
 def _index_of(names: NDArray[Any], known: NDArray[np.str_]) -> Integers:
     """Where each of the names stands among those that are known, -1 where nowhere."""
-    if names.dtype.kind in "iu":  # by far the faster where there are no other names than row numbers
-        found = np.where((names >= 0) & (names < len(known)), names, -1).astype(np.int64)
-        if np.array_equal(known, np.arange(len(known)).astype(known.dtype)):
-            return found
-    words, order = names.astype(np.str_), np.argsort(known)
-    place = order[np.minimum(np.searchsorted(known, words, sorter=order), len(known) - 1)]
-    return np.where(known[place] == words, place, -1)
+    if names.dtype.kind in "iu" and np.array_equal(known, np.arange(len(known)).astype(known.dtype)):
+        return np.where((names >= 0) & (names < len(known)), names, -1).astype(np.int64)
+    place = {name: i for i, name in enumerate(known.tolist())}
+    return np.array([place.get(name, -1) for name in names.astype(np.str_).tolist()], dtype=np.int64)
 
 
 def check_readings(readings: Floats, robot: Robot, name: str) -> None:

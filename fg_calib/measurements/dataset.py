@@ -332,8 +332,11 @@ class Measurements(FrozenArrays):
         known, rows = checked_ids(ids, n, repeated=repeated), checked_mask("test", test, n)
         R, angles = checked_rotation(n, rotation, quaternion, roll_pitch_yaw)
         every = tuple(dict.fromkeys((*names, *listed("points", points))))
-        between = None if pairs is None else _pairs_from_arrays(pairs, known, rows, every, index)
-        names = names if between is None or not between[1].n_pairs else every
+        between, of_groups = None, no_pairs(source)
+        if pairs is not None:
+            between, which = pairs_from_arrays(pairs, known, rows, Labels(every, index))
+            between, of_groups = between.select(~which), between.select(which)
+        names = every if of_groups.n_pairs else names
         return cls(
             readings=q,
             ids=known,
@@ -343,9 +346,9 @@ class Measurements(FrozenArrays):
             sigma_position=checked_sigma("sigma_position", sigma_position, (n, 3)),
             sigma_orientation=checked_sigma("sigma_orientation", sigma_orientation, (n, 3)),
             sigma_joint=checked_joint_sigma(sigma_joint, q.shape[1]),
-            pairs=None if between is None else between[0],
+            pairs=between,
             source=source,
-            groups=Groups(names, index, no_pairs(source) if between is None else between[1]) if names else None,
+            groups=Groups(names, index, of_groups) if names else None,
             sigma_point=checked_sigma("sigma_point", sigma_point, (n,)),
             roll_pitch_yaw=angles,
             named=ids is not None,
@@ -393,19 +396,21 @@ class Measurements(FrozenArrays):
         return ("", *self.ids.tolist(), *(() if self.groups is None else self.groups.names))
 
 
-def _pairs_from_arrays(
-    given: Any, ids: NDArray[np.str_], test: Booleans, names: tuple[str, ...], group: Integers
-) -> tuple[Pairs, Pairs]:
-    """Pairs of configurations, and pairs of groups; those of test rows alone are test pairs."""
-    columns, of_groups = checked_pairs(given, ids, names)
-    pairs = Pairs(**columns)  # type: ignore[arg-type]
-    touches = [test[group == g] for g in range(len(names))]
-    only_test = np.array([len(here) > 0 and here.all() for here in touches], dtype=np.bool_)
-    of_rows = pairs.test.copy()
+def pairs_from_arrays(given: Any, ids: NDArray[np.str_], test: Booleans, groups: Labels) -> tuple[Pairs, Booleans]:
+    """Pairs, and which of them are of groups; those of a test row, or of a group of test rows alone, are test pairs.
+
+    Args:
+        given: Columns by name: see `Measurements.from_arrays`.
+        ids: Names of the configurations.
+        test: Which configurations are test rows.
+        groups: The contact points.
+    """
+    columns, of_groups = checked_pairs(given, ids, groups.names)
+    contacts = [test[groups.index == g] for g in range(len(groups.names))]
+    only_test = np.array([len(rows) > 0 and rows.all() for rows in contacts], dtype=np.bool_)
     for flags, chosen in ((test, ~of_groups), (only_test, of_groups)):
-        of_rows[chosen] |= flags[pairs.a[chosen]] | flags[pairs.b[chosen]]
-    pairs = replace(pairs, test=of_rows)
-    return pairs.select(~of_groups), pairs.select(of_groups)
+        columns["test"][chosen] |= flags[columns["a"][chosen]] | flags[columns["b"][chosen]]
+    return Pairs(**columns), of_groups  # type: ignore[arg-type]
 
 
 def no_pairs(source: str) -> Pairs:

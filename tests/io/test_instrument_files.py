@@ -138,7 +138,7 @@ CASES = [
      "t.csv:2: station: found an empty cell, expected the name of a station"),
     ("pixels", f"{HEAD},u,v\n0,0,0,0,1,2\n", "t.csv: no column corner_x, expected u v corner_x corner_y together"),
     ("pixels", f"{HEAD},u,v,corner_x,corner_y,sigma_pixel,sigma_u\n0,0,0,0,1,2,3,4,1,1\n",
-     "t.csv: both sigma_pixel and sigma_u, expected one of the two"),
+     "t.csv: no column sigma_v, expected sigma_u sigma_v together"),
     ("board", f"{HEAD},cov_11\n0,0,0,0,1\n", f"t.csv: no column cov_12, expected {' '.join(COVARIANCE)} together"),
     ("board", f"{HEAD},{','.join(COVARIANCE)}\n0,0,0,0,{','.join(['1'] * 21)}\n",
      "t.csv:2: cov_11: found '1', expected a covariance: eigenvalues above 0"),
