@@ -1,58 +1,22 @@
 """Rows and their dense covariance, written down anew: every error's effect by finite differences of plain formulas."""
 
 import numpy as np
+from oracle import central_differences
 from scipy.spatial.transform import Rotation
 
 from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds.contact import PointDistance, TouchedPoint
-from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
-from fg_calib.measurements.kinds.pose import Orientation, Position
+from fg_calib.measurements.kind import Frames
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.moments import angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.robot.kinematics import forward
 
-STEP, WEIGHTS = 5e-3, np.array([45.0, -9.0, 1.0]) / 60.0
-"""Central differences of sixth order: off by some 1e-13 of frames' own size."""
+STEP, WEIGHTS = 5e-4, np.array([45.0, -9.0, 1.0]) / 60.0
+"""Central differences of sixth order."""
 
 PRIVATE_SHARE, REDUNDANT = 1e-3, 100.0
-"""What pairs have to themselves at least, of their variance; what is not linear counts as, in too many of them."""
-
-
-def predicted(kind, R, p, measured, points):
-    """Rows of a kind, predicted minus measured, from rotations and positions of each end, shapes (ends, n, ...)."""
-    if isinstance(kind, Distance):
-        return np.linalg.norm(p[1] - p[0], axis=1)[:, None] - measured
-    if isinstance(kind, RotationAngle):
-        turn = (Rotation.from_matrix(R[0]).inv() * Rotation.from_matrix(R[1])).magnitude()
-        return turn[:, None] - measured
-    if isinstance(kind, SamePoint):
-        return p[1] - p[0]
-    if isinstance(kind, Position):
-        return p[0] - measured
-    if isinstance(kind, TouchedPoint):
-        return p[0] - points
-    if isinstance(kind, PointDistance):
-        return np.linalg.norm(points[:, 3:] - points[:, :3], axis=1)[:, None] - measured
-    assert isinstance(kind, Orientation)
-    turn = Rotation.from_matrix(measured.reshape(-1, 3, 3)).inv() * Rotation.from_matrix(R[0])
-    return turn.as_rotvec()
-
-
-def change(kind, R, p, still, measured, points):
-    """What has the derivatives of `predicted` where the ends are `still`, and no kink there."""
-    if isinstance(kind, Distance):
-        vector = still[1][1] - still[1][0]
-        return np.sum(vector / np.linalg.norm(vector, axis=1)[:, None] * (p[1] - p[0]), axis=1)[:, None]
-    if isinstance(kind, RotationAngle):
-        Q, was = (Rotation.from_matrix(a).inv() * Rotation.from_matrix(b) for a, b in (R, still[0]))
-        axis = was.as_rotvec() / was.magnitude()[:, None]
-        return np.sum(axis * (was.inv() * Q).as_rotvec(), axis=1)[:, None]
-    return predicted(kind, R, p, measured, points)
-
-
-def parts_of(kind):
-    return getattr(kind, "parts", (kind,))
+"""Least private share of a pair's variance; factor on second-order variance where pairs are more than their errors."""
 
 
 class SeriesRows:
@@ -62,8 +26,8 @@ class SeriesRows:
         r: Residuals, shape (n, residual_dim); those of the readings where joint values are estimated.
         J: Their derivatives in all columns, shape (n, residual_dim, n_columns + n_nuisance).
         sources: Derivatives times sigma by the error's name, shape (n, residual_dim, ends, errors), of the rows.
-        own, total: Covariance of what is a measurement's own, and of everything, shape (n, residual_dim, residual_dim).
-        bent: Variance beyond the first order, shape (n, residual_dim).
+        own, total: Covariance of private noise, and of all noise, shape (n, residual_dim, residual_dim).
+        second_order: Variance beyond the first order, shape (n, residual_dim).
     """
 
     def __init__(self, problem, parameters, number):
@@ -83,15 +47,19 @@ class SeriesRows:
         self.J = np.zeros((*self.r.shape, at.n_columns + at.n_nuisance))
         self.J[:, :, : at.n_columns] = J[:, :, : at.n_columns]
         for k in range(s.kind.n_nuisances):
-            np.put_along_axis(self.J, at.columns[s.nuisances[:, k]][:, None, None], J[:, :, at.n_columns + k, None], 2)
+            column = at.columns[s.nuisances[:, k]]
+            there = np.flatnonzero(column >= 0)
+            self.J[there, :, column[there]] = J[there, :, at.n_columns + k]
         self.joint_factor = state.factors.get(JOINT_NOISE, 1.0)
         self.joints = self._sensitivity(lambda k, h: self._arm(self.q + h * np.eye(len(self.q[0]))[k]), len(self.q[0]))
         self.sources = {"joints": self.joints * self.m.sigma_joint * self.joint_factor}
-        if all(isinstance(part, Distance | RotationAngle) for part in s.kind.parts):
+        if is_pairs(s.kind):
             self._pairs()
         else:
-            self.own = self._diagonal((s.sigma * self.factors) ** 2)
-            self.bent = np.zeros(self.r.shape)
+            private = s.covariance
+            self.own = self._diagonal(s.sigma**2) if private is None else private
+            self.own = self.own * np.outer(self.factors, self.factors)
+            self.second_order = np.zeros(self.r.shape)
         if self.errors is not None:
             self.r = self.r - np.einsum("nhew,new->nh", self.joints, self.errors[s.ends])
         self.total = self.own + sum(self._variance(G) for G in self.sources.values())
@@ -130,15 +98,15 @@ class SeriesRows:
         self.joints = self.joints * slope[:, :, None, None]
         self.sources["joints"] = self.sources["joints"] * slope[:, :, None, None]
         first_order = slope**2 * (of_poses + own + of_joints)
-        self.bent = np.maximum(variance - first_order, 0.0)
+        self.second_order = np.maximum(variance - first_order, 0.0)
         left = variance - slope**2 * (of_joints + of_poses)
-        if s.formed:  # half of what is not linear is its poses', a quarter either one's
+        if s.formed:  # half of the second-order variance is its poses', a quarter either one's
             squares = np.zeros((s.n, s.kind.residual_dim, 2, s.kind.residual_dim))
             for i in range(s.kind.residual_dim):
-                squares[:, i, :, i] = np.sqrt(self.bent[:, i, None] / 4.0)
+                squares[:, i, :, i] = np.sqrt(self.second_order[:, i, None] / 4.0)
             poses = poses * slope[:, :, None, None]
             self.sources[f"poses of {s.table}"] = np.concatenate([poses, squares], axis=3)
-            left = left - self.bent / 2.0
+            left = left - self.second_order / 2.0
         self.own = self._diagonal(left)
 
     def _arm(self, q):
@@ -158,16 +126,11 @@ class SeriesRows:
         return R @ Rotation.from_rotvec(h * np.eye(3)[k]).as_matrix(), p
 
     def _ends(self, poses):
-        return [array[self.series.ends.T] for array in poses]
+        return [array[self.series.ends] for array in poses]
 
-    def _rows(self, ends, still=None):
-        rows, column = [], 0
-        for part in self.series.kind.parts:
-            measured = self.series.data[:, column : column + part.width]
-            own = (measured, self.points)
-            rows.append(predicted(part, *ends, *own) if still is None else change(part, *ends, still, *own))
-            column += part.width
-        return np.hstack(rows)
+    def _rows(self, ends):
+        """Predicted minus measured by the kind's own formula in numpy, which has no compiled code."""
+        return self.series.kind.rows(Frames(*ends), self.series.data, self.points).residual
 
     def _sensitivity(self, move, n):
         """Derivative of all rows in moves of each end, shape (n, residual_dim, ends, n)."""
@@ -180,8 +143,8 @@ class SeriesRows:
                     for end in range(self.series.kind.ends):
                         ends = [a.copy() for a in still]
                         for into, source in zip(ends, moved, strict=True):
-                            into[end] = source[end]
-                        out[:, :, end, k] += sign * weight * self._rows(ends, still) / STEP
+                            into[:, end] = source[:, end]
+                        out[:, :, end, k] += sign * weight * self._rows(ends) / STEP
         return out
 
     def _trace_of_joints(self, part):
@@ -207,6 +170,11 @@ class SeriesRows:
         return values[:, :, None] * np.eye(values.shape[1])
 
 
+def is_pairs(kind):
+    """Whether all rows are distances and angles of pairs."""
+    return all(isinstance(part, Distance | RotationAngle) for part in kind.parts)
+
+
 def dense(problem, parameters):
     """[J r] of all train rows in use, what errors of 1 sigma of the joints do to them, and their covariance.
 
@@ -222,31 +190,35 @@ def dense(problem, parameters):
             if G.any():
                 reached[name] = reached.get(name, 0) + np.bincount(ends.ravel(), minlength=n_configurations)
     names = {name: G.shape[3] for rows in every for name, G in rows.sources.items()}
+    sharing = problem.options.pair_errors == "shared"
     A, private, loadings, used = [], [], {name: [] for name in names}, []
     for i, rows in enumerate(every):
         train, residual_dim = rows.series.train, rows.series.kind.residual_dim
         ends = rows.place[rows.series.ends]
         shared = [name for name in rows.sources if name in reached and (reached[name][ends[train]] > 1).any()]
-        if "joints" in rows.sources and problem.state.joint_errors is not None and "joints" not in shared:
+        if problem.state.joint_errors is not None and "joints" not in shared:
             shared.append("joints")
+        shared = [name for name in shared if sharing or (name == "joints" and problem.state.joint_errors is not None)]
         own = rows.own.copy()
-        if shared and all(isinstance(part, Distance | RotationAngle) for part in rows.series.kind.parts):
+        if shared and is_pairs(rows.series.kind):
             of_each = sum(rows.sources[name].shape[3] for name in shared)
             many = len(train) * residual_dim > len(np.unique(rows.series.ends[train])) * of_each
             if rows.series.formed and many and any(name != "joints" for name in shared):
-                own += rows._diagonal(0.5 * (REDUNDANT - 1.0) * rows.bent)
+                own += rows._diagonal(0.5 * (REDUNDANT - 1.0) * rows.second_order)
             diagonal = np.einsum("nii->ni", own)
             least = PRIVATE_SHARE * np.einsum("nii->ni", rows.total)
             own += rows._diagonal(np.maximum(least - diagonal, 0.0))
+        private_alone = [name for name in rows.sources if not sharing and name not in shared]
+        own += sum((rows._variance(rows.sources[name]) for name in private_alone), 0.0)
         weights = problem.state.weights
         if weights is not None:
-            own += (1.0 / weights[i] - 1.0)[:, None, None] * rows.total
+            own += (1.0 / np.maximum(weights[i], 1e-12) - 1.0)[:, None, None] * rows.total
         A.append(np.concatenate([rows.J, rows.r[:, :, None]], axis=2)[train].reshape(len(train) * residual_dim, -1))
         used.append(rows.series.used[train].ravel())
         private.append(own[train])
         for name, width in names.items():
             L = np.zeros((len(train), residual_dim, n_configurations, width))
-            if name in rows.sources:
+            if name in rows.sources and name not in private_alone:
                 for k, measurement in enumerate(train):
                     for end in range(rows.series.kind.ends):
                         L[k, :, ends[measurement, end]] += rows.sources[name][measurement, :, end]
@@ -260,3 +232,28 @@ def dense(problem, parameters):
     L = {name: np.concatenate(each) for name, each in loadings.items()}
     C += sum(G.reshape(len(used), -1) @ G.reshape(len(used), -1).T for G in L.values())
     return np.concatenate(A)[used], L["joints"][used], C[np.ix_(used, used)]
+
+
+def priors(problem, parameters):
+    """[K k] of the priors on the arm and on landmarks, shape (n, n_columns + n_nuisance + 1)."""
+    variables, unknowns = problem.variables, problem.data.unknowns
+
+    def residual(step):
+        x, out = variables.moved(parameters, step), []
+        for v in variables.items:
+            if v.kind == "frame" or not variables.priors:
+                continue
+            values, nominal = x[v.places], variables.nominal()[v.places]
+            off = values - nominal
+            if v.is_pose:  # x, y, z, then the rotation from nominal about the frame's own z, y and x axes
+                was, now = (Rotation.from_euler("ZYX", angles) for angles in (nominal[3:], values[3:]))
+                off[3:] = (was.inv() * now).as_rotvec()[::-1]
+            sigma = [variables.robot.parameters[i].tolerance or np.inf for i in v.parameters]
+            out += list(off / sigma)
+        places = np.split(variables.at(x).coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
+        for place, start, sigma in zip(places, unknowns.starts, unknowns.tolerances, strict=True):
+            out += list((place - start) / sigma) if sigma else []
+        return np.array(out)
+
+    still = np.zeros(variables.n_columns + variables.n_nuisance)
+    return np.column_stack([central_differences(residual, still, 1e-5), residual(still)])

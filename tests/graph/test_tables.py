@@ -1,4 +1,4 @@
-"""Several tables in one job, each with its kind, frame and noise: one optimum, honest sigmas, tables told apart."""
+"""Several tables in one job, each with its kind, frame and noise: shared configurations, frames and landmarks."""
 
 import json
 from dataclasses import replace
@@ -6,16 +6,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-import scipy.optimize
 import yaml
-from instruments import measured_by
+from custom_kinds import lengths_to_anchors
 from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot, write_job
-from sparing import diagonal
-from test_own_kind import measured
 from touches import corners, touch
 
-from fg_calib import Measurements, Robot, read_job
+from fg_calib import Measurements, read_job
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
@@ -24,9 +21,7 @@ from fg_calib.io import write_robot
 from fg_calib.io.columns import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 PLACED = (Rotation.from_rotvec([0.4, -1.1, 2.0]), np.array([3.0, -1.0, 0.5]))
@@ -63,88 +58,6 @@ def mixture(seed, *, n=16, sigma_joint=0.0, shared=True):
     return robot, true, [Table(tracker, "position", frame="unknown"), Table(bar, "distance")]
 
 
-def everything(robot, tables, sigma_joint):
-    """Optimum over arm, frame and joint values of shared configurations, by scipy."""
-    tracker, bar = (t.measurements for t in tables)
-    scale = np.array([p.scale if p.estimated else 0.0 for p in robot.parameters])
-    columns = np.flatnonzero(scale)
-    k = len(columns)
-
-    def residuals(x):
-        values = robot.nominal
-        values[columns] += x[:k] * scale[columns]
-        turn, shift = PLACED[0] * Rotation.from_rotvec(x[k : k + 3]), PLACED[1] + x[k + 3 : k + 6]
-        q = tracker.readings + (sigma_joint * x[k + 6 :].reshape(tracker.readings.shape) if sigma_joint else 0.0)
-        p = pose(robot.with_values(values), q).position
-        lengths = np.linalg.norm(np.diff(p, axis=0), axis=1)
-        rows = [(turn.apply(p) + shift - tracker.position) / SIGMA[0], (lengths - bar.pairs.distance) / 2e-4]
-        return np.concatenate([*(r.ravel() for r in rows), x[:k], x[k + 6 :]])
-
-    start = np.zeros(k + 6 + (tracker.readings.size if sigma_joint else 0))
-    found = scipy.optimize.least_squares(residuals, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
-    values = robot.nominal
-    values[columns] += found.x[:k] * scale[columns]
-    return values, 2.0 * found.cost
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma_joint", [pytest.param(0.0, marks=pytest.mark.slow), 1e-3])
-def test_the_optimum_is_that_over_everything(sigma_joint):
-    """Joint errors of a configuration are the same in both tables."""
-    robot, _, tables = mixture(1, sigma_joint=sigma_joint)
-    options = {"encoder": "estimated"} if sigma_joint else {}
-    solution = solve(build_problem(robot, tables, **options))
-    values, least = everything(robot, tables, sigma_joint)
-    uncertainty = assess(solution)
-    sigma = np.array([p.sigma or 1.0 for p in uncertainty.estimates.parameters])
-    assert solution.converged
-    assert np.abs((solution.parameters[: len(values)] - values) / sigma).max() < 1e-4  # where scipy stops
-    assert uncertainty.fit.chi_square.value == pytest.approx(least, rel=1e-6)
-    assert uncertainty.fit.chi_square.dof == 3 * 16 + 15 - 6
-    propagated = solve(build_problem(robot, tables))
-    apart = np.abs((propagated.parameters[: len(values)] - values) / sigma).max()
-    assert apart < (0.5 if sigma_joint else 1e-4)  # to first order the same
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("without_reasons")
-@pytest.mark.parametrize("shared", [True, False])
-def test_sigmas_are_honest(shared):
-    """60 draws: the mean of NEES over its degrees of freedom, within five of its sigmas."""
-    total, n = 0.0, 60
-    for seed in range(n):
-        robot, true, tables = mixture(200 + seed, sigma_joint=5e-4, shared=shared)
-        uncertainty = assess(solve(build_problem(robot, tables)))
-        names = list(uncertainty.names)
-        off = np.array([uncertainty.robot.nominal[robot.index(x)] - true.nominal[robot.index(x)] for x in names])
-        total += float(off @ np.linalg.solve(uncertainty.covariance, off)) / len(names) / n
-    assert total == pytest.approx(1.0, abs=5 * np.sqrt(2.0 / (n * len(names))))
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("without_reasons")
-def test_sigmas_are_honest_where_a_loss_loses_less_of_lengths_than_of_poses():
-    """Cauchy keeps 92 % of what a clean length says, 64 % of what a pose does; both share the joints' errors."""
-    nees = []
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        robot = small_arm(tolerance=TOLERANCE)
-        true = true_robot(robot, rng)
-        stood = rng.uniform(-np.pi, np.pi, (60, 4))
-        m = measure(true, 60, rng, sigma=SIGMA, frame=PLACED, readings=stood)
-        read = stood + 1e-4 * rng.normal(size=stood.shape)
-        m = replace(m, readings=read, sigma_joint=np.full(4, 1e-4), named=True)
-        bar = replace(m, position=None, rotation=None, pairs=pairs_of(true, stood, rng), source="bar.csv")
-        tables = [Table(m, "pose", frame="unknown"), Table(bar, "distance")]
-        found = assess(solve(build_problem(robot, tables, loss="cauchy")))
-        error = (found.robot.nominal - true.nominal)[[robot.index(name) for name in found.names]]
-        sigma = np.sqrt(np.diag(found.covariance))
-        z = error / sigma
-        nees.append(float(z @ np.linalg.solve(found.covariance / np.outer(sigma, sigma), z)) / 16)
-    # 1.15 where all measurements count as poses; the standard error of the mean is sqrt(2 / 16 / 60) = 0.046.
-    assert np.mean(nees) == pytest.approx(1.0, abs=2.5 * np.sqrt(2 / 16 / 60))
-
-
 def test_each_table_has_its_own_frame():
     rng = np.random.default_rng(5)
     robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
@@ -162,17 +75,11 @@ def test_each_table_has_its_own_frame():
     assert np.all(together <= alone * (1 + 1e-9))
 
 
-@pytest.mark.slow
-def test_order_of_tables_and_one_table_in_parts_change_nothing():
+def test_the_order_of_tables_and_one_table_in_parts_change_nothing():
     rng = np.random.default_rng(6)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 30, rng, sigma=SIGMA, sigma_joint=3e-4)
-    parts = [
-        replace(m, readings=m.readings[rows], ids=m.ids[rows], test=m.test[rows], position=m.position[rows],
-                rotation=m.rotation[rows], sigma_position=m.sigma_position[rows],
-                sigma_orientation=m.sigma_orientation[rows])
-        for rows in (slice(0, 12), slice(12, 30))
-    ]  # fmt: skip
+    parts = [m.select(rows) for rows in (np.arange(12), np.arange(12, 30))]
     whole = assess(solve(build_problem(robot, m, model="pose")))
     for tables in (parts, parts[::-1]):
         found = assess(solve(build_problem(robot, tables, model="pose")))
@@ -220,8 +127,8 @@ def test_a_point_of_one_name_in_two_tables_is_one_point():
     )
 
 
-def test_an_unknown_of_one_name_started_at_two_places_is_refused():
-    robot, _, table = measured(0, n=20)
+def test_a_landmark_of_one_name_started_at_two_places_is_refused():
+    robot, _, table = lengths_to_anchors(0, n=20)
     (own,) = table.own
     again = replace(own, unknowns=own.unknowns + 0.01)
     with pytest.raises(ProblemError, match=r"start \[.*\] of unknown A, expected that of the other A: \["):
@@ -234,30 +141,13 @@ def test_an_unknown_of_one_name_started_at_two_places_is_refused():
         build_problem(robot, replace(table, own=(own, own)))
 
 
-def test_an_unknown_of_one_name_in_another_frame_is_another():
+def test_a_landmark_of_one_name_in_another_frame_is_another():
     """In a table with a frame of its own the tool, and so the anchor, is seen in that frame."""
-    robot, _, table = measured(0, n=20)
+    robot, _, table = lengths_to_anchors(0, n=20)
     rng = np.random.default_rng(0)
     m = measure(robot, 20, rng, sigma=SIGMA, frame=PLACED, readings=table.measurements.readings)
     elsewhere = Table(m, "position", frame="unknown", own=(replace(table.own[0], data=table.own[0].data + 0.1),))
     assert len(build_problem(robot, [table, elsewhere]).data.unknowns.names) == 6
-
-
-@pytest.mark.slow
-def test_noise_is_estimated_table_by_table():
-    rng = np.random.default_rng(7)
-    robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
-    true = true_robot(robot, rng)
-    coarse, fine = (measure(true, 80, rng, sigma=(s, 2e-4)) for s in (2e-3, 2e-4))
-    stated = [replace(m, sigma_position=np.full((80, 3), 1e-3)) for m in (coarse, fine)]
-    tables = [Table(m, "position") for m in stated]
-    found = estimate_noise(build_problem(robot, tables))
-    assert found.converged
-    factors = found.problem.state.factors
-    assert factors[0, "position"] == pytest.approx(2.0, rel=0.2)  # 80 rows of three: 5 % each, four sigma
-    assert factors[1, "position"] == pytest.approx(0.2, rel=0.2)
-    kinds = assess(found).fit.goodness.kinds
-    assert [(kind.table, kind.kind) for kind in kinds] == [(0, "position"), (1, "position")]
 
 
 @pytest.mark.slow
@@ -274,9 +164,6 @@ def test_a_gross_error_in_one_table_is_left_out():
     rows = assess(solution)
     worst = rows.fit.goodness.suspects[0]
     assert (rows.fit.residuals.series[worst], rows.fit.residuals.measurement[worst]) == (1, 3)
-
-
-# --- through files ----------------------------------------------------------------------------------------------------
 
 
 def write_tables(folder, robot, tables, **keys):
@@ -343,7 +230,7 @@ def test_two_tables_that_contradict_each_other_are_refused():
         (("orientation", "position"), None),
     ],
 )
-def test_a_table_that_is_there_twice_is_refused(models, said):
+def test_a_table_given_twice_is_refused(models, said):
     rng = np.random.default_rng(9)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
@@ -371,7 +258,7 @@ def pasted(m, rows):
 
 
 @pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])
-def test_a_block_that_was_pasted_twice_into_a_table_is_told_of(model, caplog):
+def test_a_block_that_was_pasted_twice_into_a_table_is_warned_of(model, caplog):
     rng = np.random.default_rng(9)
     robot = small_arm(tolerance=TOLERANCE)
     m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
@@ -386,7 +273,7 @@ def test_a_block_that_was_pasted_twice_into_a_table_is_told_of(model, caplog):
     assert caplog.records == []
 
 
-def test_pairs_in_both_directions_are_told_of_and_repeats_are_not(caplog):
+def test_pairs_in_both_directions_are_warned_of_and_repeats_are_not(caplog):
     robot, _, (_, table) = mixture(11)
     m, p = table.measurements, table.measurements.pairs
     twice = p.select(np.tile(np.arange(p.n_pairs), 2))
@@ -437,51 +324,6 @@ def test_a_mistake_in_the_list_of_tables_is_named(fg_calib, tmp_path, keys, said
     assert ended.err.count("\n") == 1
 
 
-def test_pairs_formed_of_one_table_are_mixed_with_poses_of_another():
-    """Star pairs share the errors of their poses; the other table none of these."""
-    rng = np.random.default_rng(14)
-    robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
-    true = true_robot(robot, rng)
-    first, second = measure(true, 30, rng, sigma=(1e-3, 2e-4)), measure(true, 20, rng, sigma=(5e-4, 2e-4))
-    alone = [
-        build_problem(robot, first, model="distance-rotation", pairing=Pairing("star")),
-        build_problem(robot, second, model="pose"),
-    ]
-    tables = [Table(first, "distance-rotation", Pairing("star")), Table(second, "pose")]
-    both = build_problem(robot, tables)
-    at = both.start
-    cost = [p.graph.error(p.initial) for p in (*alone, both)]
-    # Priors are zero at nominal, where all of them start.
-    assert cost[2] == pytest.approx(cost[0] + cost[1], rel=1e-12)
-    assert both.n_residuals == alone[0].n_residuals + alone[1].n_residuals
-    assert np.array_equal(at, alone[0].start)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("loss", "encoder"), diagonal(["cauchy", "gnc"], ["propagated", "estimated"]))
-def test_a_loss_weighs_more_pairs_than_positions_that_share_joint_noise(loss, encoder):
-    """Lengths lose less than positions: no measurement may count for more than it is by that."""
-    rng = np.random.default_rng(0)
-    robot = small_arm(tolerance=TOLERANCE)
-    true = true_robot(robot, rng)
-    stood = rng.uniform(-np.pi, np.pi, (20, 4))
-    m = measure(true, 20, rng, sigma=(1e-4, 1e-4), readings=stood)
-    read = stood + 3e-4 * rng.normal(size=stood.shape)
-    m = replace(m, readings=read, sigma_joint=np.full(4, 3e-4), named=True)
-    a, b = np.triu_indices(20, 1)
-    a, b = a[::4], b[::4]
-    p = pose(true, stood).position
-    d = np.linalg.norm(p[a] - p[b], axis=1) + 1e-4 * rng.normal(size=len(a))
-    d[::20] += 0.02
-    nothing = np.full(len(a), np.nan)
-    pairs = Pairs(a, b, d, nothing, np.full(len(a), 1e-4), nothing, np.zeros(len(a), bool), "pairs.csv")
-    tables = [Table(m, "position"), Table(replace(m, position=None, pairs=pairs, source="bar"), "distance")]
-    found = assess(solve(build_problem(robot, tables, loss=loss, encoder=encoder)))
-    z = [(p.estimate - t) / p.sigma for p, t in zip(found.estimates.parameters, true.nominal, strict=True) if p.sigma]
-    assert np.abs(z).max() < 4.5  # of 16 parameters
-    assert not found.verdict.errors
-
-
 @pytest.mark.slow
 def test_a_loss_that_drops_a_whole_table_is_a_finding():
     rng = np.random.default_rng(3)
@@ -493,34 +335,6 @@ def test_a_loss_that_drops_a_whole_table_is_a_finding():
     found = assess(solve(build_problem(robot, [good, bad], model="position", loss="gnc")))
     said = "loss gnc takes 8 of 8 measurements of position of bad.csv for outliers: more than it can tell from noise"
     assert said in found.verdict.errors
-
-
-@pytest.mark.slow
-def test_a_mistake_in_one_table_names_the_table():
-    rng = np.random.default_rng(4)
-    robot = small_arm(tolerance=TOLERANCE)
-    true = true_robot(robot, rng)
-    first, second = (measure(true, 30, rng, sigma=(1e-4, 1e-4)) for _ in range(2))
-    second = replace(second, position=second.position * 1e3, source="second.csv")
-    found = assess(solve(build_problem(robot, [first, second], model="position")))
-    assert found.verdict.setup.table == "second.csv"
-    assert found.verdict.errors[0].startswith("second.csv: position residuals fall from ")
-    assert "if x, y, z are in mm" in found.verdict.errors[0]
-
-
-@pytest.mark.slow
-def test_another_target_on_the_tool_in_one_table_is_named():
-    rng = np.random.default_rng(5)
-    robot = small_arm(
-        tolerance=dict.fromkeys(TOLERANCE, 2e-4) | {"tool": 2e-3}, estimate=("tool.x", "tool.y", "tool.z")
-    )
-    true = true_robot(robot, rng)
-    values = true.nominal
-    values[[true.index(f"tool.{k}") for k in "xyz"]] += [0.06, -0.02, 0.03]
-    first = measure(true, 30, rng, sigma=(1e-4, 1e-4))
-    second = replace(measure(true.with_values(values), 30, rng, sigma=(1e-4, 1e-4)), source="second.csv")
-    found = assess(solve(build_problem(robot, [first, second], model="position")))
-    assert "if tool or base differ from those of the other tables" in found.verdict.errors[0]
 
 
 @pytest.mark.slow
@@ -561,25 +375,6 @@ def test_points_of_another_table_are_named_where_arrays_are_given():
         Measurements.from_arrays(np.zeros((3, 4)), pairs=pairs)
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("instrument", ["anchors", "planes", "board"])
-def test_an_anchor_plane_or_board_of_one_name_in_two_tables_is_one(instrument):
-    """Started by the first table's rows, solved as in one table: to what the rounding of its optimum leaves."""
-    robot, _, table = measured_by(instrument, np.random.default_rng(0), n=60)
-    m = table.measurements
-    parts = [
-        replace(table, measurements=replace(m.select(rows), source=source))
-        for source, rows in (("monday", np.arange(24)), ("tuesday", np.arange(24, 60)))
-    ]
-    whole, mixed = (assess(solve(build_problem(robot, tables))) for tables in (table, parts))
-    rows = [robot.index(name) for name in whole.names]
-    off = (mixed.robot.nominal - whole.robot.nominal)[rows] / np.sqrt(np.diag(whole.covariance))
-    assert np.abs(off).max() < 1e-4
-    named = [[p.name for p in u.estimates.landmarks if not p.name.startswith("offset of")] for u in (mixed, whole)]
-    assert named[0] == named[1]
-    assert mixed.fit.chi_square.value == pytest.approx(whole.fit.chi_square.value, rel=1e-6)
-
-
 @pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("model", ["distance-rotation", "distance", "pose"])
 def test_test_rows_have_no_say_in_the_fit(model, apart):
@@ -593,23 +388,3 @@ def test_test_rows_have_no_say_in_the_fit(model, apart):
     sigma = np.sqrt(np.diag(assess(fitted).spread.tangent))
     step = fitted.problem.variables.step(fitted.parameters, beside.parameters) / sigma
     assert np.abs(step).max() < 1e-6
-
-
-def test_estimated_joint_errors_of_two_tables_are_shared_whatever_is_asked():
-    """Of direct pairs they are all that is shared: counted as independent they end in the same covariance."""
-    rng, rows = np.random.default_rng(0), [[0.4, 0.3, 0.2, 0.0], [0.3, -1.2, 0.1, 0.0], [0.5, 0.7, 0.1, 0.0]]
-    robot = Robot.from_dh(rows, tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
-
-    def chain(source):
-        q, a = rng.uniform(-2.0, 2.0, (30, 3)), np.arange(29)
-        p = pose(robot, q).position
-        distance = np.linalg.norm(p[1:] - p[:-1], axis=1) + 1e-4 * rng.normal(size=29)
-        pairs = {"a": a, "b": a + 1, "distance": distance, "sigma_distance": 1e-4}
-        return Table(Measurements.from_arrays(q, pairs=pairs, sigma_joint=1e-4, source=source), "distance")
-
-    tables = [chain("one"), chain("two")]
-    found = [
-        assess(solve(build_problem(robot, tables, encoder="estimated", pair_errors=asked))).covariance
-        for asked in ("shared", "independent")
-    ]
-    assert found[1] == pytest.approx(found[0], rel=1e-9, abs=1e-20)

@@ -1,14 +1,13 @@
-"""A kind of one's own, in ten lines: distances from the tool to a fixed point that nobody knows."""
+"""A kind of measurement of a user's own: solved and assessed as ours, and what is wrong with it is named."""
 
 from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
-import scipy.optimize
+from custom_kinds import ANCHORS, SIGMA, AnchorDistance, lengths_to_anchors
 from reported import format_report, result_document
-from scipy.stats import chi2
-from simulated import measure, small_arm, true_robot
+from simulated import measure
 
 from fg_calib import Calibration, calibrate
 from fg_calib.assessment import assess
@@ -17,7 +16,6 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import InputError
 from fg_calib.job import Job
-from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.kinds import Kind, Rows
 from fg_calib.measurements.kinds.pair import Distance
 from fg_calib.measurements.table import CustomMeasurements, Table
@@ -25,87 +23,6 @@ from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.options import Options
 from fg_calib.report.compare import format_comparison
 from fg_calib.robot.kinematics import pose
-
-
-class AnchorDistance(Kind):
-    """`|p - anchor| - measured`."""
-
-    names, units = ("anchor",), ("m",)
-    ends, residual_dim, width, n_nuisances = 1, 1, 1, 3
-
-    def rows(self, at, data, nuisances):
-        """See `Kind.rows`."""
-        step = at.position[:, 0] - nuisances
-        length = np.linalg.norm(step, axis=1)
-        D = np.zeros((len(step), 1, 1, 6))
-        D[:, 0, 0, 3:] = u = step / length[:, None]
-        return Rows(length[:, None] - data, D, -u[:, None])
-
-
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
-ANCHORS = np.array([[1.5, -0.8, 0.6], [-1.2, 1.4, 0.3], [0.2, 0.5, -1.8]])
-SIGMA = 2e-4
-
-
-def measured(seed, *, n=60, sigma_joint=0.0, gross=0, n_test=0):
-    rng = np.random.default_rng(seed)
-    robot = small_arm(tolerance=TOLERANCE)
-    true = true_robot(robot, rng)
-    q = rng.uniform(-np.pi, np.pi, (n + n_test, 4))
-    which = np.arange(len(q)) % len(ANCHORS)
-    lengths = np.linalg.norm(pose(true, q).position - ANCHORS[which], axis=1) + SIGMA * rng.normal(size=len(q))
-    lengths[:gross] += 0.05
-    m = Measurements(
-        q + sigma_joint * rng.normal(size=q.shape), np.arange(len(q)).astype(str), np.zeros(len(q), bool),
-        *4 * (None,), np.full(4, sigma_joint), source="lengths",
-    )  # fmt: skip
-    starts = ANCHORS + 0.05 * rng.normal(size=ANCHORS.shape)
-    test = np.arange(len(q)) >= n
-    own = CustomMeasurements(
-        AnchorDistance(), lengths, SIGMA, unknowns=starts, which=which[:, None], names=("A", "B", "C"), test=test
-    )
-    return robot, true, Table(m, model=None, own=(own,))
-
-
-def everything(robot, table, sigma_joint):
-    """Optimum over arm, anchors and (with joint noise) joint values, by scipy."""
-    own, m = table.own[0], table.measurements
-    scale = np.array([p.scale if p.estimated else 0.0 for p in robot.parameters])
-    columns = np.flatnonzero(scale)
-    k = len(columns)
-
-    def residuals(x):
-        values = robot.nominal
-        values[columns] += x[:k] * scale[columns]
-        q = m.readings + (sigma_joint * x[k + 9 :].reshape(m.readings.shape) if sigma_joint else 0.0)
-        anchors = own.unknowns + 0.1 * x[k : k + 9].reshape(3, 3)
-        length = np.linalg.norm(pose(robot.with_values(values), q).position - anchors[own.which[:, 0]], axis=1)
-        return np.concatenate([(length - own.data[:, 0]) / SIGMA, x[:k], x[k + 9 :]])
-
-    start = np.zeros(k + 9 + (m.readings.size if sigma_joint else 0))
-    found = scipy.optimize.least_squares(residuals, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12)
-    values = robot.nominal
-    values[columns] += found.x[:k] * scale[columns]
-    return values, own.unknowns + 0.1 * found.x[k : k + 9].reshape(3, 3), 2.0 * found.cost
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma_joint", [1e-3, 0.0])
-def test_it_is_solved_to_the_optimum_over_everything(sigma_joint):
-    robot, _, table = measured(1, n=24, sigma_joint=sigma_joint)
-    options = {"encoder": "estimated"} if sigma_joint else {}
-    solution = solve(build_problem(robot, table, **options))
-    values, anchors, least = everything(robot, table, sigma_joint)
-    uncertainty = assess(solution)
-    sigma = np.array([p.sigma or 1.0 for p in uncertainty.estimates.parameters])
-    assert solution.converged
-    assert np.abs((solution.parameters[: len(values)] - values) / sigma).max() < 1e-4  # where scipy stops
-    for point, anchor in zip(uncertainty.estimates.landmarks, anchors, strict=True):
-        assert np.abs((point.xyz - anchor) / point.sigma).max() < 1e-4
-    assert uncertainty.fit.chi_square.value == pytest.approx(least, rel=1e-6)
-    assert uncertainty.fit.chi_square.dof == 24 - 9  # as many priors as unknowns of the arm
-    assert [p.name for p in uncertainty.estimates.landmarks] == ["A", "B", "C"]
-    assert [p.n for p in uncertainty.estimates.landmarks] == [8, 8, 8]
 
 
 class Offset(Kind):
@@ -122,7 +39,7 @@ class Offset(Kind):
 
 
 def test_an_unknown_may_have_any_number_of_coordinates(tmp_path):
-    robot, _, table = measured(1, n=40)
+    robot, _, table = lengths_to_anchors(1, n=40)
     q = table.measurements.readings
     heights = pose(robot, q).position[:, 2] + 0.01 + SIGMA * np.random.default_rng(0).normal(size=len(q))
     own = CustomMeasurements(Offset(), heights, SIGMA, unknowns=[[0.0]], names=("offset",))
@@ -133,7 +50,7 @@ def test_an_unknown_may_have_any_number_of_coordinates(tmp_path):
 
 
 def test_test_rows_of_an_unknown_that_nothing_else_says_are_not_judged():
-    robot, _, table = measured(1, n=40)
+    robot, _, table = lengths_to_anchors(1, n=40)
     (own,) = table.own
     m = measure(robot, 40, np.random.default_rng(0), sigma=(1e-4, 1e-4), readings=table.measurements.readings)
     beside = Table(m, "position", own=(replace(own, test=np.ones(40, bool), unknowns=own.unknowns + 0.05),))
@@ -160,23 +77,8 @@ def test_what_was_given_stays_as_it_was_when_the_giver_changes_it():
     assert not own.test.any()
 
 
-@pytest.mark.slow
-def test_sigmas_and_chi_square_are_honest():
-    """40 draws: NEES and chi-square over their degrees of freedom, within five of their sigmas."""
-    nees, fit, dof = 0.0, 0.0, 0
-    for seed in range(40):
-        robot, true, table = measured(100 + seed, sigma_joint=3e-4)
-        uncertainty = assess(solve(build_problem(robot, table)))
-        names = list(uncertainty.names)
-        off = np.array([uncertainty.robot.nominal[robot.index(n)] - true.nominal[robot.index(n)] for n in names])
-        nees += float(off @ np.linalg.solve(uncertainty.covariance, off)) / len(names) / 40
-        fit, dof = fit + uncertainty.fit.chi_square.value, dof + uncertainty.fit.chi_square.dof
-    assert nees == pytest.approx(1.0, abs=5 * np.sqrt(2.0 / (40 * len(names))))
-    assert 1e-6 < chi2.sf(fit, dof) < 1 - 1e-6
-
-
 def test_it_has_residuals_goodness_and_predictions():
-    robot, _, table = measured(3, n_test=30)
+    robot, _, table = lengths_to_anchors(3, n_test=30)
     solution = solve(build_problem(robot, table))
     uncertainty = assess(solution)
     rows, fit = uncertainty.fit.residuals, uncertainty.fit.goodness
@@ -201,7 +103,7 @@ class AnchorTurns(AnchorDistance):
 
 
 def test_its_rows_are_in_its_unit_and_in_no_other(tmp_path):
-    robot, _, table = measured(3)
+    robot, _, table = lengths_to_anchors(3)
     result = calibrate(robot, replace(table, own=(replace(table.own[0], kind=AnchorTurns()),)))
     result.save(tmp_path)
     assert set(pl.read_csv(tmp_path / "residuals.csv")["unit"]) == {"rad"}
@@ -210,94 +112,8 @@ def test_its_rows_are_in_its_unit_and_in_no_other(tmp_path):
         assert f"-> {size:.3g} deg" in repr(calibration)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure", "gnc"])
-def test_robust_losses_leave_gross_errors_out(loss):
-    robot, _, table = measured(4, gross=4)
-    clean = replace(table, own=(replace(table.own[0], test=np.arange(60) < 4),))
-    without = assess(solve(build_problem(robot, clean)))
-    robust = solve(build_problem(robot, table, loss=loss))
-    uncertainty = assess(robust)
-    sigma = np.array([p.sigma or 1.0 for p in without.estimates.parameters])
-    apart = np.abs(
-        [
-            a.estimate - b.estimate
-            for a, b in zip(uncertainty.estimates.parameters, without.estimates.parameters, strict=True)
-        ]
-    )
-    assert robust.converged
-    assert (apart / sigma).max() < (2.0 if loss == "huber" else 1.0)  # least squares is off by tens of sigma
-    assert np.all(robust.problem.state.weights[0][:4] < 0.1)
-    if loss == "gnc":
-        assert (apart / sigma).max() < 0.6  # but for clean ones beyond its 99 %
-        assert {int(i) for i in uncertainty.fit.residuals.measurement[uncertainty.fit.goodness.suspects]} >= {
-            0,
-            1,
-            2,
-            3,
-        }
-
-
-# --- what is wrong is named -------------------------------------------------------------------------------------------
-
-
-class WrongDerivative(AnchorDistance):
-    """Half as long again."""
-
-    def rows(self, at, data, nuisances):
-        """See `Kind.rows`."""
-        found = super().rows(at, data, nuisances)
-        return Rows(found.residual, 1.5 * found.wrenches, found.nuisances)
-
-
-class WrongShape(AnchorDistance):
-    """Without the turns."""
-
-    def rows(self, at, data, nuisances):
-        """See `Kind.rows`."""
-        found = super().rows(at, data, nuisances)
-        return Rows(found.residual, found.wrenches[..., 3:], found.nuisances)
-
-
-@pytest.mark.parametrize(
-    ("kind", "said"),
-    [
-        (
-            WrongDerivative(),
-            r"^lengths: kind WrongDerivative: wrenches: \S+ where a small change gives \S+, expected ",
-        ),
-        (WrongShape(), r"^lengths: kind WrongShape: wrenches: shape \(60, 1, 1, 3\), expected \(60, 1, 1, 6\)$"),
-    ],
-)
-def test_a_kind_that_is_wrong_about_itself_is_refused(kind, said):
-    robot, _, table = measured(5)
-    with pytest.raises(InputError, match=said):
-        build_problem(robot, replace(table, own=(replace(table.own[0], kind=kind),)))
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"data": "far"}, "own: data: found 'far', expected finite numbers"),
-        ({"data": np.full(60, np.nan)}, "own: data: row 0: found nan, expected a finite number$"),
-        ({"data": np.zeros((60, 2))}, r"own: data: shape \(60, 2\), expected \(60, 1\)"),
-        ({"sigma": -1.0}, "own: sigma: found -1, expected a number above 0"),
-        ({"which": np.full((60, 1), 3)}, "own: which: found 3, expected 0 to 2"),
-        ({"ends": np.full((60, 1), -1)}, "own: ends: found -1, expected 0 and above"),
-        ({"names": ("A", "A", "B")}, r"own: names: found \('A', 'A', 'B'\), expected 3 different names"),
-        ({"unknowns": np.zeros((0, 0))}, r"own: unknowns: shape \(0, 0\), expected a start for each unknown; "),
-        ({"test": [True]}, r"own: test: bool of shape \(1,\), expected True or False for each of 60"),
-        ({"kind": AnchorDistance}, "own: kind: found <class .*>, expected an object of a class derived from Kind"),
-    ],
-)
-def test_a_mistake_in_what_was_measured_is_named(change, said):
-    _, _, table = measured(5)
-    with pytest.raises(InputError, match=f"^{said}"):
-        replace(table.own[0], **change)
-
-
 def test_configurations_out_of_range_are_named():
-    robot, _, table = measured(5)
+    robot, _, table = lengths_to_anchors(5)
     own = replace(table.own[0], ends=np.full((60, 1), 60))
     with pytest.raises(InputError, match=r"^own: ends: found 60, expected one a measurement, 0 to 59$"):
         build_problem(robot, replace(table, own=(own,)))
@@ -313,7 +129,7 @@ def test_configurations_out_of_range_are_named():
 
 def test_an_anchor_that_too_few_lengths_see_is_unknown_and_harms_nothing():
     """Two lengths to the third anchor: one direction of it stays where it was started, without a sigma."""
-    robot, _, table = measured(6)
+    robot, _, table = lengths_to_anchors(6)
     own = table.own[0]
     keep = np.flatnonzero((own.which[:, 0] != 2) | (np.arange(60) < 6))
     ends = np.arange(60)[keep, None]
@@ -327,7 +143,7 @@ def test_an_anchor_that_too_few_lengths_see_is_unknown_and_harms_nothing():
 
 
 def test_reasons_beside_a_kind_of_ones_own_do_not_say_what_it_cannot_see():
-    robot, _, table = measured(0, n=60)
+    robot, _, table = lengths_to_anchors(0, n=60)
     found = assess(solve(build_problem(robot, table))).identifiability
     reasons = {name: lost.reason for lost in found.lost for name in lost.relation}
     assert "blind to the base" in reasons["d1"]  # the anchors move with it
@@ -335,7 +151,7 @@ def test_reasons_beside_a_kind_of_ones_own_do_not_say_what_it_cannot_see():
 
 
 def of_kind(kind, **changes):
-    robot, _, table = measured(5, n=12)
+    robot, _, table = lengths_to_anchors(5, n=12)
     return build_problem(robot, replace(table, own=(replace(table.own[0], kind=kind, **changes),)))
 
 
@@ -436,6 +252,27 @@ def test_want_of_memory_is_no_fault_of_a_kind():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"data": "far"}, "own: data: found 'far', expected finite numbers"),
+        ({"data": np.full(60, np.nan)}, "own: data: row 0: found nan, expected a finite number$"),
+        ({"data": np.zeros((60, 2))}, r"own: data: shape \(60, 2\), expected \(60, 1\)"),
+        ({"sigma": -1.0}, "own: sigma: found -1, expected a number above 0"),
+        ({"which": np.full((60, 1), 3)}, "own: which: found 3, expected 0 to 2"),
+        ({"ends": np.full((60, 1), -1)}, "own: ends: found -1, expected 0 and above"),
+        ({"names": ("A", "A", "B")}, r"own: names: found \('A', 'A', 'B'\), expected 3 different names"),
+        ({"unknowns": np.zeros((0, 0))}, r"own: unknowns: shape \(0, 0\), expected a start for each unknown; "),
+        ({"test": [True]}, r"own: test: bool of shape \(1,\), expected True or False for each of 60"),
+        ({"kind": AnchorDistance}, "own: kind: found <class .*>, expected an object of a class derived from Kind"),
+    ],
+)
+def test_a_mistake_in_what_was_measured_is_named(change, said):
+    _, _, table = lengths_to_anchors(5)
+    with pytest.raises(InputError, match=f"^{said}"):
+        replace(table.own[0], **change)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
         ({"data": ["1.0"] * 60}, "own: data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite "
          "numbers"),
         ({"sigma": "1e-3"}, "own: sigma: found '1e-3', expected finite numbers"),
@@ -453,13 +290,13 @@ def test_want_of_memory_is_no_fault_of_a_kind():
 )  # fmt: skip
 def test_text_and_other_things_are_no_figures(change, said):
     with pytest.raises(InputError) as found:
-        replace(measured(5)[2].own[0], **change)
+        replace(lengths_to_anchors(5)[2].own[0], **change)
     assert str(found.value) == said
 
 
 @pytest.mark.slow
 def test_plain_least_squares_takes_it_too():
-    robot, true, table = measured(5, n_test=10)
+    robot, true, table = lengths_to_anchors(5, n_test=10)
     found = compare(Job(None, robot, (table,), Options(), true))
     _, keep, _, weighted = found.estimates
     assert weighted.converged

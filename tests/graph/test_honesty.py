@@ -1,0 +1,78 @@
+"""Errors are as large as sigmas say: NEES and chi-square over many draws."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from instruments import measured_by
+from scipy.spatial.transform import Rotation
+from simulated import measure, small_arm, true_robot
+from touches import TOLERANCE as TOUCH_TOLERANCE
+from touches import TOOL_POINT, corners, touch
+
+from fg_calib.assessment import assess
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.solver import solve
+from fg_calib.options import Pairing
+
+TOLERANCE = dict.fromkeys(("a", "d", "alpha", "theta"), 2e-3)
+
+
+def poses(rng, *, joint=3e-4, n=20, wrong=0):
+    robot = small_arm(TOLERANCE)
+    true = true_robot(robot, rng)
+    m = measure(true, n, rng, sigma=(1e-3, 5e-4), sigma_joint=joint)
+    off = np.zeros((n, 3))
+    off[1 : wrong + 1] = 0.05
+    return robot, true, replace(m, position=m.position + off)
+
+
+def small_motions(rng):
+    """Poses near each other, whose noise is another one along each axis: lengths and angles are nonlinear in it."""
+    robot, sigma = small_arm(TOLERANCE), np.array([6e-4, 3e-3, 1.2e-3])
+    true = true_robot(robot, rng)
+    q = rng.uniform(-1.0, 1.0, (1, 4)) + rng.uniform(-0.1, 0.1, (30, 4))
+    m = measure(true, 30, rng, sigma=(0.0, 0.0), readings=q)
+    noise = Rotation.from_rotvec(sigma * rng.normal(size=(30, 3))).as_matrix()
+    sigmas = {"sigma_position": np.tile(sigma, (30, 1)), "sigma_orientation": np.tile(sigma, (30, 1))}
+    position = m.position + sigma * rng.normal(size=(30, 3))
+    return robot, true, replace(m, position=position, rotation=m.rotation @ noise, **sigmas)
+
+
+def touches(rng):
+    robot = small_arm(TOUCH_TOLERANCE, TOOL_POINT)
+    true = true_robot(robot, rng)
+    m = touch(true, corners(true, 3, rng), 6, rng, distances=((0, 1, 1e-4),))
+    noise = 3e-4 * rng.normal(size=m.readings.shape)
+    return robot, true, replace(m, readings=m.readings + noise, sigma_joint=np.full(4, 3e-4))
+
+
+PAIRS = {"model": "distance-rotation"}
+CASES = {
+    "poses, joint values": (poses, {"joint": 2e-3}, {"model": "pose", "encoder": "estimated"}),
+    "star": (poses, {}, PAIRS),
+    "all pairs": (poses, {}, PAIRS | {"pairing": Pairing("all")}),
+    "all pairs of small motions": (small_motions, {}, PAIRS | {"pairing": Pairing("all")}),
+    "touches": (touches, {}, {"model": "distance"}),
+    "gnc with outliers": (poses, {"n": 40, "wrong": 4, "joint": 0.0}, {"model": "pose", "loss": "gnc"}),
+    **{name: (lambda rng, name=name: measured_by(name, rng, sigma_joint=5e-4), {}, {})
+       for name in ("targets", "anchors", "planes", "board")},
+}  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_reasons")
+@pytest.mark.parametrize("name", CASES)
+def test_errors_and_residuals_are_as_large_as_said(name):
+    """The mean of 20 draws, each within four of its own sigmas."""
+    make, how, options = CASES[name]
+    nees, value, expected = [], 0.0, 0.0
+    for seed in range(20):
+        robot, true, measurements = make(np.random.default_rng(100 + seed), **how)
+        found = assess(solve(build_problem(robot, measurements, **options)))
+        rows = [robot.index(parameter) for parameter in found.names]
+        error = (found.robot.nominal - true.nominal)[rows]
+        nees.append(error @ np.linalg.solve(found.covariance, error) / len(error))
+        value, expected = value + found.fit.chi_square.value, expected + found.fit.chi_square.expected
+    assert np.mean(nees) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / len(error) / len(nees)))
+    assert value / expected == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / expected) + 0.05)
