@@ -74,13 +74,13 @@ def months_of(kind, seed, *, n=60, n_new=40, slip=None, **changes):
         slip: What changes in between, by parameter.
         changes: Of the scenario.
     """
-    first = simulate(scenario(OF_INSTRUMENTS[kind], n=n, **changes), seed=seed, leave_out=True)
+    first = simulate(scenario(OF_INSTRUMENTS[kind], n=n, **changes), seed=seed)
     robot, true = first.robot, first.true_robot
     off = {p.name: x for p, x in zip(robot.parameters, true.nominal - robot.nominal, strict=True) if x}
     for name, size in (slip or {}).items():
         off[name] = off.get(name, 0.0) + size
     later = scenario(OF_INSTRUMENTS[kind], n=n_new, **changes | {"errors": Errors("values", off)})
-    after = simulate(later, seed=10_000 + seed, leave_out=True)  # what cannot be touched by chance
+    after = simulate(later, seed=10_000 + seed)  # what cannot be touched by chance
     return robot, true, first.tables, tuple(map(_of_another_month, after.tables))
 
 

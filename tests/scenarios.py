@@ -8,47 +8,42 @@ from fg_calib import Pairing
 from fg_calib.measurements import Camera
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.scenario import (
-    BoardCamera,
-    Corners,
     Errors,
-    Indicator,
-    LengthGauge,
-    PairGauge,
+    Instrument,
     Placement,
     RandomReadings,
     Scenario,
-    Sockets,
     Spot,
-    Tracker,
+    board_corners,
 )
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA = Noise(1e-4, 2e-4, 0.0, distance=1e-4, angle=2e-4, point=1e-4, pixel=0.1)
 EXACT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
 CAMERA = Camera(fx=900, fy=905, cx=640, cy=480, k1=-0.1, k2=0.05)
-GRID = Corners(5, 4, 0.1)
+GRID = board_corners(5, 4, 0.1)
 WALL = {"wall": Placement(Rotation.from_euler("y", -0.5 * np.pi).as_matrix(), np.array([2.5, 0.0, 0.0]))}
 """Across x, its front towards the arm."""
 
 
 INSTRUMENTS = {
-    "pose": Tracker(model="pose", name="it"),
-    "orientations": Tracker(model="orientation", name="it", stations=2),
-    "targets": Tracker(model="position", name="it", targets=3),
-    "stations": Tracker(model="position", name="it", targets={"a": Spot([0.1, 0, 0]), "b": Spot([0, 0.2, 0.1])},
+    "pose": Instrument(model="pose", name="it"),
+    "orientations": Instrument(model="orientation", name="it", stations=2),
+    "targets": Instrument(model="position", name="it", targets=3),
+    "stations": Instrument(model="position", name="it", targets={"a": Spot([0.1, 0, 0]), "b": Spot([0, 0.2, 0.1])},
                         stations=2),
-    "formed pairs": Tracker(model="distance-rotation", name="it", pairing=Pairing("chain")),
-    "pairs": PairGauge(model="distance-rotation", name="it", pairs=Pairing("random", 80)),
-    "anchors": LengthGauge(name="it"),
-    "offset": LengthGauge(name="it", anchors={"bolt": Spot([1.0, -2.0, 0.5], 0.0), "pin": Spot([2.0, 1.0, 0.5])},
-                          offset=0.12),
-    "contact": LengthGauge(name="it", anchors=3, contact=True),
-    "planes": Indicator(name="it", planes=4),
-    "faces": Indicator(name="it", contact=True),
-    "board": BoardCamera(model="board", name="it", boards=WALL),
-    "pixels": BoardCamera(model="pixels", name="it", boards=WALL, camera=CAMERA, corners=GRID),
-    "camera in the room": BoardCamera(model="pixels", name="it", camera=CAMERA, corners=GRID, fixed=True),
-    "sockets": Sockets(name="it", sockets=3),
+    "formed pairs": Instrument(model="distance-rotation", name="it", pairing=Pairing("chain")),
+    "pairs": Instrument(model="distance-rotation", name="it", pairs=Pairing("random", 80)),
+    "anchors": Instrument(model="anchor", name="it"),
+    "offset": Instrument(model="anchor", name="it", offset=0.12,
+                         anchors={"bolt": Spot([1.0, -2.0, 0.5], 0.0), "pin": Spot([2.0, 1.0, 0.5])}),
+    "contact": Instrument(model="anchor", name="it", anchors=3, contact=True),
+    "planes": Instrument(model="plane", name="it", planes=4),
+    "faces": Instrument(model="plane", name="it", contact=True),
+    "board": Instrument(model="board", name="it", boards=WALL),
+    "pixels": Instrument(model="pixels", name="it", boards=WALL, camera=CAMERA, corners=GRID),
+    "camera in the room": Instrument(model="pixels", name="it", camera=CAMERA, corners=GRID, fixed=True),
+    "sockets": Instrument(model="distance", name="it", sockets=3),
 }  # fmt: skip
 
 

@@ -20,25 +20,19 @@ from numpy.typing import NDArray
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
 from fg_calib.inputs import Brief, Floats, InputError, Integers
-from fg_calib.measurements import KnownPoint, Landmarks, Noise, Table
+from fg_calib.measurements import Landmarks, Table
 from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot import Robot
 from fg_calib.simulation import (
-    NOISE_KINDS,
-    BoardCamera,
     BoardViews,
     Candidates,
     Configurations,
     Errors,
     GivenReadings,
     Instrument,
-    PairGauge,
     Placement,
     Scenario,
-    Simulation,
-    Tracker,
     draw_candidates,
-    override_noise,
     simulate,
 )
 
@@ -291,9 +285,9 @@ def build_pool(
         found=found,
         before=before,
         formed={
-            k: (i.model, i.pairing)
+            k: (i.model, i.pairing or Pairing())
             for k, i in enumerate(scenario.instruments)
-            if isinstance(i, Tracker) and i.model in PAIR_MODELS
+            if i.model in PAIR_MODELS and i.sockets is None
         },
     )
 
@@ -310,7 +304,7 @@ def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Flo
             reason = "where every instrument has configurations of its own"
             raise InputError("given", reason, "a job with what was measured")
         readings[""] = np.vstack([given, readings[""]])
-    return _with_true_points(simulate(_without_noise(scenario, readings), leave_out=True))
+    return simulate(_nominal(scenario, readings), exact=True).tables
 
 
 def _find_references(problem: Problem) -> Integers:
@@ -330,13 +324,14 @@ def _with_instruments(scenario: Scenario) -> Scenario:
         InputError: An instrument measures pairs directly.
     """
     for instrument in scenario.instruments:
-        if isinstance(instrument, PairGauge):
+        if instrument.pairs is not None:
             expected = "model: pose with frame: unknown to choose the configurations of pairs"
             raise InputError(f"instruments: {instrument.name}", "pairs that are measured directly", expected)
     if scenario.instruments:
         return scenario
     model = scenario.job.get("model", "distance-rotation")
-    return replace(scenario, instruments=(Tracker(model=model, name="poses", pairing=scenario.pairing),))
+    pairing = scenario.pairing if model in PAIR_MODELS else None
+    return replace(scenario, instruments=(Instrument(model=model, name="poses", pairing=pairing),))
 
 
 def _split_name(name: str) -> tuple[str, int]:
@@ -346,42 +341,22 @@ def _split_name(name: str) -> tuple[str, int]:
     return found[1] or "", int(found[2])
 
 
-def _without_noise(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
-    """A scenario of the nominal arm at some readings, without noise; specified noise stays."""
-    stated = scenario.stated_noise or scenario.noise
+def _nominal(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
+    """A scenario of the nominal arm at some readings."""
     instruments: list[Instrument] = []
     for i in scenario.instruments:
-        views = i.configurations or scenario.configurations
-        specified = override_noise(override_noise(stated, i.noise), i.stated_noise)
-        changes: dict[str, Any] = {"noise": _zeros(specified), "stated_noise": specified}
+        views, changes = i.configurations or scenario.configurations, dict[str, Any]()
         if i.configurations is not None:
             changes["configurations"] = GivenReadings(readings[i.name])
-        if isinstance(i, Tracker) and i.model in PAIR_MODELS and i.pairing.strategy != "star":
-            changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3))}
-        elif isinstance(i, BoardCamera) and not (i.boards or i.fixed) and isinstance(views, BoardViews):
+        if i.pairing is not None and i.pairing.strategy != "star":
+            changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3)), "pairing": None}
+        elif i.model in ("board", "pixels") and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))
     return replace(
         scenario,
         errors=Errors("values", {}),
-        noise=_zeros(stated),
-        stated_noise=stated,
         validation=None,
         configurations=GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))),
         instruments=tuple(instruments),
-    )
-
-
-def _zeros(noise: Noise) -> Noise:
-    """Zero noise of the kinds that are specified."""
-    nothing: dict[str, Any] = {kind: 0.0 for kind in NOISE_KINDS if noise.get(kind) is not None}
-    return noise.updated(joint=0.0, **nothing)
-
-
-def _with_true_points(simulation: Simulation) -> tuple[Table, ...]:
-    """The tables with known points where they truly are."""
-    places = {name: spot for kind in ("targets", "anchors") for name, spot in simulation.truth.get(kind, {}).items()}
-    return tuple(
-        replace(t, known={name: KnownPoint(places[name].xyz, known.tolerance) for name, known in t.known.items()})
-        for t in simulation.tables
     )

@@ -24,22 +24,16 @@ from fg_calib.measurements import Noise, Table
 from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot import pose
 from fg_calib.simulation import (
-    BoardCamera,
-    BoardPoints,
     BoardViews,
     Candidates,
     Configurations,
     Errors,
-    Indicator,
     Instrument,
-    LengthGauge,
     Placement,
     Plane,
     RandomReadings,
     Scenario,
-    Sockets,
     Spot,
-    Tracker,
 )
 
 MIN_CONE_RAD = np.deg2rad(60.0)
@@ -176,17 +170,17 @@ class _Reader:
         contact = m.length is None or not np.nan_to_num(m.length).any()
         if model in POSE_MODELS:
             frame: Placement | str = self.frame() if table.unknown_frame else "base"
-            return Tracker(**given, targets=self.points("P", "target"), frame=frame)
+            return Instrument(**given, targets=self.points("P", "target") or None, frame=frame)
         if model in PAIR_MODELS:
             if m.groups is not None:
                 sockets = {name: Spot(self.place("L", name)) for name in m.groups.names}
-                return Sockets(**given | {"model": "distance"}, sockets=sockets)
-            return Tracker(**given, pairing=table.pairing)
+                return Instrument(**given | {"model": "distance"}, sockets=sockets)
+            return Instrument(**given, pairing=table.pairing)
         if model == "anchor":
             offset = float(self.place("O", f"offset of {m.source}")[0]) if table.offset else None
-            return LengthGauge(**given, anchors=self.points("A", "anchor"), offset=offset, contact=contact)
+            return Instrument(**given, anchors=self.points("A", "anchor"), offset=offset, contact=contact)
         if model == "plane":
-            return Indicator(**given, planes={n: self.plane(n) for n in m.labels["plane"].names}, contact=contact)
+            return Instrument(**given, planes={n: self.plane(n) for n in m.labels["plane"].names}, contact=contact)
         return self.camera(given)
 
     def noise(self) -> Noise:
@@ -245,9 +239,9 @@ class _Reader:
         table, m = self.table, self.table.measurements
         if table.model == "pixels":
             assert m.image is not None
-            given |= {"camera": table.camera, "corners": BoardPoints(np.unique(m.image[:, 2:], axis=0))}
+            given |= {"camera": table.camera, "corners": np.unique(m.image[:, 2:], axis=0)}
         if table.fixed_camera:
-            return BoardCamera(**given, fixed=True, frame=self.frame())
+            return Instrument(**given, fixed=True, frame=self.frame())
         boards, from_behind = dict[str, Placement](), list[str]()
         robot = self.problem.robot.with_values(self.problem.start[self.problem.variables.robot_span])
         tool = pose(robot, m.readings).position
@@ -260,7 +254,7 @@ class _Reader:
         if self.configurations is None:
             name = next(iter(boards))
             given["configurations"] = self.views(boards[name], tool, flip=name in from_behind)
-        return BoardCamera(**given, boards=boards, from_behind=tuple(from_behind))
+        return Instrument(**given, boards=boards, from_behind=tuple(from_behind))
 
     def views(self, board: Placement, tool: Floats, *, flip: bool) -> BoardViews:
         """Views of a board from as far and as near as it was seen from, and a little more oblique."""

@@ -13,6 +13,7 @@ from .atomic import (
 )
 from .columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of, require_own_csv, write_csv
 from .job import (
+    NOISE_UNITS,
     UNSTATED,
     camera_in,
     check_choices,
@@ -61,6 +62,7 @@ __all__ = [
     "ANGLES",
     "KNOWN",
     "LENGTHS",
+    "NOISE_UNITS",
     "OF_CONFIGURATIONS",
     "OF_PAIRS",
     "RESULT_FILES",

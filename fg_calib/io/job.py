@@ -54,12 +54,12 @@ _log = logging.getLogger(__name__)
 UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
 """Where the noise starts from if it is to be estimated and nothing was stated."""
 
-_UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
-_UNITS |= {name: column.si for name, column in GENERIC_COLUMNS.items()}
+NOISE_UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
+NOISE_UNITS |= {name: column.si for name, column in GENERIC_COLUMNS.items()}
 """Units of the kinds of noise; that of joints is in the joint's unit."""
 
 
-_SIGMAS: dict[str, Any] = dict.fromkeys(_UNITS, (Positive | None, None))
+_SIGMAS: dict[str, Any] = dict.fromkeys(NOISE_UNITS, (Positive | None, None))
 _Noise = create_model("_Noise", __base__=Schema, joint=(Any, 0.0), estimate=(StrictBool, False), **_SIGMAS)
 
 
@@ -438,7 +438,7 @@ def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise
     file: Any = validate(_Noise, given or {}, place)
     stated: dict[str, Any] = {
         key: units.sigma(sigma, unit, f"{place}: {key}") if unit in ("m", "rad") else sigma
-        for key, unit in _UNITS.items()
+        for key, unit in NOISE_UNITS.items()
         if (sigma := getattr(file, key)) is not None
     }
     noise = Noise(joint=joint_noise(file.joint, units, robot, place)).updated(**stated)

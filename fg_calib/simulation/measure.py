@@ -18,8 +18,8 @@ Every draw has a generator of its own, by the seed and the name of what is drawn
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import astuple, dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,23 +39,17 @@ from fg_calib.measurements import (
     no_pairs,
 )
 from fg_calib.measurements.kinds import Camera
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge
+from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Pairing
 from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import (
-    BoardCamera,
     BoardViews,
-    Configurations,
-    Indicator,
     Instrument,
-    LengthGauge,
-    PairGauge,
     Placement,
-    PlainInstrument,
     Plane,
-    Sockets,
+    Scenario,
     Spot,
-    Tracker,
     frame_knowledge,
+    override_noise,
 )
 
 MAX_BASE_M = 5.0
@@ -70,8 +64,22 @@ def generator_of(seed: int, *names: str) -> np.random.Generator:
     return np.random.default_rng([seed, *"\n".join(names).encode()])
 
 
-@dataclass(frozen=True)
-class Visits:
+def choose_frame(frame: Placement | str, generator: np.random.Generator) -> Placement:
+    """The frame that is given, the base itself, or one of any rotation that is drawn within `MAX_BASE_M`."""
+    if isinstance(frame, Placement):
+        return frame
+    if frame == "base":
+        return Placement(np.eye(3), np.zeros(3))
+    rotation = Rotation.from_quat(generator.normal(size=4)).as_matrix()  # any rotation as likely as any other
+    return Placement(rotation, generator.uniform(-MAX_BASE_M, MAX_BASE_M, 3))
+
+
+def joint_sigma(noise: Noise, robot: Robot) -> Floats:
+    """Sigma of the readings, shape (n_joints,), [rad] (prismatic: [m])."""
+    return np.broadcast_to(np.asarray(noise.joint, dtype=np.float64), robot.n_joints).copy()
+
+
+class Visits(NamedTuple):
     """Configurations that the arm was sent to.
 
     Attributes:
@@ -86,106 +94,83 @@ class Visits:
     ids: NDArray[np.str_]
     test: Booleans
 
-    def __len__(self) -> int:
-        return len(self.test)
-
     def select(self, rows: Integers | Booleans) -> Visits:
         """Some of them."""
-        return Visits(*(getattr(self, f.name)[rows] for f in fields(Visits)))
+        values: list[Any] = [values[rows] for values in self]
+        return Visits(*values)
 
     @staticmethod
     def joined(parts: Sequence[Visits]) -> Visits:
         """Visits one after the other."""
-        return Visits(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Visits)))
+        values: list[Any] = [np.concatenate(values) for values in zip(*parts, strict=True)]
+        return Visits(*values)
 
 
-@dataclass(frozen=True)
-class Scene:
-    """What an instrument measures, and how well.
+@dataclass
+class Measuring:
+    """One instrument at work.
 
     Attributes:
-        robot: The nominal robot.
-        true_robot: The true one.
+        scenario: What is simulated.
+        instrument: The instrument.
+        true_robot: The robot that moves.
         visits: Where it was sent.
-        configurations: What these came from.
-        noise: True noise.
-        stated_noise: Noise that the calibration is given.
-        sigma_joint: Noise of the readings that the calibration is given, shape (n_joints,), [rad] (prismatic: [m]).
         frame: world_T_base.
-        known_frame: Whether the calibration knows that it is the base.
         seed: Seed of all draws.
-        source: The scenario, for messages.
-        leave_out: Whether configurations are left out from which a point to touch is not reached.
+        exact: Whether measurements and known points have no errors.
     """
 
-    robot: Robot
+    scenario: Scenario
+    instrument: Instrument
     true_robot: Robot
     visits: Visits
-    configurations: Configurations
-    noise: Noise
-    stated_noise: Noise
-    sigma_joint: Floats
     frame: Placement
-    known_frame: bool
     seed: int
-    source: str = "scenario"
-    leave_out: bool = False
+    exact: bool
 
+    def __post_init__(self) -> None:
+        self.name, self.model, self.n = self.instrument.name, self.instrument.model, len(self.visits.ids)
+        self.place = f"{self.scenario.source}: instruments: {self.name}"
+        self.places = self.generator("places")
+        self.noises = override_noise(self.scenario.noise, self.instrument.noise)
+        self.sigmas = override_noise(self.noises, self.scenario.stated_noise)
 
-def measure(instrument: Instrument, scene: Scene) -> tuple[Table, Truth]:
-    """Measure with an instrument: its table, and where landmarks truly are.
+    def measure(self) -> tuple[Table, Truth]:
+        """Measure: a table, and where landmarks truly are.
 
-    Raises:
-        InputError: A value of the noise is missing, nothing is seen, or a point is not reached.
-    """
-    work = _Work(instrument, scene)
-    methods: dict[type, Any] = {
-        Tracker: work.poses,
-        PairGauge: work.pairs,
-        LengthGauge: work.lengths,
-        Indicator: work.distances,
-        Sockets: work.contacts,
-        BoardCamera: work.boards if instrument.model == "board" else work.pixels,
-        PlainInstrument: work.plain,
-    }
-    if type(instrument) not in methods:
-        raise InputError("instruments", f"found a {type(instrument).__name__}", "an instrument of fg_calib")
-    found: tuple[Table, Truth] = methods[type(instrument)](instrument)
-    return found
-
-
-def draw_frame(generator: np.random.Generator) -> Placement:
-    """Draw a frame within `MAX_BASE_M`, of any rotation."""
-    rotation = Rotation.from_quat(generator.normal(size=4)).as_matrix()  # any rotation as likely as any other
-    return Placement(rotation, generator.uniform(-MAX_BASE_M, MAX_BASE_M, 3))
-
-
-class _Work:
-    """One instrument at work."""
-
-    def __init__(self, instrument: Instrument, scene: Scene) -> None:
-        self.name, self.model, self.scene, self.visits = instrument.name, instrument.model, scene, scene.visits
-        self.place = f"{scene.source}: instruments: {self.name}"
-        self.places = generator_of(scene.seed, self.name, "places")
+        Raises:
+            InputError: A value of the noise is missing, nothing is seen, or no point is reached.
+        """
+        if self.instrument.sockets is not None:
+            return self.contacts()
+        if self.instrument.pairs is not None:
+            return self.pairs()
+        methods = dict.fromkeys((*POSE_MODELS, *PAIR_MODELS), self.poses)
+        methods |= {"anchor": self.lengths, "plane": self.distances, "board": self.boards, "pixels": self.pixels}
+        return methods.get(self.model, self.plain)()
 
     # --- for all instruments ---
 
+    def generator(self, *names: str) -> np.random.Generator:
+        """The generator of something of this instrument."""
+        return generator_of(self.seed, self.name, *names)
+
     def at(self) -> Poses:
         """True poses of the tool."""
-        return pose(self.scene.true_robot, self.visits.true_readings)
+        return pose(self.true_robot, self.visits.true_readings)
 
     def noise(self, kind: str, *shape: int) -> Floats:
         """Noise of a kind: standard normal numbers times sigma, so that another sigma scales the same noise."""
-        sigma = self._value(self.scene.noise, kind)
-        return sigma * generator_of(self.scene.seed, self.name, "noise", kind).normal(size=shape)
+        sigma = 0.0 if self.exact else self._value(self.noises, kind)
+        return sigma * self.generator("noise", kind).normal(size=shape)
 
-    def stated(self, kind: str, *shape: int) -> Floats:
+    def sigma(self, kind: str, *shape: int) -> Floats:
         """The sigma of a kind that the calibration is given.
 
         Raises:
             InputError: It is 0.
         """
-        sigma = self._value(self.scene.stated_noise, kind)
+        sigma = self._value(self.sigmas, kind)
         if sigma == 0.0:
             hint = f"a calibration takes nothing for exact: specify what to assume under job: noise: {kind}"
             raise InputError(f"{self.place}: noise: {kind}", "found 0", "a number above 0", hint)
@@ -205,7 +190,7 @@ class _Work:
             readings=visits.readings,
             ids=visits.ids,
             test=visits.test,
-            sigma_joint=self.scene.sigma_joint,
+            sigma_joint=joint_sigma(self.scenario.stated_noise or self.scenario.noise, self.scenario.robot),
             source=f"{self.name}.csv",
             named=True,
             **nothing | measured,
@@ -213,14 +198,13 @@ class _Work:
 
     def nominal(self) -> Poses:
         """Nominal poses of the tool at the train configurations."""
-        return pose(self.scene.robot, self.visits.readings[~self.visits.test])
+        return pose(self.scenario.robot, self.visits.readings[~self.visits.test])
 
     def workspace(self) -> tuple[Floats, float]:
         """Middle and radius of the nominal tool points, [m]."""
         points = self.nominal().position
         middle = points.mean(axis=0)
-        radius = float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1))))
-        return middle, max(radius, 1e-3)
+        return middle, max(float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))), 1e-3)
 
     def directions(self, n: int) -> Floats:
         """Unit vectors in any direction, shape (n, 3)."""
@@ -239,7 +223,7 @@ class _Work:
             return given
         if within_reach:  # half of the train configurations: those from which the arm moves best
             at = self.nominal()
-            slowest = np.linalg.svd(at.jacobian[:, 3:, -self.scene.robot.n_joints :], compute_uv=False)[:, -1]
+            slowest = np.linalg.svd(at.jacobian[:, 3:, -self.scenario.robot.n_joints :], compute_uv=False)[:, -1]
             inside = at.position[slowest >= np.median(slowest)]
             places = inside[self.places.choice(len(inside), given, replace=given > len(inside))]
         else:
@@ -252,54 +236,43 @@ class _Work:
         found = {}
         for name, spot in spots.items():
             if spot.tolerance is not None:
-                off = spot.tolerance * generator_of(self.scene.seed, "known", name).normal(size=3)
+                off = (0.0 if self.exact else spot.tolerance) * generator_of(self.seed, "known", name).normal(size=3)
                 found[name] = KnownPoint(spot.xyz + off, spot.tolerance or None)
         return found
 
     def touch(self, points: Floats, n_starts: int = N_STARTS) -> Booleans:
         """Move the arm from each configuration until the tool point is at a point; which are reached, shape (n,).
 
-        The table holds the reading, so the encoders' error is subtracted from where the joints then stand.
-        """
-        before, generator = self.visits, generator_of(self.scene.seed, self.name, "touch")
-        found = solve_inverse(
-            self.scene.true_robot, points, near=before.true_readings, generator=generator, n_starts=n_starts
-        )
-        lower, upper = self.scene.robot.limits.T
-        readings = np.clip(found.readings - (before.true_readings - before.readings), lower, upper)
-        ids = np.array([f"{self.name} {i}" for i in before.ids])
-        self.visits = Visits(readings, found.readings, ids, before.test)
-        return found.reached
-
-    def touch_in_turn(self, spots: Mapping[str, Spot], noise: str) -> Integers:
-        """Touch points in turn; the point of each configuration, of which some may be left out.
+        Others are left out. The table holds the reading, so the encoders' error is subtracted from where the joints
+        then stand.
 
         Raises:
-            InputError: A point was not reached, and none is to be left out, or none was reached at all.
+            InputError: None is reached.
         """
-        which = np.arange(len(self.visits)) % len(spots)
-        places = np.array([s.xyz for s in spots.values()])[which]
-        reached = self.touch(places + self.noise(noise, len(which), 3))
-        if self.scene.leave_out and reached.any():
-            self.visits = self.visits.select(reached)
-        elif not reached.all():
-            missed = sorted({list(spots)[i] for i in which[~reached]})
-            found = f"{', '.join(missed)} not reached from {np.sum(~reached)} of {len(reached)} configurations"
-            raise InputError(self.place, found, "points within the joint limits")
-        return which[reached]
+        v, generator = self.visits, self.generator("touch")
+        found = solve_inverse(self.true_robot, points, near=v.true_readings, generator=generator, n_starts=n_starts)
+        if not found.reached[~v.test].any():
+            missed = f"nothing is reached from {np.sum(~v.test)} configurations"
+            raise InputError(self.place, missed, "points within the joint limits")
+        readings = np.clip(found.readings - (v.true_readings - v.readings), *self.scenario.robot.limits.T)
+        ids = np.array([f"{self.name} {i}" for i in v.ids])
+        self.visits = Visits(readings, found.readings, ids, v.test).select(found.reached)
+        return found.reached
 
     # --- one instrument after the other ---
 
-    def poses(self, i: Tracker) -> tuple[Table, Truth]:
+    def poses(self) -> tuple[Table, Truth]:
         """Poses of the tool, or positions of targets on it."""
+        i, n = self.instrument, self.n
         rotated, placed = POSE_MODELS[self.model] if self.model in POSE_MODELS else PAIR_MODELS[self.model][::-1]
-        targets = i.targets
+        targets = i.targets or {}
         if not isinstance(targets, Mapping):
             away = 0.1 * self.workspace()[1] * self.directions(targets)
             targets = self.named("target", [Spot(p) for p in away])
-        n, n_targets = len(self.visits), max(1, len(targets))
+        n_targets = max(1, len(targets))
         k, which = np.repeat(np.arange(n), n_targets), np.tile(np.arange(n_targets), n)
-        frames, known = self._stations(i)
+        first = self.frame if i.frame is None else choose_frame(i.frame, self.places)
+        frames = [first, *(choose_frame("unknown", self.places) for _ in range(i.stations - 1))]
         station = k % i.stations
         X = np.array([f.rotation for f in frames])[station]
         at, labels, measured = self.at(), dict[str, Labels](), dict[str, Any]()
@@ -309,89 +282,83 @@ class _Work:
             points = at.position[k] + np.einsum("nij,nj->ni", R, t)
             seen = np.einsum("nij,nj->ni", X, points) + np.array([f.position for f in frames])[station]
             measured["position"] = seen + self.noise("position", len(k), 3)
-            measured["sigma_position"] = self.stated("position", len(k), 3)
+            measured["sigma_position"] = self.sigma("position", len(k), 3)
         if rotated:
             noise = Rotation.from_rotvec(self.noise("orientation", len(k), 3)).as_matrix()
             measured["rotation"] = X @ R @ noise
-            measured["sigma_orientation"] = self.stated("orientation", len(k), 3)
+            measured["sigma_orientation"] = self.sigma("orientation", len(k), 3)
         if targets:
             labels["target"] = Labels(tuple(targets), which)
         names = [self.name]
         if i.stations > 1:
             names = [f"{self.name}, station s{s + 1}" for s in range(i.stations)]
             labels["station"] = Labels(tuple(f"s{s + 1}" for s in range(i.stations)), station)
-        frame: FrameKnowledge = "known" if known or self.model in PAIR_MODELS else "unknown"
-        table = Table(self.rows(k, labels=labels, **measured), self.model, i.pairing, frame, known=self.known(targets))
+        known = self.model in PAIR_MODELS or frame_knowledge(i.frame or self.scenario.frame) == "known"
+        frame: FrameKnowledge = "known" if known else "unknown"
+        table = Table(
+            self.rows(k, labels=labels, **measured),
+            self.model,
+            i.pairing or Pairing(),
+            frame,
+            known=self.known(targets),
+        )
         return table, {"targets": targets, "frames": dict(zip(names, frames, strict=True))}
 
-    def _stations(self, i: Tracker) -> tuple[list[Placement], bool]:
-        """world_T_base of each station, and whether the calibration knows it."""
-        first, known = self.scene.frame, self.scene.known_frame
-        if i.frame is not None:
-            known = frame_knowledge(i.frame) == "known"
-            drawn = i.frame if isinstance(i.frame, Placement) else draw_frame(self.places)
-            first = Placement(np.eye(3), np.zeros(3)) if known else drawn
-        if i.stations > 1 and known:
-            raise InputError(f"{self.place}: stations", f"{i.stations} with frame base", "1")
-        return [first, *(draw_frame(self.places) for _ in range(i.stations - 1))], known
-
-    def plain(self, i: PlainInstrument) -> tuple[Table, Truth]:
+    def plain(self) -> tuple[Table, Truth]:
         """Columns that the model alone has."""
-        model, n, at = INSTRUMENTS[self.model], len(self.visits), self.at()
-        exact = model.predict(self.rows(), at, lambda kind, name: np.zeros(kind.size))
-        columns = {name: exact.columns[name] + self.noise(name, n) for name in model.generic_columns}
-        sigmas = {name: self.stated(name, n) for name in model.generic_columns}
-        return Table(replace(exact, columns=columns, sigmas=sigmas), i.model), {}
+        model = INSTRUMENTS[self.model]
+        exact = model.predict(self.rows(), self.at(), lambda kind, name: np.zeros(kind.size))
+        columns = {name: exact.columns[name] + self.noise(name, self.n) for name in model.generic_columns}
+        sigmas = {name: self.sigma(name, self.n) for name in model.generic_columns}
+        return Table(replace(exact, columns=columns, sigmas=sigmas), self.model), {}
 
-    def pairs(self, i: PairGauge) -> tuple[Table, Truth]:
+    def pairs(self) -> tuple[Table, Truth]:
         """Distances and angles between configurations."""
         at, (distances, angles) = self.at(), PAIR_MODELS[self.model]
-        true = form_pairs(self.rows(position=at.position, rotation=at.rotation), i.pairs)
+        assert self.instrument.pairs is not None
+        true = form_pairs(self.rows(position=at.position, rotation=at.rotation), self.instrument.pairs)
         n = true.n_pairs
-        nothing = np.full(n, np.nan)
-        found = replace(true, source=f"{self.name}_pairs.csv", distance=nothing, angle=nothing,
-                        sigma_distance=nothing, sigma_angle=nothing)  # fmt: skip
+        found: dict[str, Any] = dict.fromkeys(
+            ("distance", "angle", "sigma_distance", "sigma_angle"), np.full(n, np.nan)
+        )
         if distances:
-            measured = np.abs(true.distance + self.noise("distance", n))
-            found = replace(found, distance=measured, sigma_distance=self.stated("distance", n))
+            found["distance"] = np.abs(true.distance + self.noise("distance", n))
+            found["sigma_distance"] = self.sigma("distance", n)
         if angles:
-            measured = np.pi - np.abs(np.pi - np.abs(true.angle + self.noise("angle", n)))
-            found = replace(found, angle=measured, sigma_angle=self.stated("angle", n))
-        return Table(self.rows(pairs=found), self.model), {}
+            found["angle"] = np.pi - np.abs(np.pi - np.abs(true.angle + self.noise("angle", n)))
+            found["sigma_angle"] = self.sigma("angle", n)
+        pairs = replace(true, source=f"{self.name}_pairs.csv", **found)
+        return Table(self.rows(pairs=pairs), self.model), {}
 
-    def lengths(self, i: LengthGauge) -> tuple[Table, Truth]:
+    def lengths(self) -> tuple[Table, Truth]:
         """Lengths to anchors."""
-        anchors = self.spots(i.anchors, "anchor", within_reach=i.contact)
-        which, n = np.arange(len(self.visits)) % len(anchors), len(self.visits)
+        i, n = self.instrument, self.n
+        anchors = self.spots(3 if i.anchors is None else i.anchors, "anchor", within_reach=i.contact)
+        which = np.arange(n) % len(anchors)
+        places = np.array([a.xyz for a in anchors.values()])[which]
         if i.contact:
-            which = self.touch_in_turn(anchors, "distance")
+            which = which[self.touch(places + self.noise("distance", n, 3))]
             length = np.zeros(len(which))
         else:
-            places = np.array([a.xyz for a in anchors.values()])[which]
             length = np.linalg.norm(self.at().position - places, axis=1)
             length = np.abs(length + (i.offset or 0.0) + self.noise("distance", n))
         labels = {"anchor": Labels(tuple(anchors), which)}
-        m = self.rows(labels=labels, length=length, sigma_length=self.stated("distance", len(which)))
+        m = self.rows(labels=labels, length=length, sigma_length=self.sigma("distance", len(which)))
         table = Table(m, "anchor", known=self.known(anchors), offset=i.offset is not None)
         return table, {"anchors": anchors, "offsets": {} if i.offset is None else {self.name: i.offset}}
 
-    def distances(self, i: Indicator) -> tuple[Table, Truth]:
+    def distances(self) -> tuple[Table, Truth]:
         """Distances from planes."""
-        planes = i.planes if isinstance(i.planes, Mapping) else self._draw_planes(i.planes)
-        which = np.arange(len(self.visits)) % len(planes)
+        i = self.instrument
+        planes = i.planes if isinstance(i.planes, Mapping) else self._draw_planes(3 if i.planes is None else i.planes)
+        which, at = np.arange(self.n) % len(planes), self.at().position
         normal = np.array([p.normal for p in planes.values()])[which]
-        above = np.einsum("ni,ni->n", normal, self.at().position)
-        above = above - np.array([p.distance for p in planes.values()])[which] + self.noise("distance", len(which))
+        distance = np.array([p.distance for p in planes.values()])[which]
+        above = np.einsum("ni,ni->n", normal, at) - distance + self.noise("distance", self.n)
         if i.contact:
-            reached = self.touch(self.at().position - above[:, None] * normal, n_starts=3)
-            if not reached[~self.visits.test].any():
-                raise InputError(self.place, "no plane is reached from any configuration", "planes within reach")
-            self.visits, which = self.visits.select(reached), which[reached]
-        m = self.rows(
-            labels={"plane": Labels(tuple(planes), which)},
-            length=None if i.contact else above,
-            sigma_length=self.stated("distance", len(which)),
-        )
+            which = which[self.touch(at - above[:, None] * normal, n_starts=3)]
+        labels, sigma = {"plane": Labels(tuple(planes), which)}, self.sigma("distance", len(which))
+        m = self.rows(labels=labels, length=None if i.contact else above, sigma_length=sigma)
         return Table(m, "plane"), {"planes": planes}
 
     def _draw_planes(self, n: int) -> Mapping[str, Plane]:
@@ -401,11 +368,25 @@ class _Work:
         away = radius * self.places.uniform(-0.5, 0.5, n)
         return self.named("plane", [Plane(v, float(v @ middle + d)) for v, d in zip(normals, away, strict=True)])
 
-    def boards(self, i: BoardCamera) -> tuple[Table, Truth]:
+    def contacts(self) -> tuple[Table, Truth]:
+        """Contacts with points, and distances between these."""
+        sockets = self.spots(self.instrument.sockets or {}, "socket", within_reach=True)
+        which, places = np.arange(self.n) % len(sockets), np.array([s.xyz for s in sockets.values()])
+        which = which[self.touch(places[which] + self.noise("point", self.n, 3))]
+        pairs = no_pairs(f"{self.name}.csv")
+        if len(sockets) > 1:
+            a, b = np.triu_indices(len(sockets), 1)
+            d = np.linalg.norm(places[b] - places[a], axis=1) + self.noise("distance", len(a))
+            unmeasured, fitted = np.full(len(a), np.nan), np.zeros(len(a), dtype=np.bool_)
+            sigma, source = self.sigma("distance", len(a)), f"{self.name}_pairs.csv"
+            pairs = Pairs(a, b, np.abs(d), unmeasured, sigma, unmeasured, fitted, source)
+        m = self.rows(groups=Groups(tuple(sockets), which, pairs), sigma_point=self.sigma("point", len(which)))
+        return Table(m, "distance"), {"sockets": sockets}
+
+    def boards(self) -> tuple[Table, Truth]:
         """Poses of boards in the camera's frame."""
-        boards = self._boards_of(i)
-        R, b = _in_camera(self.at(), boards)
-        k, which = np.nonzero((b[:, :, 2] > 0.0) & _faces(i, boards, R, b))
+        boards, R, b, faced = self._boards_in_camera()
+        k, which = np.nonzero((b[:, :, 2] > 0.0) & faced)
         self._require_seen(k)
         n = len(k)
         m = self.rows(
@@ -413,51 +394,60 @@ class _Work:
             labels={"board": Labels(tuple(boards), which)},
             rotation=Rotation.from_rotvec(self.noise("orientation", n, 3)).as_matrix() @ R[k, which],
             position=b[k, which] + self.noise("position", n, 3),
-            sigma_orientation=self.stated("orientation", n, 3),
-            sigma_position=self.stated("position", n, 3),
+            sigma_orientation=self.sigma("orientation", n, 3),
+            sigma_position=self.sigma("position", n, 3),
         )
         return Table(m, "board"), {"boards": boards}
 
-    def _boards_of(self, i: BoardCamera) -> Mapping[str, Placement]:
-        """The boards; the one that the configurations look at if none are given.
-
-        Raises:
-            InputError: There are none.
-        """
-        views = self.scene.configurations
-        if i.boards:
-            return i.boards
-        if isinstance(views, BoardViews):
-            return {"board": views.board}
-        raise InputError(f"{self.place}: boards", "found none", "boards by name, or configurations: {board: ...}")
-
-    def pixels(self, i: BoardCamera) -> tuple[Table, Truth]:
+    def pixels(self) -> tuple[Table, Truth]:
         """Images of the corners of boards that a camera on the tool sees, or of one on the tool."""
+        i, (boards, R, b, faced) = self.instrument, self._boards_in_camera()
         assert i.camera is not None
         assert i.corners is not None
-        at, boards = self.at(), dict[str, Placement]()
-        if i.fixed:
-            X = i.frame or self._looking_in()
-            R, b = (X.rotation @ at.rotation)[:, None], (at.position @ X.rotation.T + X.position)[:, None]
-            truth: Truth = {"frames": {self.name: X}}
-        else:
-            boards = dict(self._boards_of(i))
-            R, b = _in_camera(at, boards)
-            truth = {"boards": boards}
-        c = i.corners.points
-        points = b[:, :, None] + np.einsum("nkij,cj->nkci", R[:, :, :, :2], c)
+        points = b[:, :, None] + np.einsum("nkij,cj->nkci", R[:, :, :, :2], i.corners)
         image = i.camera.image(points.reshape(-1, 3))[0].reshape(*points.shape[:3], 2)
-        k, which, corner = np.nonzero(_in_image(i.camera, points, image) & _faces(i, boards, R, b)[:, :, None])
+        k, which, corner = np.nonzero(_in_image(i.camera, points, image) & faced[:, :, None])
         self._require_seen(k)
-        n = len(k)
         m = self.rows(
             k,
-            labels={"board": Labels(tuple(boards), which)} if boards else {},
-            image=np.hstack([image[k, which, corner] + self.noise("pixel", n, 2), c[corner]]),
-            sigma_pixel=self.stated("pixel", n, 2),
+            labels={} if i.fixed else {"board": Labels(tuple(boards), which)},
+            image=np.hstack([image[k, which, corner] + self.noise("pixel", len(k), 2), i.corners[corner]]),
+            sigma_pixel=self.sigma("pixel", len(k), 2),
         )
         frame: FrameKnowledge = "unknown" if i.fixed else "known"
-        return Table(m, "pixels", frame=frame, camera=i.camera, fixed_camera=i.fixed), truth
+        table = Table(m, "pixels", frame=frame, camera=i.camera, fixed_camera=i.fixed)
+        return table, {"frames" if i.fixed else "boards": boards}
+
+    def _boards_in_camera(self) -> tuple[Mapping[str, Placement], Floats, Floats, Booleans]:
+        """The boards, or the frame of a fixed camera; where boards are in the camera's frame, and which it faces.
+
+        Returns:
+            base_T_board or camera_T_base by name; camera_R_board, shape (n, n_boards, 3, 3); camera_p_board, shape
+            (n, n_boards, 3), [m]; whether the camera is on the visible side, shape (n, n_boards).
+
+        Raises:
+            InputError: There are no boards.
+        """
+        i, at = self.instrument, self.at()
+        views = i.configurations or self.scenario.configurations
+        if i.fixed:
+            X = i.frame if isinstance(i.frame, Placement) else self._looking_in()
+            boards: Mapping[str, Placement] = {self.name: X}
+            R, b = (X.rotation @ at.rotation)[:, None], (at.position @ X.rotation.T + X.position)[:, None]
+        elif i.boards or isinstance(views, BoardViews):
+            boards = i.boards or {"board": views.board}  # type: ignore[union-attr]
+            R_T, B = np.swapaxes(at.rotation, 1, 2)[:, None], np.array([one.rotation for one in boards.values()])
+            step = np.array([one.position for one in boards.values()]) - at.position[:, None]
+            R, b = R_T @ B, (R_T @ step[..., None])[..., 0]
+        else:
+            raise InputError(f"{self.place}: boards", "found none", "boards by name, or configurations: {board: ...}")
+        side = np.array([-1.0 if name in i.from_behind else 1.0 for name in boards])
+        return boards, R, b, side * np.einsum("nki,nki->nk", R[:, :, :, 2], b) < 0.0
+
+    def _require_seen(self, k: Integers) -> None:
+        if self.visits.test[k].all():
+            found = f"sees no board at any of {np.sum(~self.visits.test)} configurations"
+            raise InputError(self.place, found, hint="configurations: {board: ...} have the camera look at one")
 
     def _looking_in(self) -> Placement:
         """camera_T_base of a camera that looks at the workspace's middle from outside."""
@@ -466,40 +456,6 @@ class _Work:
         y = np.linalg.svd(ahead[None])[2][1]  # orthogonal to ahead
         base_R_camera = np.stack([np.cross(y, ahead), y, ahead], axis=1)
         return Placement(base_R_camera.T, -base_R_camera.T @ (middle - 2.5 * radius * ahead))
-
-    def _require_seen(self, k: Integers) -> None:
-        if self.visits.test[k].all():
-            found = f"sees no board at any of {np.sum(~self.visits.test)} configurations"
-            raise InputError(self.place, found, hint="configurations: {board: ...} have the camera look at one")
-
-    def contacts(self, i: Sockets) -> tuple[Table, Truth]:
-        """Contacts with points, and distances between these."""
-        sockets = self.spots(i.sockets, "socket", within_reach=True)
-        which = self.touch_in_turn(sockets, "point")
-        pairs = no_pairs(f"{self.name}.csv")
-        if len(sockets) > 1:
-            places = np.array([s.xyz for s in sockets.values()])
-            a, b = np.triu_indices(len(sockets), 1)
-            d = np.linalg.norm(places[b] - places[a], axis=1) + self.noise("distance", len(a))
-            unmeasured, fitted = np.full(len(a), np.nan), np.zeros(len(a), dtype=np.bool_)
-            sigma, source = self.stated("distance", len(a)), f"{self.name}_pairs.csv"
-            pairs = Pairs(a, b, np.abs(d), unmeasured, sigma, unmeasured, fitted, source)
-        m = self.rows(groups=Groups(tuple(sockets), which, pairs), sigma_point=self.stated("point", len(which)))
-        return Table(m, "distance"), {"sockets": sockets}
-
-
-def _in_camera(at: Poses, boards: Mapping[str, Placement]) -> tuple[Floats, Floats]:
-    """camera_T_board at every configuration, shapes (n, n_boards, 3, 3) and (n, n_boards, 3)."""
-    R_T = np.swapaxes(at.rotation, 1, 2)[:, None]
-    B, b = np.array([p.rotation for p in boards.values()]), np.array([p.position for p in boards.values()])
-    return R_T @ B, (R_T @ (b - at.position[:, None])[..., None])[..., 0]
-
-
-def _faces(i: BoardCamera, boards: Mapping[str, Placement], R: Floats, b: Floats) -> Booleans:
-    """Whether the camera, in whose frame boards are, is on the visible side of them, shape (n, n_boards)."""
-    side = np.array([-1.0 if name in i.from_behind else 1.0 for name in boards] or [1.0])
-    toward: Booleans = side * np.einsum("nki,nki->nk", R[:, :, :, 2], b) < 0.0
-    return toward
 
 
 def _in_image(camera: Camera, points: Floats, image: Floats) -> Booleans:
@@ -510,12 +466,10 @@ def _in_image(camera: Camera, points: Floats, image: Floats) -> Booleans:
     ahead = points[..., 2] > 0.0
     within = np.all((image >= 0.0) & (image <= [2.0 * camera.cx, 2.0 * camera.cy]), axis=-1)
     z = np.where(ahead, points[..., 2], 1.0)
-    s = np.sum((points[..., :2] / z[..., None]) ** 2, axis=-1)
-    outward = np.ones(s.shape, dtype=np.bool_)
-    for share in np.linspace(0.1, 1.0, 10):  # r (1 + k1 r^2 + k2 r^4 + k3 r^6) grows all the way to the point
-        t = s * share
-        outward &= 1.0 + t * (3.0 * camera.k1 + t * (5.0 * camera.k2 + t * 7.0 * camera.k3)) > 0.0
-    seen: Booleans = ahead & within & outward
+    square = np.sum((points[..., :2] / z[..., None]) ** 2, axis=-1)  # of r, which must grow all the way to the point
+    s = square[..., None] * np.linspace(0.1, 1.0, 10)
+    growing = 1.0 + s * (3.0 * camera.k1 + s * (5.0 * camera.k2 + s * 7.0 * camera.k3)) > 0.0
+    seen: Booleans = ahead & within & growing.all(axis=-1)
     return seen
 
 
@@ -526,20 +480,14 @@ def merge_truths(tables: list[Table], truths: list[Truth], source: str) -> tuple
         InputError: Landmarks of one kind and name are at different places.
     """
     every: dict[str, dict[str, Any]] = {}
-    for truth in truths:
-        for kind, landmarks in truth.items():
-            for name, landmark in landmarks.items():
-                if not _same(every.setdefault(kind, {}).setdefault(name, landmark), landmark):
-                    raise InputError(f"{source}: instruments: {kind}: {name}", "at two places", "one, or other names")
+    other: Any
+    for kind, name, landmark in ((k, n, one) for t in truths for k, found in t.items() for n, one in found.items()):
+        other = every.setdefault(kind, {}).setdefault(name, landmark)
+        if other is not landmark and not all(map(np.array_equal, astuple(other), astuple(landmark))):
+            raise InputError(f"{source}: instruments: {kind}: {name}", "at two places", "one, or other names")
     known: dict[bool, dict[str, KnownPoint]] = {True: {}, False: {}}
     for table in tables:
         known[table.model == "anchor"] |= table.known
     takes = [t.model == "anchor" or t.model in POSE_MODELS for t in tables]
     shared = (replace(t, known=known[t.model == "anchor"]) if one else t for t, one in zip(tables, takes, strict=True))
     return tuple(shared), {kind: landmarks for kind, landmarks in every.items() if landmarks}
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, Spot | Plane | Placement):
-        return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
-    return bool(a == b)

@@ -58,25 +58,15 @@ def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
         boxes: What must stay free.
     """
-    points = link_points(robot, np.concatenate([_probes(robot), readings]))  # (2 + n, m, 3)
-    moves = _moving(points)
+    if not boxes:
+        return np.zeros(len(readings), dtype=np.bool_)
+    probes = np.outer([0.3, 1.1], np.linspace(0.7, 1.0, robot.n_joints))  # show what stands still in all
+    points = link_points(robot, np.concatenate([probes, readings]))  # (2 + n, m, 3)
+    moves = np.abs(points[0] - points[1]).max(axis=1) > MAX_CONTACT_M
     lines = moves[:-1] | moves[1:]
     start, end = points[2:, :-1][:, lines], points[2:, 1:][:, lines]  # (n, n_lines, 3)
-    hit = np.zeros(len(readings), dtype=np.bool_)
-    for box in boxes:
-        hit |= _cross(start, end, box).any(axis=1)
+    hit: Booleans = np.any([_cross(start, end, box).any(axis=1) for box in boxes], axis=0)
     return hit
-
-
-def _probes(robot: Robot) -> Floats:
-    """Two configurations that show what stands still in all of them."""
-    return np.outer([0.3, 1.1], np.linspace(0.7, 1.0, robot.n_joints))
-
-
-def _moving(points: Floats) -> Booleans:
-    """Which points, shape (n, m, 3), of which the first two are of probes, some joint moves: shape (m,)."""
-    found: Booleans = np.abs(points[0] - points[1]).max(axis=1) > MAX_CONTACT_M
-    return found
 
 
 def _cross(start: Floats, end: Floats, box: Box) -> Booleans:

@@ -18,7 +18,6 @@ configurations:                       # where the calibration measures; one of
     cone: 60                          #     and within this angle of the normal; default 60 degrees
     roll: random                      #     about the optical axis: random (default) or an angle
     self_motion: random               #     random (default), or held: all continue from A's configuration
-    posture: [0, 30, 0, 90, 0, 60, 0] #     where A's is sought if held; default: drawn
     field_of_view: 20                 #     turned away, the centre within this of the axis; default 0: it is on it
     board_size: [0.4, 0.3]            #     and all four corners of the board; default: the centre alone
   tracker:                            #   a tracker sees a reflector on the tool: see `TargetViews`
@@ -66,7 +65,7 @@ the `job` has no model or pairing of its own. A design needs no `errors`.
 | `sockets` | `distance` | contact points by name, or how many; one is touched from each configuration, in turn |
 | `anchors`, `offset` | `anchor` | anchors by name, or how many; what the instrument adds, which is then estimated |
 | `planes` | `plane` | planes by name, `{normal: [x, y, z], distance: d}`, or how many |
-| `contact` | `anchor plane` | true: the tool point is brought there, from each configuration |
+| `contact` | `anchor plane` | true: the tool point is brought there from each configuration, where it reaches |
 | `boards` | `board pixels` | base_T_board by name; else the board that the configurations look at |
 | `camera` | `pixels` | a path or a mapping; with `fixed: true` it stands in the room and the board is on the tool |
 | `corners` | `pixels` | of the boards: `{columns: 8, rows: 6, square: 30}` |
@@ -80,8 +79,8 @@ nominal arm's tool point: mean, and root mean square distance from it.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -90,11 +89,12 @@ from typing import Annotated, Any, Literal, TypeVar, cast, dataclass_transform
 import numpy as np
 import pydantic
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError, ValidationInfo, create_model
-from pydantic_core import core_schema
+from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
+from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import NEAR, Brief, Floats, InputError, as_floats, check, checked, did_you_mean, known_names
 from fg_calib.io import (
+    NOISE_UNITS,
     Bound,
     FilePath,
     FrameValues,
@@ -119,7 +119,7 @@ from fg_calib.io import (
     unit_of_key,
     validate,
 )
-from fg_calib.measurements import GENERIC_COLUMNS, LIMIT_SLACK, Noise
+from fg_calib.measurements import Noise
 from fg_calib.measurements.kinds import Camera
 from fg_calib.options import PAIR_MODELS, POSE_MODELS, AngleUnit, FrameKnowledge, LengthUnit, Model, Pairing
 from fg_calib.robot import Robot, names_of, tolerance_kind
@@ -127,10 +127,10 @@ from fg_calib.robot import Robot, names_of, tolerance_kind
 MOST_DRAWN = 1_000_000
 """The largest number of configurations that are drawn."""
 
-Class = TypeVar("Class")
-
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 """The shipped scenarios, a folder each."""
+
+Class = TypeVar("Class")
 
 
 # --- one type for Python and for the file -----------------------------------------------------------------------------
@@ -150,118 +150,77 @@ class FileContext:
     folder: Path
     robot: Robot
 
+    def factor(self, unit: str) -> float:
+        """SI units in one of the file's, for `m` and `rad`; 1 for pixels and pure numbers."""
+        return self.units.factor(unit) if unit in ("m", "rad") else 1.0
 
-@dataclass(frozen=True)
-class InFile:
-    """Annotation of a field that a file states in another form. A value from Python is the field's own type, in SI.
 
-    Attributes:
-        form: The form in the file.
-        convert: From the form, and the context of the file, to the field's value.
-        from_python: Checks a value from Python; if None it must be of the field's type.
+def _convert(function: Callable[[Any, FileContext | None], Any]) -> BeforeValidator:
+    """Annotation of a field that a function makes of what is given: by a file in its context, by Python without."""
+
+    def read(given: Any, info: ValidationInfo) -> Any:
+        try:
+            return function(given, info.context)
+        except InputError as error:
+            raise ValueError(error) from None  # so that pydantic adds the place
+
+    return BeforeValidator(read)
+
+
+def _in_file(function: Callable[[Any, FileContext], Any]) -> BeforeValidator:
+    """Annotation of a field that a file states in another form; Python gives its own type."""
+    return _convert(lambda given, context: given if context is None else function(given, context))
+
+
+def _scale(unit: str) -> AfterValidator:
+    """Annotation of a field in [m] or [rad], in a file in the units of that."""
+    return AfterValidator(lambda value, info: value if info.context is None else value * info.context.factor(unit))
+
+
+def _fit(read: Callable[[], Any], place: str) -> Any:
+    """What pydantic makes of something.
+
+    Raises:
+        InputError: The first misfit.
     """
-
-    form: Any
-    convert: Callable[[Any, FileContext], Any]
-    from_python: Callable[[Any], Any] | None = None
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> core_schema.CoreSchema:
-        """The schema by which pydantic validates the field."""
-
-        def read(given: Any, inner: Callable[[Any], Any], info: Any) -> Any:
-            if info.context is not None:
-                value = inner(given)
-                return with_place(info.field_name or "", lambda: self.convert(value, info.context))
-            if self.from_python is not None:
-                return with_place(info.field_name or "", lambda: cast("Any", self.from_python)(given))
-            if isinstance(source, type) and not isinstance(given, source):
-                raise InputError(info.field_name or "value", f"found {shown(given)}", f"a {source.__name__}")
-            return given
-
-        return core_schema.with_info_wrap_validator_function(read, handler.generate_schema(self.form))
+    try:
+        return read()
+    except ValidationError as error:
+        misfit, context = first_misfit(error, place), error.errors(include_url=False)[0].get("ctx", {})
+        if "error" not in context:
+            raise misfit from None
+        of: InputError = context["error"].args[0]
+        within = ": ".join(part for part in (misfit.place, of.place.removeprefix(": ")) if part)
+        raise InputError(within, of.found, of.expected, of.hint) from None
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(Field,))
-def schema(*, kw_only: bool = False) -> Callable[[type[Class]], type[Class]]:
-    """Make a frozen dataclass whose fields are validated: from Python in SI, from a file in the file's units."""
-
-    def make(cls: type[Class]) -> type[Class]:
-        keys = dict.fromkeys(key for c in reversed(cls.__mro__) for key in vars(c).get("__annotations__", {}))
-        refuse = refuse_unknown_keys(*("pose" if cls.__name__ == "BoardViews" and k == "board" else k for k in keys))
-        check_keys: Any = classmethod(lambda _, value: refuse(value))
-        setattr(cls, "check_keys", pydantic.model_validator(mode="before")(check_keys))  # noqa: B010
-        made = pydantic.dataclasses.dataclass(frozen=True, kw_only=kw_only, config=_CONFIG)(cls)
-        plain: Any = made.__init__
-        positional = [f.name for f in fields(cast("Any", made)) if not f.kw_only]
-
-        def validate_fields(self: Any, *args: Any, **kwargs: Any) -> None:
-            try:
-                plain(self, *args[len(positional) :], **dict(zip(positional, args, strict=False)), **kwargs)
-            except ValidationError as error:
-                raise first_misfit(error, _KEYS.get(cls.__name__, cls.__name__.lower())) from None
-
-        made.__init__ = validate_fields  # type: ignore[method-assign]
-        return cast("type[Class]", made)
-
-    return make
-
-
-_CONFIG = pydantic.ConfigDict(extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False, populate_by_name=True)
-_KEYS = {"BoardViews": "board", "TargetViews": "tracker", "RandomReadings": "random"}
-
-
-def read_as(kind: Any, given: object, place: str, context: FileContext) -> Any:
-    """Read a value of a file as a type.
+def _read(kind: Any, given: object, place: str, context: FileContext | None) -> Any:
+    """Read a value as a type.
 
     Raises:
         InputError: It does not fit.
     """
-
-    def read() -> Any:
-        try:
-            return TypeAdapter(kind).validate_python(given, context=context)
-        except ValidationError as error:
-            raise first_misfit(error, place) from None
-
-    return with_place(place, read)
+    return _fit(lambda: TypeAdapter(kind).validate_python(given, context=context), place)
 
 
-def with_place(place: str, read: Callable[[], Any]) -> Any:
-    """Read something; the place of what is wrong with it is within another place."""
-    try:
-        return read()
-    except InputError as error:
-        if error.place.startswith(place):
-            raise
-        at = ": ".join(part for part in (place, error.place.removeprefix(": ")) if part)
-        raise InputError(at, error.found, error.expected, error.hint) from None
+@dataclass_transform(frozen_default=True, field_specifiers=(Field,))
+def schema(cls: type[Class]) -> type[Class]:
+    """Make a frozen dataclass whose fields are validated: from Python in SI, from a file in the file's units."""
+    keys = dict.fromkeys(key for c in reversed(cls.__mro__) for key in vars(c).get("__annotations__", {}))
+    refuse: Any = refuse_unknown_keys(*("pose" if cls.__name__ == "BoardViews" and k == "board" else k for k in keys))
+    unknown: Any = classmethod(lambda _, value: refuse(value))
+    cls.refuse_unknown = pydantic.model_validator(mode="before")(unknown)  # type: ignore[attr-defined]
+    config = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True)
+    made: Any = pydantic.dataclasses.dataclass(frozen=True, config=config)(cls)
+    plain = made.__init__
+    names = [f.name for f in fields(made) if not f.kw_only]
 
+    def validate_fields(self: Any, *args: Any, **kwargs: Any) -> None:
+        by_name = dict(zip(names, args, strict=False)) | kwargs
+        _fit(lambda: plain(self, *args[len(names) :], **by_name), cls.__name__)
 
-def _scaled(unit: str) -> AfterValidator:
-    def convert(value: float, info: ValidationInfo) -> float:
-        return value if info.context is None else value * cast("FileContext", info.context).units.factor(unit)
-
-    return AfterValidator(convert)
-
-
-def _array(unit: str | None) -> InFile:
-    """Three numbers; in a file those of x, y and z, or a list."""
-
-    def convert(given: Any, context: FileContext) -> Floats:
-        if isinstance(given, Mapping):
-            xyz = validate(_Xyz, given, "")
-            given = (xyz.x, xyz.y, xyz.z)
-        scale = 1.0 if unit is None else context.units.factor(unit)
-        return frozen(as_floats("", given, "(3,)") * scale)
-
-    return InFile(Any, convert, lambda given: frozen(as_floats("", given, "(3,)")))
-
-
-def frozen(array: Floats) -> Floats:
-    """A read-only copy."""
-    array = np.array(array)
-    array.setflags(write=False)
-    return array
+    made.__init__ = validate_fields
+    return cast("type[Class]", made)
 
 
 class _Xyz(Schema):
@@ -270,16 +229,38 @@ class _Xyz(Schema):
     z: Number = 0.0
 
 
-Length = Annotated[Number, _scaled("m")]
-PositiveLength = Annotated[Positive, _scaled("m")]
-LengthFromZero = Annotated[NotNegative, _scaled("m")]
-Angle = Annotated[Number, _scaled("rad")]
-PositiveAngle = Annotated[Positive, _scaled("rad")]
-AngleFromZero = Annotated[NotNegative, _scaled("rad")]
+def _array(given: Any, context: FileContext | None) -> Floats:
+    """Three numbers; in a file those of x, y and z, or a list."""
+    if context is not None and isinstance(given, Mapping):
+        xyz = validate(_Xyz, given, "")
+        given = (xyz.x, xyz.y, xyz.z)
+    return as_floats("", given, "(3,)")
+
+
+Length = Annotated[Number, _scale("m")]
+PositiveLength = Annotated[Positive, _scale("m")]
+LengthFromZero = Annotated[NotNegative, _scale("m")]
+Angle = Annotated[Number, _scale("rad")]
+PositiveAngle = Annotated[Positive, _scale("rad")]
+AngleFromZero = Annotated[NotNegative, _scale("rad")]
 Count = Annotated[int, Field(ge=0, le=MOST_DRAWN, strict=True)]
 CountFromOne = Annotated[int, Field(gt=0, le=MOST_DRAWN, strict=True)]
-Point = Annotated[Floats, _array("m")]
-Direction = Annotated[Floats, _array(None)]
+Direction = Annotated[Floats, _convert(_array)]
+Point = Annotated[Direction, _scale("m")]
+
+
+def _require(fits: bool, place: str, found: str, expected: str) -> None:
+    """Check the fields of a type of a scenario.
+
+    Raises:
+        ValueError: They do not fit, for `_fit`.
+    """
+    if not fits:
+        raise ValueError(InputError(place, found, expected))
+
+
+def _require_order(distance: tuple[float, float]) -> None:
+    _require(distance[0] <= distance[1], "distance", f"found {shown(list(distance))}", "the smaller one first")
 
 
 # --- frames and where the arm goes ------------------------------------------------------------------------------------
@@ -299,36 +280,29 @@ class Placement:
 
     def summary(self) -> dict[str, list[float]]:
         """For programs: position, [m], and rotation."""
-        from scipy.spatial.transform import Rotation
-
         quaternion = Rotation.from_matrix(self.rotation.copy()).as_quat(canonical=True)
         return {"xyz": self.position.tolist(), "quaternion_xyzw": quaternion.tolist()}
 
 
-def _placement(values: FrameValues, context: FileContext) -> Placement:
-    from scipy.spatial.transform import Rotation
-
-    si = values.si(context.units, "")
+def _placement(given: Any, context: FileContext) -> Placement:
+    si = validate(FrameValues, given, "").si(context.units, "")
     rotation = Rotation.from_euler("xyz", [si["roll"], si["pitch"], si["yaw"]])  # about fixed axes: Rz(yaw) Ry Rx
     return Placement(rotation.as_matrix(), np.array([si["x"], si["y"], si["z"]]))
 
 
-def _frame_in_file(given: object, context: FileContext) -> str | Placement:
-    if given in ("base", "unknown"):
-        return str(given)
-    if not isinstance(given, dict):
-        raise InputError("", f"found {shown(given)}", "base, unknown, or a mapping of x, y, z, roll, pitch, yaw")
-    return _placement(validate(FrameValues, given, ""), context)
+def _frame(given: Any, context: FileContext | None) -> str | Placement | None:
+    if isinstance(given, dict) and context is not None:
+        return _placement(given, context)
+    if given is None or isinstance(given, Placement):
+        return given
+    return str(check("", given, ("base", "unknown")))
 
 
-def _as_it_is(given: Any) -> Any:
-    return given
+Board = Annotated[Placement, _in_file(_placement)]
+Frame = Annotated[Placement | str, _convert(_frame)]
 
 
-Frame = Annotated[Placement, InFile(FrameValues, _placement)]
-
-
-@schema()
+@schema
 class Box:
     """A box along the axes of the robot's base frame.
 
@@ -341,9 +315,8 @@ class Box:
     upper: Point
 
     def __post_init__(self) -> None:
-        if not (self.lower < self.upper).all():
-            found = f"found {self.upper.tolist()} above a lower of {self.lower.tolist()}"
-            raise InputError("box: upper", found, "more than lower in x, y and z")
+        found = f"found {self.upper.tolist()} above a lower of {self.lower.tolist()}"
+        _require(bool((self.lower < self.upper).all()), "upper", found, "more than lower in x, y and z")
 
     def holds(self, points: Floats) -> NDArray[np.bool_]:
         """Which points, shape (n, 3), [m], are in it or on its faces, shape (n,)."""
@@ -351,7 +324,7 @@ class Box:
         return inside
 
 
-@schema(kw_only=True)
+@schema
 class Conditions:
     """Conditions on configurations of any kind.
 
@@ -361,28 +334,11 @@ class Conditions:
             as its share of the arm's reach. None: any.
     """
 
-    keep_out: tuple[Box, ...] = ()
-    apart: PositiveAngle | None = None
+    keep_out: tuple[Box, ...] = Field(default=(), kw_only=True)
+    apart: PositiveAngle | None = Field(default=None, kw_only=True)
 
 
-def _roll(given: object) -> object:
-    return None if given == "random" else given
-
-
-def _posture(given: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-    if given is None or info.context is None:
-        return given
-    joints, units = info.context.robot.joints, info.context.units
-    if len(given) != len(joints):
-        raise InputError("posture", f"{len(given)} values", f"{len(joints)}, one a joint")
-    for i, (value, joint) in enumerate(zip(given, joints, strict=True)):
-        low, high = (limit / units.factor(joint.unit) for limit in (joint.lower, joint.upper))
-        if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
-            raise InputError(f"posture {i + 1}", f"found {shown(value)}", f"within [{low:.6g}, {high:.6g}]")
-    return tuple(v * units.factor(j.unit) for v, j in zip(given, joints, strict=True))
-
-
-@schema()
+@schema
 class BoardViews(Conditions):
     """Configurations in which the tool's z axis, a camera's optical axis, meets the centre of a board.
 
@@ -401,8 +357,6 @@ class BoardViews(Conditions):
             smallest rotation of the optical axis applied to that. None draws it.
         self_motion: `random`: every configuration has its own, from a random start of the inverse kinematics;
             `held`: all continue from that of A by steps of minimum norm.
-        posture: Configuration near which that of A is sought, if self-motion is held, shape (n_joints,), [rad]
-            (prismatic: [m]); None draws it.
         field_of_view: Half angle of the cone about the optical axis in which the camera sees, [rad]. The camera, placed
             and rolled as above, is rotated so that the board's centre is anywhere in that cone, evenly in solid angle;
             at 0 the optical axis meets the centre.
@@ -410,27 +364,25 @@ class BoardViews(Conditions):
             field of view are taken. None: the centre alone is seen.
     """
 
-    board: Annotated[Frame, Field(validation_alias="pose")]
+    board: Annotated[Board, Field(validation_alias="pose")]
     count: Count = 51
     height: PositiveLength = 0.5
     radius: PositiveLength = 0.5
     distance: tuple[PositiveLength, PositiveLength] | None = None
     cone: PositiveAngle = math.pi / 3.0
-    roll: Annotated[Angle | None, BeforeValidator(_roll)] = None
+    roll: Annotated[Angle | None, BeforeValidator(lambda given: None if given == "random" else given)] = None
     self_motion: Literal["random", "held"] = "random"
-    posture: Annotated[tuple[Number, ...] | None, AfterValidator(_posture)] = None
     field_of_view: AngleFromZero = 0.0
     board_size: tuple[PositiveLength, PositiveLength] | None = None
 
     def __post_init__(self) -> None:
-        if self.distance is not None and self.distance[0] > self.distance[1]:
-            raise InputError("board: distance", f"found {shown(list(self.distance))}", "the smaller one first")
-        if max(self.cone, self.field_of_view) > 0.5 * math.pi + 1e-9:
-            key = "cone" if self.cone > self.field_of_view else "field_of_view"
-            raise InputError(f"board: {key}", f"found {getattr(self, key):g} rad", "at most a quarter turn")
+        _require_order(self.distance or (0.0, 0.0))
+        for key in ("cone", "field_of_view"):
+            angle = getattr(self, key)
+            _require(angle <= 0.5 * math.pi + 1e-9, key, f"found {angle:g} rad", "at most a quarter turn")
 
 
-@schema()
+@schema
 class TargetViews(Conditions):
     """Configurations in which a tracker sees a reflector on the tool.
 
@@ -449,26 +401,23 @@ class TargetViews(Conditions):
     count: CountFromOne = 50
     axis: Direction = Field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     acceptance: PositiveAngle = math.pi / 6.0
-    distance: tuple[LengthFromZero, Annotated[Bound, _scaled("m")]] = (0.0, math.inf)
+    distance: tuple[LengthFromZero, Annotated[Bound, _scale("m")]] = (0.0, math.inf)
     region: Box | None = None
 
     def __post_init__(self) -> None:
-        if not self.axis.any():
-            raise InputError("tracker: axis", "found 0, 0, 0", "a direction")
-        if self.acceptance > math.pi:
-            raise InputError("tracker: acceptance", f"found {self.acceptance:g} rad", "at most half a turn")
-        if not self.distance[0] <= self.distance[1]:
-            raise InputError("tracker: distance", f"found {shown(list(self.distance))}", "the smaller one first")
+        _require(bool(self.axis.any()), "axis", "found 0, 0, 0", "a direction")
+        _require(self.acceptance <= math.pi, "acceptance", f"found {self.acceptance:g} rad", "at most half a turn")
+        _require_order(self.distance)
 
 
-@schema()
+@schema
 class RandomReadings(Conditions):
     """Configurations drawn evenly within the joint limits, +-180 degrees or +-1 m where there are none."""
 
     count: CountFromOne
 
 
-@schema()
+@schema
 class GivenReadings(Conditions):
     """Configurations of a table.
 
@@ -476,13 +425,13 @@ class GivenReadings(Conditions):
         readings: Shape (n_configurations, n_joints), [rad] (prismatic: [m]).
     """
 
-    readings: Annotated[Floats, InFile(Any, lambda given, _: given, lambda given: frozen(np.asarray(given, float)))]
+    readings: Annotated[Floats, _convert(lambda given, _: as_floats("", given, "(n, m)"))]
 
 
 Configurations = BoardViews | TargetViews | RandomReadings | GivenReadings
 
 
-@schema()
+@schema
 class _ConfigurationsInFile:
     board: BoardViews | None = None
     tracker: TargetViews | None = None
@@ -492,15 +441,15 @@ class _ConfigurationsInFile:
     apart: PositiveAngle | None = None
 
 
-def _configurations(given: _ConfigurationsInFile, context: FileContext) -> Configurations:
-    found: dict[str, Any] = _the_one_of({key: getattr(given, key) for key in ("board", "tracker", "random", "table")})
-    ((key, value),) = found.items()
+def _configurations(given: Any, context: FileContext) -> Configurations:
+    file = _read(_ConfigurationsInFile, given, "", context)
+    key, found = _the_one_of({key: getattr(file, key) for key in ("board", "tracker", "random", "table")})
     if key == "table":
-        value = GivenReadings(read_measurements(context.folder / value, context.robot, units=context.units).readings)
-    return cast("Configurations", replace(value, keep_out=given.keep_out, apart=given.apart))
+        found = GivenReadings(read_measurements(context.folder / found, context.robot, units=context.units).readings)
+    return cast("Configurations", replace(found, keep_out=file.keep_out, apart=file.apart))
 
 
-def _the_one_of(given: Mapping[str, Any]) -> dict[str, Any]:
+def _the_one_of(given: Mapping[str, Any]) -> tuple[str, Any]:
     """The only entry that is not None.
 
     Raises:
@@ -509,44 +458,30 @@ def _the_one_of(given: Mapping[str, Any]) -> dict[str, Any]:
     found = {key: value for key, value in given.items() if value is not None}
     if len(found) != 1:
         raise InputError("", f"found {' and '.join(found) or 'none'}", known_names(list(given)))
-    return found
+    return next(iter(found.items()))
 
 
-ConfigurationsInFile = Annotated[Configurations, InFile(_ConfigurationsInFile, _configurations, _as_it_is)]
+InPairing = Annotated[Pairing, _in_file(lambda given, _: pairing_of(given, ""))]
+InConfigurations = Annotated[Configurations, _in_file(_configurations)]
 
 
 # --- noise and landmarks ----------------------------------------------------------------------------------------------
 
-
-class _NoiseOfFields(Schema):
-    position: LengthFromZero | None = None
-    orientation: AngleFromZero | None = None
-    joint: Any = None  # one value, or one a joint
-    distance: LengthFromZero | None = None
-    angle: AngleFromZero | None = None
-    point: LengthFromZero | None = None
-    pixel: NotNegative | None = None
-
-
-_GENERIC: dict[str, Any] = {
-    name: (LengthFromZero | None if column.unit == "length" else AngleFromZero | None, None)
-    for name, column in GENERIC_COLUMNS.items()
-}
-_NoiseInFile = create_model("_NoiseInFile", __base__=_NoiseOfFields, **_GENERIC)
-
-NOISE_KINDS = tuple(kind for kind in _NoiseInFile.model_fields if kind != "joint")
+_SIGMAS: dict[str, Any] = dict.fromkeys(NOISE_UNITS, (NotNegative | None, None))
+_NoiseInFile: Any = pydantic.create_model("_NoiseInFile", __base__=Schema, joint=(Any, 0.0), **_SIGMAS)
 
 
 def _noise(given: Any, context: FileContext) -> Noise:
-    values = {kind: getattr(given, kind) for kind in NOISE_KINDS}
-    joint = 0.0 if given.joint is None else given.joint
-    return Noise().updated(**values, joint=joint_noise(joint, context.units, context.robot, ""))
+    file = validate(_NoiseInFile, given, "")
+    specified = {kind: (getattr(file, kind), context.factor(unit)) for kind, unit in NOISE_UNITS.items()}
+    values = {kind: sigma * factor for kind, (sigma, factor) in specified.items() if sigma is not None}
+    return Noise(joint=joint_noise(file.joint, context.units, context.robot, "")).updated(**values)
 
 
-NoiseInFile = Annotated[Noise, InFile(_NoiseInFile, _noise)]
+InNoise = Annotated[Noise, _in_file(_noise)]
 
 
-@schema()
+@schema
 class Spot:
     """The true place of a point: of a target in the tool frame, of an anchor or a contact point in the base frame.
 
@@ -566,13 +501,12 @@ class _SpotInFile(Schema):
     tolerance: NotNegative | None = None
 
 
-def _spot(given: _SpotInFile, context: FileContext) -> Spot:
-    length = context.units.factor("m")
-    tolerance = None if given.tolerance is None else given.tolerance * length
-    return Spot(np.array([given.x, given.y, given.z]) * length, tolerance)
+def _spot(given: Any, _: FileContext) -> dict[str, Any]:
+    file = validate(_SpotInFile, given, "")
+    return {"xyz": (file.x, file.y, file.z), "tolerance": file.tolerance}
 
 
-@schema()
+@schema
 class Plane:
     """The true place of a plane: points x with `normal . x = distance`, distances from it positive along its normal.
 
@@ -586,250 +520,139 @@ class Plane:
 
     def __post_init__(self) -> None:
         length = float(np.linalg.norm(self.normal))
-        if length == 0.0:
-            raise InputError("normal", "found 0, 0, 0", "a direction")
-        object.__setattr__(self, "normal", frozen(self.normal / length))
+        _require(length > 0.0, "normal", "found 0, 0, 0", "a direction")
+        object.__setattr__(self, "normal", self.normal / length)
 
 
-def _landmarks(kind: Any, counted: bool = True) -> InFile:
-    """Landmarks by name; or how many are drawn."""
-
-    def convert(given: Any, context: FileContext) -> Any:
-        if not isinstance(given, Mapping):
-            return read_as(Count if counted else dict[str, Any], given, "", context)
-        for name in given:
-            if not isinstance(name, str) or not name or name != name.strip() or not name.isprintable():
-                raise InputError("", f"found name {shown(name)}", "a word")
-        return {name: read_as(kind, one, name, context) for name, one in given.items()}
-
-    def check_count(given: Any) -> Any:
-        return given if isinstance(given, Mapping) else TypeAdapter(Count).validate_python(given)
-
-    return InFile(Any, convert, check_count)
+Name = Annotated[str, Field(pattern=r"^\S(.*\S)?$")]
 
 
-Spots = Annotated[Mapping[str, Spot] | int, _landmarks(Annotated[Spot, InFile(_SpotInFile, _spot)])]
-Planes = Annotated[Mapping[str, Plane] | int, _landmarks(Plane)]
-Boards = Annotated[Mapping[str, Placement], _landmarks(Frame, counted=False)]
-PairingInFile = Annotated[Pairing, InFile(Any, lambda given, _: pairing_of(given, "pairing"))]
+def _by_name(kind: Any, number: bool = True) -> BeforeValidator:
+    """Annotation of landmarks by name; or of how many are drawn."""
+
+    def read(given: Any, context: FileContext | None) -> Any:
+        counted = number and not isinstance(given, Mapping)
+        every = Annotated[dict[Name, kind], Field(min_length=1)]
+        return _read(CountFromOne if counted else every, given, "", context)
+
+    return _convert(read)
 
 
-@schema()
-class Corners:
-    """The corners of a chequered board, in rows and columns about its centre, in its plane.
+Spots = Annotated[Mapping[str, Spot] | int, _by_name(Annotated[Spot, _in_file(_spot)])]
+Planes = Annotated[Mapping[str, Plane] | int, _by_name(Plane)]
+Boards = Annotated[Mapping[str, Placement], _by_name(Board, number=False)]
 
-    Attributes:
+
+class _CornersInFile(Schema):
+    columns: CountFromOne
+    rows: CountFromOne
+    square: Positive
+
+
+def board_corners(columns: int, rows: int, square: float) -> Floats:
+    """Corners of a chequered board about its centre, row by row, x and y in its plane, shape (rows * columns, 2), [m].
+
+    Args:
         columns: Along its x axis.
         rows: Along its y axis.
         square: From one to the next, [m].
     """
-
-    columns: CountFromOne
-    rows: CountFromOne
-    square: PositiveLength
-
-    @property
-    def points(self) -> Floats:
-        """Coordinates x and y of each, row by row, shape (rows * columns, 2), [m]."""
-        x, y = (self.square * (np.arange(n) - 0.5 * (n - 1)) for n in (self.columns, self.rows))
-        return np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
+    x, y = (square * (np.arange(n) - 0.5 * (n - 1)) for n in (columns, rows))
+    return np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
 
 
-@dataclass(frozen=True)
-class BoardPoints:
-    """Points of a board anywhere in its plane.
-
-    Attributes:
-        points: Coordinates x and y of each, shape (n, 2), [m].
-    """
-
-    points: Floats
+def _corners(given: Any, context: FileContext) -> Floats:
+    file = validate(_CornersInFile, given, "")
+    return board_corners(file.columns, file.rows, file.square * context.factor("m"))
 
 
 # --- instruments ------------------------------------------------------------------------------------------------------
 
-
-_MODELS_OF: dict[str, tuple[Model, ...]] = {
-    "PlainInstrument": (),
-    "Sockets": ("distance",),
-    "PairGauge": tuple(PAIR_MODELS),
-    "Tracker": (*POSE_MODELS, *PAIR_MODELS),
-    "LengthGauge": ("anchor",),
-    "Indicator": ("plane",),
-    "BoardCamera": ("board", "pixels"),
+_MODELS_WITH: Mapping[str, tuple[str, ...]] = {
+    "targets": ("pose", "position"),
+    "stations": tuple(POSE_MODELS),
+    "frame": (*POSE_MODELS, "pixels"),
+    **dict.fromkeys(("pairing", "pairs"), tuple(PAIR_MODELS)),
+    "sockets": ("distance",),
+    **dict.fromkeys(("anchors", "offset"), ("anchor",)),
+    "planes": ("plane",),
+    "contact": ("anchor", "plane"),
+    **dict.fromkeys(("boards", "from_behind"), ("board", "pixels")),
+    **dict.fromkeys(("camera", "fixed", "corners"), ("pixels",)),
 }
-"""Models that each instrument measures; a plain one measures all that no other does."""
-
-_LANDMARKS_OF = {"Sockets": "sockets", "LengthGauge": "anchors", "Indicator": "planes"}
-"""Landmarks of which an instrument needs at least one."""
+"""Models that take each field of an instrument which not all take."""
 
 
-@schema(kw_only=True)
+@schema
 class Instrument:
-    """Fields of all instruments.
+    """What measures a table of a scenario; a table at the top of the module says which models take which fields.
+
+    Every target is seen at every configuration; anchors, planes and contact points are measured in turn. A board is
+    seen where its centre (pixels: the corner) is in front of the camera (pixels: and in the image, which is twice as
+    wide as cx and twice as high as cy), and the camera is on the side of the board's z axis.
 
     Attributes:
         model: The model of its table.
         name: The name of its table, without the ending.
         noise: Its own values, 1 sigma; the scenario's where there are none, and those of the joints always.
-        stated_noise: Values that the calibration is given instead.
         configurations: Where it measures; where the scenario's instruments do if None. Test rows are those of the
             scenario's validation.
+        targets: Points of the tool by name, or how many; the tool point itself if None.
+        stations: How many measure in turn; each has a frame of its own.
+        frame: world_T_base: the base itself, unknown (drawn), or given; the scenario's if None. Of several stations
+            the first has it, the others' are drawn. camera_T_base of a fixed camera; if None it looks at the
+            workspace's middle from two and a half times its radius.
+        pairing: How pairs are formed from measured poses; a star if None.
+        pairs: Pairs of configurations that are measured directly.
+        sockets: Contact points by name, or how many: the tool point touches one from each configuration.
+        anchors: By name, or how many; three if None.
+        offset: What is added to every length, [m], which the calibration then estimates; nothing if None.
+        planes: By name, or how many; three if None.
+        contact: Whether the tool point is brought to the anchor, or along the normal to the plane, from each
+            configuration. What is out of reach is left out.
+        boards: base_T_board by name; that which the configurations look at if None.
+        camera: What takes the images.
+        fixed: Whether the camera stands in the room, and the board is the tool.
+        corners: Points of the boards, x and y in their planes, shape (n, 2), [m].
+        from_behind: Names of boards whose z axis points away from the camera.
     """
 
     model: Model
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-    noise: NoiseInFile = Field(default_factory=Noise)
-    stated_noise: NoiseInFile = Field(default_factory=Noise)
-    configurations: ConfigurationsInFile | None = None
-
-    def __post_init__(self) -> None:
-        if _MODELS_OF[type(self).__name__]:
-            check(f"instruments: {self.name}: model", self.model, _MODELS_OF[type(self).__name__])
-        landmarks = getattr(self, _LANDMARKS_OF.get(type(self).__name__, ""), None)
-        if landmarks is not None and not landmarks:
-            self._refuse(_LANDMARKS_OF[type(self).__name__], "found none", "at least one")
-
-    def _refuse(self, key: str, found: str, expected: str) -> None:
-        raise InputError(f"instruments: {self.name}: {key}", found, expected)
-
-
-FrameOfInstrument = Annotated[str | Placement | None, InFile(Any, _frame_in_file, _as_it_is)]
-
-
-@schema(kw_only=True)
-class PlainInstrument(Instrument):
-    """An instrument that measures the columns of its model at every configuration, landmarks in turn."""
-
-
-@schema(kw_only=True)
-class Tracker(Instrument):
-    """Poses, positions or orientations of the tool, or positions of targets on it; pairs formed from these.
-
-    Every target is seen at every configuration. With several stations the configurations are measured from them in
-    turn.
-
-    Attributes:
-        targets: By name, or how many; the tool point itself if 0.
-        stations: How many; each has a frame of its own.
-        frame: world_T_base: the base itself, unknown (drawn), or given; the scenario's if None. Of several stations
-            the first has it, the others' are drawn.
-        pairing: How pairs are formed, for models of pairs.
-    """
-
-    targets: Spots = 0
+    noise: InNoise = Noise()
+    configurations: InConfigurations | None = None
+    targets: Spots | None = None
     stations: CountFromOne = 1
-    frame: FrameOfInstrument = None
-    pairing: PairingInFile = Field(default_factory=Pairing)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.targets and not POSE_MODELS.get(self.model, (True, False))[1]:
-            self._refuse("targets", f"with model {self.model}", "model position or pose")
-        if self.stations > 1 and (self.frame == "base" or self.model in PAIR_MODELS):
-            found = "frame base" if self.frame == "base" else f"model {self.model}"
-            self._refuse("stations", f"{self.stations} with {found}", "1")
-
-
-@schema(kw_only=True)
-class PairGauge(Instrument):
-    """Distances and angles between configurations, measured directly.
-
-    Attributes:
-        pairs: Which configurations.
-    """
-
-    pairs: PairingInFile = Field(default_factory=Pairing)
-
-
-@schema(kw_only=True)
-class LengthGauge(Instrument):
-    """Lengths from the tool point to anchors, one at a configuration, the anchors in turn.
-
-    Attributes:
-        anchors: By name, or how many.
-        offset: What the instrument adds to every length, [m], which the calibration then estimates; nothing if None.
-        contact: Whether the tool point is brought to the anchor, from each configuration, and the length is 0.
-    """
-
-    model: Model = "anchor"
-    anchors: Spots = 3
-    offset: Length | None = None
-    contact: pydantic.StrictBool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.contact and self.offset is not None:
-            self._refuse("offset", "with contact", "none: there is no length")
-
-
-@schema(kw_only=True)
-class Indicator(Instrument):
-    """Distances of the tool point from planes, one at a configuration, the planes in turn.
-
-    Attributes:
-        planes: By name, or how many.
-        contact: Whether the tool point is brought to the plane, along its normal from each configuration; what is out
-            of reach is left out.
-    """
-
-    model: Model = "plane"
-    planes: Planes = 3
-    contact: pydantic.StrictBool = False
-
-
-@schema(kw_only=True)
-class BoardCamera(Instrument):
-    """Boards as a camera on the tool sees them; or the board on the tool as a camera in the room does.
-
-    A board is seen where its centre (pixels: the corner) is in front of the camera (pixels: and in the image, which is
-    twice as wide as cx and twice as high as cy), and the camera is on the side of the board's z axis.
-
-    Attributes:
-        boards: base_T_board by name; where there are none, that which the configurations look at.
-        camera: For pixels.
-        corners: For pixels.
-        fixed: Whether the camera stands in the room and the board is the tool.
-        frame: camera_T_base of a fixed camera; if None one that looks at the workspace's middle from two and a half
-            times its radius.
-        from_behind: Names of boards whose z axis points away from the camera instead.
-    """
-
-    boards: Boards = Field(default_factory=dict)
-    camera: Annotated[Camera | None, InFile(Any, lambda given, _: given)] = None
-    corners: Annotated[Corners | BoardPoints | None, InFile(Corners, lambda given, _: given, _as_it_is)] = None
-    fixed: bool = False
     frame: Frame | None = None
+    pairing: InPairing | None = None
+    pairs: InPairing | None = None
+    sockets: Spots | None = None
+    anchors: Spots | None = None
+    offset: Length | None = None
+    planes: Planes | None = None
+    contact: pydantic.StrictBool = False
+    boards: Boards | None = None
+    camera: Camera | None = None
+    fixed: pydantic.StrictBool = False
+    corners: Annotated[Floats | None, _in_file(_corners)] = None
     from_behind: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        pixels = self.model == "pixels"
+        defaults = {f.name: f.default for f in fields(cast("Any", self))}
+        for key, models in _MODELS_WITH.items():
+            given = getattr(self, key) is not defaults[key]
+            _require(not given or self.model in models, key, f"with model {self.model}", f"model {' or '.join(models)}")
+        _require(not self.contact or self.offset is None, "offset", "with contact", "none: there is no length")
         for key in ("camera", "corners"):
-            if (getattr(self, key) is not None) != pixels:
-                found = f"found {'none' if pixels else 'one'} with model {self.model}"
-                self._refuse(key, found, "it with model pixels")
-        if self.fixed and (self.boards or not pixels):
-            found = "boards" if self.boards else f"model {self.model}"
-            self._refuse("camera", f"fixed, with {found}", "model pixels, and the board on the tool")
+            given = getattr(self, key) is not None
+            _require(given or self.model != "pixels", key, "found none with model pixels", "it with model pixels")
+        _require(not self.fixed or not self.boards, "camera", "fixed, with boards", "the board on the tool")
 
 
-@schema(kw_only=True)
-class Sockets(Instrument):
-    """Contact points that the tool point touches, one from each configuration, in turn; and their distances.
-
-    Attributes:
-        sockets: By name, or how many.
-    """
-
-    model: Model = "distance"
-    sockets: Spots = 2
-
-
-def override_noise(noise: Noise, more: Noise) -> Noise:
+def override_noise(noise: Noise, more: Noise | None) -> Noise:
     """A noise with the values of another where it has some; the joints' stay."""
-    values = {kind: more.get(kind) for kind in NOISE_KINDS}
-    return noise.updated(**{name: value for name, value in values.items() if value is not None})
+    values = {} if more is None else {kind: more.get(kind) for kind in NOISE_UNITS}
+    return noise.updated(**{kind: value for kind, value in values.items() if value is not None})
 
 
 def frame_knowledge(frame: str | Placement) -> FrameKnowledge:
@@ -840,7 +663,7 @@ def frame_knowledge(frame: str | Placement) -> FrameKnowledge:
 # --- the scenario -----------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@schema
 class Errors:
     """True minus nominal values of parameters.
 
@@ -852,29 +675,24 @@ class Errors:
     """
 
     law: Literal["uniform", "normal", "values"]
-    values: Mapping[str, float]
-
-    def __post_init__(self) -> None:
-        check("errors: law", self.law, ("uniform", "normal", "values"))
+    values: Mapping[str, Number]
 
 
 class _ErrorsInFile(Schema):
     uniform: dict[str, NotNegative] | None = None
-    normal: Any = None  # `tolerance`, or as `uniform`
+    normal: dict[str, NotNegative] | None = None
     values: dict[str, Number] | None = None
 
 
-def _errors(given: _ErrorsInFile, context: FileContext) -> Errors:
-    found = _the_one_of({key: getattr(given, key) for key in _ErrorsInFile.model_fields})
-    ((law, values),) = found.items()
-    if values == "tolerance":
+def _errors(given: Any, context: FileContext) -> Errors:
+    if given == {"normal": "tolerance"}:
         for p in context.robot.parameters:
             if p.estimated and p.tolerance is None:
                 raise InputError("normal", f"{p.name} of the robot has no tolerance", "one for all that is estimated")
-        values = {p.name: p.tolerance for p in context.robot.parameters if p.tolerance is not None}
-    else:
-        values = read_as(dict[str, NotNegative], values, law, context) if law == "normal" else values
-        values = {key: value * context.units.factor(unit_of_key(key)) for key, value in values.items()}
+        return Errors("normal", {p.name: p.tolerance for p in context.robot.parameters if p.tolerance is not None})
+    file = validate(_ErrorsInFile, given, "")
+    law, values = _the_one_of({key: getattr(file, key) for key in _ErrorsInFile.model_fields})
+    values = {key: value * context.factor(unit_of_key(key)) for key, value in values.items()}
     return Errors(cast("Any", law), values_by_name(context.robot, values, law))
 
 
@@ -899,7 +717,7 @@ def values_by_name(robot: Robot, values: Mapping[str, float], place: str) -> dic
     return {name: value for name, value in found.items() if value is not None}
 
 
-@dataclass(frozen=True)
+@schema
 class Scenario(Brief):
     """A simulation to run, in SI.
 
@@ -911,7 +729,7 @@ class Scenario(Brief):
         frame: world_T_base, in whose world the poses are measured: `base` is the base itself, `unknown` an arbitrary
             one, drawn.
         validation: Where it is measured to test the calibration; None without test rows.
-        stated_noise: The noise that the calibration is given, where that is another one.
+        stated_noise: Values that the calibration is given instead of the true ones; None where these are given.
         job: Other keys of the calibration job, such as model and pairing.
         length_unit: Unit of length of the job's files.
         angle_unit: Unit of angles of the job's files.
@@ -920,12 +738,12 @@ class Scenario(Brief):
         instruments: What measures, each a table of its own; poses of the tool are measured if empty.
     """
 
-    robot: Robot
-    errors: Errors | None
-    configurations: Configurations
-    noise: Noise
-    frame: Literal["base", "unknown"] | Placement = "unknown"
-    validation: Configurations | None = None
+    robot: InstanceOf[Robot]
+    errors: Annotated[Errors, _in_file(_errors)] | None
+    configurations: InConfigurations
+    noise: InNoise
+    frame: Frame = "unknown"
+    validation: InConfigurations | None = None
     stated_noise: Noise | None = None
     job: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({"model": "distance-rotation"}))
     length_unit: LengthUnit = "m"
@@ -935,14 +753,13 @@ class Scenario(Brief):
     instruments: tuple[Instrument, ...] = ()
 
     def __post_init__(self) -> None:
-        if not isinstance(self.frame, Placement):
-            check(f"{self.source}: frame", self.frame, ("base", "unknown"))
-        check(f"{self.source}: length_unit", self.length_unit, LengthUnit)
-        check(f"{self.source}: angle_unit", self.angle_unit, AngleUnit)
-        names = [i.name for i in self.instruments]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"{self.source}: instruments", f"{names.count(name)} with the name {name}", "one")
+        files: set[str] = set()
+        for number, i in enumerate(self.instruments, start=1):
+            place, own = f"instrument {number}", {i.name.lower(), f"{i.name}_pairs".lower()}
+            _require(not own & files, f"{place}: name", f"{i.name} is there already", "another one")
+            known = (self.frame if i.frame is None else i.frame) == "base"
+            _require(not known or i.stations == 1, f"{place}: stations", f"{i.stations} with frame base", "1")
+            files |= own
 
     @property
     def pairing(self) -> Pairing:
@@ -960,7 +777,7 @@ class _ScenarioInFile(Schema):
     frame: Any = "unknown"
     validation: Any = None
     job: dict[str, Any] | None = None
-    instruments: Any = None
+    instruments: list[dict[str, Any]] | None = Field(None, min_length=1)
 
 
 @checked
@@ -983,88 +800,45 @@ def read_scenario(path: Path | str) -> Scenario:
     file = validate(_ScenarioInFile, read_yaml(path), source)
     robot = robot_of(file.robot, f"{source}: robot", path.parent, file.units)
     context = FileContext(file.units, path.parent, robot)
-
-    def read(kind: Any, key: str, given: Any = None) -> Any:
-        given = getattr(file, key) if given is None else given
-        return None if given is None else read_as(kind, given, f"{source}: {key}", context)
-
-    noise = read(NoiseInFile, "noise")
-    job, stated = _job(file, noise, source, context)
-    instruments = () if file.instruments is None else _read_instruments(file.instruments, stated, source, context)
-    check_choices({**job, **({"model": instruments[0].model} if instruments else {})}, robot, f"{source}: job")
-    return Scenario(
-        robot=robot,
-        errors=read(Annotated[Errors, InFile(_ErrorsInFile, _errors)], "errors"),
-        configurations=read(ConfigurationsInFile, "configurations"),
-        noise=noise,
-        frame=cast("Any", with_place(f"{source}: frame", lambda: _frame_in_file(file.frame, context))),
-        validation=read(ConfigurationsInFile, "validation"),
-        stated_noise=None if stated is None else override_noise(replace(noise, joint=stated.joint), stated),
-        job=job,
-        length_unit=file.units.length,
-        angle_unit=file.units.angle,
-        name=file.name or Path(source).stem,
-        source=source,
-        instruments=instruments,
-    )
+    job, stated = _read_job(file, source, context)
+    given = {
+        **{key: getattr(file, key) for key in ("errors", "configurations", "noise", "frame", "validation")},
+        **{"robot": robot, "job": job, "stated_noise": stated, "source": source},
+        **{"length_unit": file.units.length, "angle_unit": file.units.angle, "name": file.name or Path(source).stem},
+        "instruments": _complete(file.instruments or (), source, path.parent),
+    }
+    scenario: Scenario = _read(Scenario, given, source, context)
+    model = {"model": scenario.instruments[0].model} if scenario.instruments else {}
+    check_choices({**job, **model}, robot, f"{source}: job")
+    return scenario
 
 
-def _job(file: _ScenarioInFile, noise: Noise, source: str, context: FileContext) -> tuple[dict[str, Any], Noise | None]:
+def _read_job(file: _ScenarioInFile, source: str, context: FileContext) -> tuple[dict[str, Any], Noise | None]:
     """Keys of the job that the simulation does not write, and the noise that it specifies instead of the true one."""
-    place, alone = f"{source}: job", file.instruments is None
+    alone = file.instruments is None
     given = dict(file.job) if file.job is not None else {"model": "distance-rotation"} if alone else {}
     written = {"robot", "measurements", "pairs", "frame", "units", "truth"}
     of_instruments = {"model", "pairing", "targets", "anchors", "tolerance", "offset", "camera"}
     for key in given:
         if key in written or (key in of_instruments and not alone):
-            raise InputError(place, f"found key {key!r}", "none", "it follows from the scenario or its instruments")
-    specified = given.pop("noise", None)
-    if specified is None:
-        return given, None
-    found: Noise = read_as(NoiseInFile, specified, f"{place}: noise", context)
-    for kind in NOISE_KINDS:
-        if found.get(kind) == 0.0:
-            raise InputError(f"{place}: noise: {kind}", "found 0", "a number above 0")
-    return given, found if "joint" in specified else replace(found, joint=noise.joint)
+            hint = "it follows from the scenario or its instruments"
+            raise InputError(f"{source}: job", f"found key {key!r}", "none", hint)
+    noise = given.pop("noise", None)
+    if isinstance(noise, dict) and isinstance(file.noise, dict) and "joint" in file.noise:
+        noise = {"joint": file.noise["joint"]} | noise
+    return given, None if noise is None else _read(InNoise, noise, f"{source}: job: noise", context)
 
 
-def _read_instruments(given: object, stated: Noise | None, source: str, context: FileContext) -> tuple[Instrument, ...]:
-    """The instruments of a file.
-
-    Raises:
-        InputError: One cannot be used.
-    """
-    place = f"{source}: instruments"
-    if not isinstance(given, list) or not given:
-        raise InputError(place, f"found {shown(given)}", "a list of instruments, each with its model")
-    found: list[Instrument] = []
-    for number, one in enumerate(given, start=1):
-        at = f"{place} {number}"
-        if not isinstance(one, dict) or "model" not in one:
-            raise InputError(at, f"found {shown(one)}", "a mapping with a model")
-        model = one["model"]
-        check(f"{at}: model", model, Model)
-        taken = [i.name for i in found]
-        count = 1 + sum(re.fullmatch(rf"{model}(_\d+)?", other) is not None for other in taken)
-        entry = {"name": model if count == 1 else f"{model}_{count}"} | one
-        files = {f"{other}{end}".lower() for other in taken for end in ("", "_pairs")}
-        if {f"{entry['name']}{end}".lower() for end in ("", "_pairs")} & files:
-            raise InputError(f"{at}: name", f"{entry['name']} is there already", "another one")
+def _complete(entries: Sequence[dict[str, Any]], source: str, folder: Path) -> list[dict[str, Any]]:
+    """The entries of instruments with names, and with cameras as they are read."""
+    found, unnamed = [], Counter[str]()
+    for number, entry in enumerate(entries, start=1):
+        model = str(entry.get("model"))
+        unnamed[model] += "name" not in entry
+        name = model if unnamed[model] == 1 else f"{model}_{unnamed[model]}"
+        camera = dict[str, Any]()
         if "camera" in entry:
-            camera, fixed = camera_in(entry["camera"], f"{at}: camera", context.folder)
-            entry |= {"camera": camera, "fixed": fixed}
-        try:
-            instrument = read_as(_class_for(entry), entry, at, context)
-        except InputError as error:
-            within = error.place.replace(f"instruments: {entry['name']}: ", "")
-            raise InputError(within, error.found, error.expected, error.hint) from None
-        found.append(instrument if stated is None else replace(instrument, stated_noise=replace(stated, joint=0.0)))
-    return tuple(found)
-
-
-def _class_for(entry: Mapping[str, Any]) -> type[Instrument]:
-    """The instrument that measures what the model of a file's entry needs."""
-    if entry["model"] in PAIR_MODELS:
-        return Sockets if "sockets" in entry else PairGauge if "pairs" in entry else Tracker
-    kinds: tuple[type[Instrument], ...] = (Tracker, LengthGauge, Indicator, BoardCamera)
-    return next((kind for kind in kinds if entry["model"] in _MODELS_OF[kind.__name__]), PlainInstrument)
+            read, fixed = camera_in(entry["camera"], f"{source}: instrument {number}: camera", folder)
+            camera = {"camera": read, "fixed": fixed}
+        found.append({"name": name} | entry | camera)
+    return found

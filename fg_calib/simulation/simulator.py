@@ -14,18 +14,17 @@ from typing import Any
 import numpy as np
 
 from fg_calib.inputs import Brief, Floats, InputError, check_number, checked
-from fg_calib.measurements import Measurements, Noise, Table
+from fg_calib.measurements import Measurements, Table
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot
-from fg_calib.simulation.measure import Scene, Visits, draw_frame, generator_of, measure, merge_truths
+from fg_calib.simulation.measure import Measuring, Visits, choose_frame, generator_of, joint_sigma, merge_truths
 from fg_calib.simulation.scenario import (
     Configurations,
     Errors,
+    Instrument,
     Placement,
     Scenario,
-    Tracker,
     frame_knowledge,
-    override_noise,
     values_by_name,
 )
 from fg_calib.simulation.views import find_readings
@@ -99,7 +98,7 @@ class Simulation(Brief):
 
 @checked
 @single_threaded
-def simulate(scenario: Scenario, seed: int = 0, *, leave_out: bool = False) -> Simulation:
+def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simulation:
     """Run a scenario.
 
     Every parameter, every table and every kind of noise has a generator of its own, by its name: changing one leaves
@@ -108,66 +107,55 @@ def simulate(scenario: Scenario, seed: int = 0, *, leave_out: bool = False) -> S
     Args:
         scenario: What to simulate.
         seed: Same seed, same simulation.
-        leave_out: Whether configurations are left out from which a point to touch is not reached, instead of an error.
+        exact: Whether nothing has noise, and known points are where the calibration takes them to be.
 
     Raises:
         InputError: The scenario is impossible: poses that the robot does not reach within its joint limits, names that
             are no parameters, values that make no sense.
     """
     check_number("seed", seed, whole=True)
-    robot, source = scenario.robot, scenario.source
-    true_robot = _draw_robot(robot, scenario.errors, seed, f"{source}: errors")
-    frame = scenario.frame
-    if not isinstance(frame, Placement):
-        unknown = frame == "unknown"
-        frame = draw_frame(generator_of(seed, "frame")) if unknown else Placement(np.eye(3), np.zeros(3))
-    common: list[Visits] = []
-    for key, of in (("configurations", scenario.configurations), ("validation", scenario.validation)):
-        if of is not None:
-            first = sum(map(len, common))
-            one = _visit(scenario, of, seed, f"{source}: {key}", key)
-            names = np.array([f"p{first + i}" for i in range(len(one))])
-            common.append(replace(one, ids=names, test=np.full(len(one), key == "validation")))
-    specified = scenario.stated_noise or scenario.noise
-    default = Tracker(model="pose", name="poses")
+    source = scenario.source
+    true_robot = _draw_robot(scenario.robot, scenario.errors, seed, f"{source}: errors")
+    frame = choose_frame(scenario.frame, generator_of(seed, "frame"))
+    common = [_visit(scenario, scenario.configurations, seed, "configurations", exact)]
+    if scenario.validation is not None:
+        common.append(_visit(scenario, scenario.validation, seed, "validation", exact, len(common[0].ids)))
+    default = Instrument(model="pose", name="poses")
     tables, truths = [], []
     for instrument in scenario.instruments or (default,):
         visits = common
         if instrument.configurations is not None:
-            place = f"{source}: instruments: {instrument.name}: configurations"
-            own = _visit(scenario, instrument.configurations, seed, place, instrument.name)
-            visits = [replace(own, ids=np.array([f"{instrument.name} p{i}" for i in range(len(own))])), *common[1:]]
-        scene = Scene(
-            robot=robot,
-            true_robot=true_robot,
-            visits=Visits.joined(visits),
-            configurations=instrument.configurations or scenario.configurations,
-            noise=override_noise(scenario.noise, instrument.noise),
-            stated_noise=override_noise(override_noise(specified, instrument.noise), instrument.stated_noise),
-            sigma_joint=_joint_sigma(specified, robot),
-            frame=frame,
-            known_frame=frame_knowledge(scenario.frame) == "known",
-            seed=seed,
-            source=source,
-            leave_out=leave_out,
-        )
-        table, truth = measure(instrument, scene)
+            own = _visit(scenario, instrument.configurations, seed, f"instruments: {instrument.name}", exact)
+            visits = [own._replace(ids=np.array([f"{instrument.name} {name}" for name in own.ids])), *common[1:]]
+        measuring = Measuring(scenario, instrument, true_robot, Visits.joined(visits), frame, seed, exact)
+        table, truth = measuring.measure()
         if instrument is default:
             table, truth = replace(table, model=scenario.job.get("model"), pairing=scenario.pairing), {}
         tables.append(table)
         truths.append(truth)
     shared, every = merge_truths(tables, truths, source)
-    return Simulation(scenario, seed, robot, true_robot, Visits.joined(common).true_readings, frame, shared, every)
+    true_readings = Visits.joined(common).true_readings
+    return Simulation(scenario, seed, scenario.robot, true_robot, true_readings, frame, shared, every)
 
 
-def _visit(scenario: Scenario, of: Configurations, seed: int, place: str, name: str) -> Visits:
-    """Configurations, and where the joints stand there."""
-    robot = scenario.robot
+def _visit(scenario: Scenario, of: Configurations, seed: int, what: str, exact: bool, first: int = 0) -> Visits:
+    """Configurations, and where the joints stand there.
+
+    Args:
+        scenario: What is simulated.
+        of: Which configurations.
+        seed: Seed of all draws.
+        what: The key that says so: `configurations`, `validation`, or `instruments: name`.
+        exact: Whether the encoders have no noise.
+        first: Number of the first.
+    """
+    robot, name = scenario.robot, what.removeprefix("instruments: ")
+    place = f"{scenario.source}: {what}" + ": configurations" * (name != what)
     readings = find_readings(robot, of, generator_of(seed, name, "configurations"), place)
-    n = len(readings)
-    noise = generator_of(seed, name, "joint noise").normal(size=(n, robot.n_joints))
-    stood = readings + _joint_sigma(scenario.noise, robot) * noise
-    return Visits(readings, stood, np.full(n, ""), np.zeros(n, dtype=np.bool_))
+    noise = generator_of(seed, name, "joint noise").normal(size=readings.shape)
+    stood = readings + (0.0 if exact else joint_sigma(scenario.noise, robot)) * noise
+    ids = np.array([f"p{first + k}" for k in range(len(readings))])
+    return Visits(readings, stood, ids, np.full(len(readings), what == "validation"))
 
 
 def _draw_robot(robot: Robot, errors: Errors | None, seed: int, place: str) -> Robot:
@@ -175,19 +163,14 @@ def _draw_robot(robot: Robot, errors: Errors | None, seed: int, place: str) -> R
     if errors is None:
         raise InputError(place, "found none", "one of uniform, normal, values: what the arm that moves has")
     values = values_by_name(robot, errors.values, f"{place}: {errors.law}")
-    if errors.law == "values":
-        return robot.with_values(robot.nominal + np.array([values.get(p.name, 0.0) for p in robot.parameters]))
     error = np.zeros(len(robot.parameters))
     for k, p in enumerate(robot.parameters):
         size = values.get(p.name, 0.0)
-        if not np.isfinite(size) or size < 0.0:
+        if errors.law == "values":
+            error[k] = size
+        elif size < 0.0:
             raise InputError(f"{place}: {errors.law}", f"found {size:g}", "numbers not below 0")
-        if p.estimated:
+        elif p.estimated:
             generator = generator_of(seed, "errors", p.name)
             error[k] = size * (generator.uniform(-1.0, 1.0) if errors.law == "uniform" else generator.normal())
     return robot.with_values(robot.nominal + error)
-
-
-def _joint_sigma(noise: Noise, robot: Robot) -> Floats:
-    """Sigma of the readings, shape (n_joints,), [rad] (prismatic: [m])."""
-    return np.broadcast_to(np.asarray(noise.joint, dtype=np.float64), robot.n_joints).copy()

@@ -75,12 +75,7 @@ class Candidates(FrozenArrays):
 
 def number_of(of: Configurations) -> int:
     """How many configurations are asked for."""
-    match of:
-        case BoardViews():
-            return 1 + of.count
-        case GivenReadings():
-            return len(of.readings)
-    return of.count
+    return len(of.readings) if isinstance(of, GivenReadings) else of.count + isinstance(of, BoardViews)
 
 
 def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Generator, n: int, place: str) -> Candidates:
@@ -105,26 +100,23 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
     most, hopeless = MAX_DRAWN_EACH * patience * n, MAX_DRAWN_IN_VAIN * patience
     if isinstance(of, GivenReadings):
         most = hopeless = len(of.readings)
-    thinning = Thinning(robot, of.apart)
-    taken, n_taken, asked = [np.empty((0, robot.n_joints))], 0, 0
+    unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
+    taken, asked = np.empty((0, robot.n_joints)), 0
     counts: Counter[str] = Counter()
-    while n_taken < n and asked < most and (n_taken or asked < hopeless):
-        share = n_taken / asked if n_taken else 1.0
-        k = int(1.1 * (n - n_taken) / share) + 10 if asked else min(n, MAX_DRAWN_IN_VAIN)
-        k = min(k, MAX_DRAWN_AT_ONCE, most - asked)
-        readings, reason = draw(k)
+    while len(taken) < n and asked < most and (len(taken) or asked < hopeless):
+        share = len(taken) / asked if len(taken) else 1.0
+        k = int(1.1 * (n - len(taken)) / share) + 10 if asked else min(n, MAX_DRAWN_IN_VAIN)
+        readings, reason = draw(min(k, MAX_DRAWN_AT_ONCE, most - asked))
         good = np.flatnonzero(reason == "")
-        if of.keep_out:
-            reason[good] = np.where(enters(robot, readings[good], of.keep_out), "in a box", "")
-            good = np.flatnonzero(reason == "")
-        reason[good] = np.where(thinning.near(readings[good]), "near another", "")
+        reason[good[enters(robot, readings[good], of.keep_out)]] = "in a box"
         good = np.flatnonzero(reason == "")
-        k = k if n_taken + len(good) < n else int(good[n - n_taken - 1]) + 1  # none after the last that is wanted
-        taken.append(readings[:k][reason[:k] == ""])
-        n_taken, asked = n_taken + len(taken[-1]), asked + k
+        reason[good[_near(taken / unit, readings[good] / unit, of.apart)]] = "near another"
+        good = np.flatnonzero(reason == "")[: n - len(taken)]
+        k = int(good[-1]) + 1 if len(taken) + len(good) == n else len(reason)  # none after the last that is wanted
+        taken, asked = np.concatenate([taken, readings[good]]), asked + k
         counts.update(reason[:k].tolist())
     rejected = {why: counts[why] for why in REASONS if counts[why]}
-    return Candidates(np.concatenate(taken), asked, rejected)
+    return Candidates(taken, asked, rejected)
 
 
 def _draw(robot: Robot, of: Configurations, generator: np.random.Generator, place: str) -> Draw:
@@ -164,9 +156,7 @@ def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, plac
         nonlocal near, first
         rotation, position = view_board(replace(views, count=k - 1 if first else k), generator)
         if first and views.self_motion == "held":
-            posture = None if views.posture is None else np.array(views.posture)
-            found = solve_inverse(robot, position[:1], rotation[:1], generator=generator, near=posture)
-            near = _require_reached(found, place)[0]
+            near = _require_reached(solve_inverse(robot, position[:1], rotation[:1], generator=generator), place)[0]
         rotation, position = rotation[-k:], position[-k:]
         first = False
         seen = sees_board(views, rotation, position)
@@ -220,29 +210,19 @@ def _reach(
     return solve_inverse(robot, position, rotation, near=near, generator=generator, n_starts=n_starts, n_steps=N_STEPS)
 
 
-class Thinning:
-    """Takes configurations one after another, each that is not near one taken before.
+def _near(taken: Floats, readings: Floats, apart: float | None) -> Booleans:
+    """Which configurations are near one taken before, or before them, shape (n,).
 
     Args:
-        robot: Whose configurations they are.
+        taken: Configurations taken before, shape (m, n_joints), [rad] (prismatic: share of the reach).
+        readings: Further ones, shape (n, n_joints).
         apart: Least distance of two, as `Conditions` has it; None: any.
     """
-
-    def __init__(self, robot: Robot, apart: float | None) -> None:
-        self._apart = apart
-        self._unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
-        self._taken = np.empty((0, robot.n_joints))
-
-    def near(self, readings: Floats) -> Booleans:
-        """Which of further configurations are near others, shape (n,); those that are not are taken."""
-        near = np.zeros(len(readings), dtype=np.bool_)
-        if self._apart is None:
-            return near
-        for k, q in enumerate(readings / self._unit):
-            near[k] = bool(np.any(np.abs(self._taken - q).max(axis=1) < self._apart))
-            if not near[k]:
-                self._taken = np.vstack([self._taken, q])
-        return near
+    near = np.zeros(len(readings), dtype=np.bool_)
+    for k, q in enumerate(readings if apart is not None else ()):
+        near[k] = bool(np.any(np.abs(taken - q).max(axis=1) < apart))
+        taken = taken if near[k] else np.vstack([taken, q])
+    return near
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -402,15 +382,12 @@ def _reach_views(robot: Robot, views: BoardViews, generator: np.random.Generator
     rotation, position = view_board(views, generator)
     if views.self_motion == "random":
         return _require_reached(solve_inverse(robot, position, rotation, generator=generator), place)
-    near = None if views.posture is None else np.array(views.posture)
-    first = _require_reached(
-        solve_inverse(robot, position[:1], rotation[:1], generator=generator, near=near), place, len(rotation)
-    )
+    first = _require_reached(solve_inverse(robot, position[:1], rotation[:1], generator=generator), place)
     others = solve_inverse(robot, position[1:], rotation[1:], generator=generator, near=first[0])
-    return np.concatenate([first, _require_reached(others, place, len(rotation), 1)])
+    return np.concatenate([first, _require_reached(others, place, 1)])
 
 
-def _require_reached(found: Inverse, place: str, n: int | None = None, first: int = 0) -> Floats:
+def _require_reached(found: Inverse, place: str, first: int = 0) -> Floats:
     """The solutions for views of a board, numbered from `first`; A is 0.
 
     Raises:
@@ -424,7 +401,7 @@ def _require_reached(found: Inverse, place: str, n: int | None = None, first: in
     by = f"{found.miss_position[nearest]:.3g} m and {np.rad2deg(found.miss_rotation[nearest]):.3g} deg"
     raise InputError(
         place,
-        f"{len(missed)} of {n or len(found.readings)} views not reached within the joint limits ("
-        f"{', '.join(names)}{', ...' if len(missed) > 12 else ''}): the nearest one is missed by {by}",
+        f"{len(missed)} of {first + len(found.readings)} views not reached within the joint limits ("
+        f"{', '.join(names)}{', ...' * (len(missed) > 12)}): the nearest one is missed by {by}",
         hint="move the board nearer or widen the limits",
     )

@@ -15,9 +15,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, checked
-from fg_calib.io import Units, fill_folder, write_csv, write_robot, write_text, write_urdf
+from fg_calib.io import NOISE_UNITS, Units, fill_folder, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
+from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot import Robot
 from fg_calib.simulation.scenario import Placement, Plane, Spot
 from fg_calib.simulation.simulator import Simulation
@@ -54,7 +54,8 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     tables = {name: c for t in simulation.tables for name, c in table_columns(t, simulation.robot, units).items()}
     texts = {"calibration.yaml": _job_text(simulation, units)}
     if simulation.scenario.instruments:
-        texts["truth.yaml"] = _yaml(_truth(simulation, units))
+        truth = {kind: {n: _place(one, units) for n, one in found.items()} for kind, found in simulation.truth.items()}
+        texts["truth.yaml"] = _yaml({"units": asdict(units)} | truth)
 
     def write(into: Path) -> None:
         for name, robot in robots.items():
@@ -69,9 +70,9 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
 
     urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
     names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
-    always = ("poses.csv", "robot_nominal.yaml", "robot_true.yaml", "robot_nominal.urdf", "robot_true.urdf")
+    earlier = ("poses.csv", *(f"{name}{ending}" for name in robots for ending in (".yaml", ".urdf")))
     job = {"calibration.yaml": _FIRST_WORDS.encode()}
-    fill_folder(folder, write, job | dict.fromkeys((*always, *names), b"") | job)
+    fill_folder(folder, write, job | dict.fromkeys((*earlier, *names), b"") | job)
     return tuple(names)
 
 
@@ -88,7 +89,7 @@ def _pairs(m: Measurements) -> tuple[Pairs, tuple[str, ...]] | None:
 
 
 def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns]:
-    """The columns of each of a table's files, by the file's name.
+    """The columns of each of a simulated table's files, by the file's name.
 
     Args:
         table: The table.
@@ -103,19 +104,16 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
         labels["group"] = (m.groups.names, m.groups.index)
     columns |= {name: np.array(["", *names])[index + 1] for name, (names, index) in labels.items()}
     if m.position is not None:
-        columns |= {axis: m.position[:, k] / length for k, axis in enumerate("xyz")}
+        columns |= dict(zip("xyz", m.position.T / length, strict=True))
     if m.rotation is not None:
         quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
-        columns |= {f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")}
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
     if m.length is not None:
         columns["distance"] = m.length / length
     columns |= {name: values / units.factor(GENERIC_COLUMNS[name].si) for name, values in m.columns.items()}
     if m.image is not None:
-        columns |= {axis: m.image[:, k] for k, axis in enumerate("uv")}
-        columns |= {f"corner_{axis}": m.image[:, 2 + k] / length for k, axis in enumerate("xy")}
-    for prefix, sigma, unit in (("sigma_", m.sigma_position, "m"), ("sigma_r", m.sigma_orientation, "rad")):
-        if sigma is not None and _differs(sigma):
-            columns |= {f"{prefix}{axis}": sigma[:, k] / units.factor(unit) for k, axis in enumerate("xyz")}
+        columns |= dict(zip("uv", m.image.T[:2], strict=True))
+        columns |= dict(zip(("corner_x", "corner_y"), m.image.T[2:] / length, strict=True))
     found: dict[str, Columns] = {m.source: columns | {"split": np.where(m.test, "test", "train")}}
     if (between := _pairs(m)) is not None:
         pairs, names = between
@@ -151,11 +149,8 @@ def is_filled_in(path: Path) -> bool:
         table = pl.read_csv(path, infer_schema=False)
     except (pl.exceptions.PolarsError, OSError):
         return True
-    for pattern in (r"q\d+", "|".join(MEASURED)):
-        columns = [c for c in table.columns if re.fullmatch(pattern, c)]
-        if columns and all((table[c].is_null() | (table[c] == "")).all() for c in columns):
-            return False
-    return True
+    groups = (table.select(f"^({pattern})$") for pattern in (r"q\d+", "|".join(MEASURED)))
+    return not any(of.width and sum(of.null_count().row(0)) == of.width * of.height for of in groups)
 
 
 # --- the job ----------------------------------------------------------------------------------------------------------
@@ -197,12 +192,13 @@ def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:
 
 def _entry(table: Table, units: Units) -> dict[str, Any]:
     """A table in the list of a job."""
-    m, between = table.measurements, _pairs(table.measurements)
+    m, between, pairing = table.measurements, _pairs(table.measurements), table.pairing
     entry: dict[str, Any] = {"table": m.source, "model": table.model}
     if between is not None:
         entry["pairs"] = between[0].source
     elif table.model in PAIR_MODELS and m.groups is None:
-        entry["pairing"] = _pairing(table.pairing)
+        random = {"random": pairing.count, "seed": pairing.seed}
+        entry["pairing"] = random if pairing.strategy == "random" else pairing.strategy
     if table.model in POSE_MODELS or table.fixed_camera:
         entry["frame"] = table.frame
     if table.offset:
@@ -213,44 +209,22 @@ def _entry(table: Table, units: Units) -> dict[str, Any]:
 
 
 def _noise(m: Measurements, units: Units) -> dict[str, float]:
-    """The sigmas of a table: one a kind."""
+    """The sigmas of a simulated table: one a kind."""
     between = _pairs(m)
-    pairs = None if between is None else between[0]
-    stated: dict[str, tuple[Any, str]] = {
-        "position": (m.sigma_position, "m"),
-        "orientation": (m.sigma_orientation, "rad"),
-        "distance": (m.sigma_length if pairs is None else pairs.sigma_distance, "m"),
-        "angle": (None if pairs is None else pairs.sigma_angle, "rad"),
-        "point": (m.sigma_point, "m"),
-        **{name: (sigma, GENERIC_COLUMNS[name].si) for name, sigma in m.sigmas.items()},
+    sigmas = {
+        **{"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma_point},
+        **{"distance": m.sigma_length, "pixel": m.sigma_pixel, **m.sigmas},
+        **({} if between is None else {"distance": between[0].sigma_distance, "angle": between[0].sigma_angle}),
     }
-    values = {
-        name: units.from_si(float(sigma.flat[0]), unit)
-        for name, (sigma, unit) in stated.items()
-        if sigma is not None and np.isfinite(sigma).any() and not _differs(sigma)
+    specified = {kind: float(s.flat[0]) for kind, s in sigmas.items() if s is not None and np.isfinite(s).any()}
+    return {
+        kind: units.from_si(specified[kind], unit) if unit in ("m", "rad") else specified[kind]
+        for kind, unit in NOISE_UNITS.items()
+        if kind in specified
     }
-    return values if m.sigma_pixel is None else values | {"pixel": float(m.sigma_pixel[0, 0])}
-
-
-def _differs(sigma: Floats) -> bool:
-    """Whether sigmas differ from axis to axis."""
-    return sigma.ndim == 2 and bool(np.any(sigma != sigma[:, :1]))
-
-
-def _pairing(pairing: Pairing) -> Any:
-    random = {"random": pairing.count, "seed": pairing.seed}
-    return random if pairing.strategy == "random" else pairing.strategy
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------
-
-
-def _truth(simulation: Simulation, units: Units) -> dict[str, Any]:
-    """Where landmarks truly are, by kind and name, as a scenario would state them, in a file's units."""
-    found: dict[str, Any] = {"units": asdict(units)}
-    for kind, landmarks in simulation.truth.items():
-        found[kind] = {name: _place(landmark, units) for name, landmark in landmarks.items()}
-    return found
 
 
 def _xyz(point: Floats, units: Units) -> dict[str, float]:
@@ -258,6 +232,7 @@ def _xyz(point: Floats, units: Units) -> dict[str, float]:
 
 
 def _place(landmark: Any, units: Units) -> Any:
+    """Where a landmark truly is, as a scenario would state it, in a file's units."""
     match landmark:
         case Placement():
             with warnings.catch_warnings():  # at a pitch of 90 degrees yaw is 0: as good as any
@@ -268,6 +243,5 @@ def _place(landmark: Any, units: Units) -> Any:
         case Spot():
             return _xyz(landmark.xyz, units)
         case Plane():
-            normal = [float(v) for v in landmark.normal]
-            return {"normal": normal, "distance": units.from_si(landmark.distance, "m")}
+            return {"normal": landmark.normal.tolist(), "distance": units.from_si(landmark.distance, "m")}
     return units.from_si(float(landmark), "m")

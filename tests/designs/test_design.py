@@ -16,20 +16,17 @@ from fg_calib.measurements.dataset import Noise
 from fg_calib.options import Options
 from fg_calib.prediction.tool_pose import errors_at
 from fg_calib.simulation.scenario import (
-    BoardCamera,
     Errors,
     GivenReadings,
-    LengthGauge,
-    PairGauge,
+    Instrument,
     RandomReadings,
     Spot,
-    Tracker,
 )
 from fg_calib.simulation.simulator import simulate
 from fg_calib.statistics.covariance import spread_of
 
 NOISE = replace(SIGMA, joint=2e-4)
-STAR = Tracker(model="distance-rotation", name="it")
+STAR = Instrument(model="distance-rotation", name="it")
 EXPECTED = {name: INSTRUMENTS[name] for name in
             ("pose", "targets", "anchors", "offset", "contact", "planes", "board", "sockets")} | {
     "formed star": STAR,
@@ -103,7 +100,7 @@ def test_a_target_is_reached_with_as_few_as_a_scan_of_all_numbers_finds():
 @pytest.mark.slow
 def test_what_no_candidate_determines_is_reported():
     """Lengths between configurations do not say where the base is."""
-    lengths = scenario(Tracker(model="distance", name="it"), n=20, job={"gauge": "none"})
+    lengths = scenario(Instrument(model="distance", name="it"), n=20, job={"gauge": "none"})
     plan = design(lengths, n=20, n_candidates=60)
     assert plan.task.fitted
     assert "theta1" in {name for relation in plan.observability.lost for name in relation}
@@ -130,10 +127,10 @@ def selected(job, rows):
 
 
 MORE = {
-    "pose": Tracker(model="pose", name="it", frame="unknown"),
-    "a target known nearly": Tracker(model="position", name="it", frame="base",
+    "pose": Instrument(model="pose", name="it", frame="unknown"),
+    "a target known nearly": Instrument(model="position", name="it", frame="base",
                                      targets={"a": Spot([0.1, 0.05, 0.2], 1e-4)}),
-    "an anchor known nearly": LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5], 1e-4)}),
+    "an anchor known nearly": Instrument(model="anchor", name="it", anchors={"a": Spot([1.0, -2.0, 0.5], 1e-4)}),
 }  # fmt: skip
 
 
@@ -171,7 +168,7 @@ def test_more_of_every_instrument_is_planned(kind):
 @pytest.mark.slow
 def test_a_board_seen_from_below_is_seen_from_below_again():
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
-    job = job_of(BoardCamera(model="board", name="it", boards=WALL), q)
+    job = job_of(Instrument(model="board", name="it", boards=WALL), q)
     m = job.tables[0].measurements
     flip = np.diag([1.0, -1.0, -1.0])
     below = replace(job, measurements=(replace(job.tables[0], measurements=replace(m, rotation=m.rotation @ flip)),))
@@ -197,7 +194,7 @@ def test_rows_of_a_job_are_chosen_among_themselves():
 
 
 def test_pairs_that_are_measured_directly_are_refused_in_one_line():
-    gauge = PairGauge(model="distance", name="it")
+    gauge = Instrument(model="distance", name="it", pairs=Pairing())
     with pytest.raises(InputError, match=r"^instruments: it: pairs that are measured directly, expected model: pose"):
         planned(gauge)
     with pytest.raises(InputError, match="pairs that are measured directly, expected tables of poses"):
@@ -254,7 +251,7 @@ def test_what_prior_sigmas_alone_determine_is_not_lost_at_tiny_noise(criterion):
     """Unknown targets leave the last joint to its priors, whatever the noise; 1 um adds 1e-6 of 1 mm, in squares."""
     expected = []
     for sigma in (1e-8, 1e-6):
-        of = scenario(Tracker(model="position", name="it", targets=2), n=5, noise=Noise(position=sigma, joint=0.0))
+        of = scenario(Instrument(model="position", name="it", targets=2), n=5, noise=Noise(position=sigma, joint=0.0))
         plan = design(of, n=12, n_candidates=30, criterion=criterion)
         assert plan.unknown == 0.0
         expected.append(plan.expected.position)

@@ -18,13 +18,10 @@ from fg_calib.prediction.tool_pose import errors_at
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import (
     Errors,
-    Indicator,
-    LengthGauge,
+    Instrument,
     Plane,
     RandomReadings,
-    Sockets,
     Spot,
-    Tracker,
 )
 from fg_calib.simulation.simulator import simulate
 
@@ -35,7 +32,7 @@ GIVEN = np.random.default_rng(8).uniform(-1.0, 1.0, (5, 4))
 
 def test_given_configurations_of_a_star_count():
     """The first of them is the reference pose."""
-    star = Tracker(model="distance-rotation", name="it", pairing=Pairing("star"))
+    star = Instrument(model="distance-rotation", name="it", pairing=Pairing("star"))
     plan = design(scenario(star, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
     assert plan.expected.position < plan.before.position
     assert (plan.readings[0] == GIVEN[0]).all()
@@ -45,7 +42,12 @@ def test_given_configurations_of_a_star_count():
 def test_given_configurations_that_are_not_used_are_refused():
     """What touches has configurations of its own: with those of others nothing is measured."""
     with pytest.raises(InputError, match="given"):
-        design(scenario(Sockets(name="it", sockets=3), n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
+        design(
+            scenario(Instrument(model="distance", name="it", sockets=3), n=20, noise=NOISE),
+            n=6,
+            given=GIVEN,
+            n_candidates=40,
+        )
 
 
 def job_of(instrument, n, stated=NOISE, **changes):
@@ -65,7 +67,7 @@ def said_by_all_rows(job, plan):
 @pytest.mark.parametrize("n", [1, 5])
 def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
     """Distances between sockets that the plan asks for count, and no others."""
-    job = job_of(Sockets(name="it", sockets=5), 12)
+    job = job_of(Instrument(model="distance", name="it", sockets=5), 12)
     plan = design(job, n=n, n_candidates=40)
     assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
 
@@ -83,8 +85,8 @@ def test_tolerances_of_a_plan_are_those_that_its_job_found():
     assert plan.before.position == pytest.approx(said, rel=0.02)
 
 
-LENGTHS = LengthGauge(name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})
-FACES = Indicator(name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)})
+LENGTHS = Instrument(model="anchor", name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})
+FACES = Instrument(model="plane", name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)})
 
 
 @pytest.mark.slow
@@ -97,7 +99,7 @@ def test_a_plan_expects_what_a_job_of_all_rows_says_of_itself(instrument, n):
 
 def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
     noise = replace(SILENT, position=3.0 * SIGMA.position, orientation=3.0 * SIGMA.orientation)
-    job = job_of(Tracker(model="pose", name="it"), 60, stated=SIGMA, noise=noise)
+    job = job_of(Instrument(model="pose", name="it"), 60, stated=SIGMA, noise=noise)
     job = replace(job, options=replace(job.options, estimate_noise=True))
     found = calibrate_job(job).result.noise_factors["position"] * SIGMA.position
     plan = design(job, n=4, n_candidates=20)
@@ -106,6 +108,6 @@ def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
 
 def test_one_more_pose_of_a_chain_can_be_planned():
     """It makes no pair by itself, and so adds nothing."""
-    chain = Tracker(model="distance", name="it", pairing=Pairing("chain"))
+    chain = Instrument(model="distance", name="it", pairing=Pairing("chain"))
     plan = design(job_of(chain, 30), n=1, n_candidates=10)
     assert plan.expected.position == pytest.approx(plan.before.position, rel=1e-6)

@@ -16,11 +16,9 @@ from fg_calib.graph.problem import square_root
 from fg_calib.graph.variables import prior_rows
 from fg_calib.inputs import InputError
 from fg_calib.simulation.scenario import (
-    BoardCamera,
-    LengthGauge,
+    Instrument,
     Placement,
     RandomReadings,
-    Tracker,
 )
 
 N = 20
@@ -30,11 +28,11 @@ NOISE = replace(SIGMA, joint=1e-3)
 """Joint noise that moves the tool ten times as far as what measures errs: what is shared counts."""
 
 FLOOR = {"floor": Placement(np.eye(3), np.array([0.0, 0.0, -2.5]))}
-STAR = Tracker(model="distance-rotation", name="formed")
-LENGTHS = Tracker(model="distance", name="lengths")
-ANCHORS = LengthGauge(name="anchors")
-POSES = Tracker(model="pose", name="poses")
-BOARDS = BoardCamera(model="pixels", name="boards", boards=WALL | FLOOR, camera=CAMERA, corners=GRID)
+STAR = Instrument(model="distance-rotation", name="formed")
+LENGTHS = Instrument(model="distance", name="lengths")
+ANCHORS = Instrument(model="anchor", name="anchors")
+POSES = Instrument(model="pose", name="poses")
+BOARDS = Instrument(model="pixels", name="boards", boards=WALL | FLOOR, camera=CAMERA, corners=GRID)
 
 ALONE = (
     "targets",
@@ -51,7 +49,7 @@ ALONE = (
 
 KINDS = {name: (INSTRUMENTS[name],) for name in ALONE} | {
     "formed star": (STAR,),
-    "formed lengths": (Tracker(model="distance", name="it", pairing=Pairing("all")),),
+    "formed lengths": (Instrument(model="distance", name="it", pairing=Pairing("all")),),
     "two boards": (BOARDS,),
     "poses and lengths at the same poses": (POSES, ANCHORS),
     "a star whose reference pose others measure": (LENGTHS, POSES),
@@ -68,7 +66,7 @@ def kinds(*others):
 
 
 def pool_with(*instruments, n=N, **changes):
-    n = 2 * n if any(isinstance(i, BoardCamera) for i in instruments) else n
+    n = 2 * n if any(i.model == "pixels" for i in instruments) else n
     of = scenario(*instruments, n=n, noise=NOISE, **changes)
     return build_pool(of, draw_groups(of, n, np.random.default_rng(0)))
 
@@ -141,7 +139,7 @@ def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     data = pool.problem.data
     (series,) = data.series
     most = np.bincount(data.places[series.table][series.ends[series.train]].ravel()).max()
-    assert most >= GRID.rows * GRID.columns / 2
+    assert most >= len(GRID) / 2
     boards = len(pool.problem.data.unknowns.names) or 1
     assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most
 

@@ -9,7 +9,7 @@ from fg_calib import assess, build_problem, simulate, solve
 from fg_calib.io import read_urdf
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.kinematics import pose
-from fg_calib.simulation.scenario import Errors, LengthGauge, RandomReadings, Scenario, Spot
+from fg_calib.simulation.scenario import Errors, Instrument, RandomReadings, Scenario, Spot
 
 SIGMA = 5e-5
 TOLERANCE = {"x": 1e-3, "y": 1e-3, "z": 1e-3, "roll": 2e-3, "pitch": 2e-3, "yaw": 2e-3}
@@ -77,7 +77,7 @@ def test_two_arms_in_contact_are_calibrated_as_one_chain(arms):
         errors=Errors("normal", {p.name: p.tolerance for p in whole.parameters if p.tolerance}),
         configurations=RandomReadings(30),
         noise=Noise(distance=SIGMA),
-        instruments=(LengthGauge(name="contact", anchors=PINS, contact=True),),
+        instruments=(Instrument(model="anchor", name="contact", anchors=PINS, contact=True),),
         job={},
     )
     s = simulate(scenario, 1)

@@ -14,27 +14,17 @@ from tolerances import rounding
 
 from fg_calib import InputError, calibrate, read_job, simulate
 from fg_calib.robot.rotations import rotation_angle
-from fg_calib.simulation import write_simulation
-from fg_calib.simulation.scenario import (
-    BoardCamera,
-    LengthGauge,
-    Placement,
-    RandomReadings,
-    Spot,
-    Tracker,
-)
-
-EVERY = pytest.mark.parametrize("which", INSTRUMENTS)
+from fg_calib.simulation import Instrument, Placement, RandomReadings, Spot, write_simulation
 
 
 @cache
-def exact(which, seed=0):
-    """A simulation without noise, of which the calibration is given some; and the true tool frames, 4x4."""
-    it = INSTRUMENTS[which]
-    more = {"pixels": 400, "camera in the room": 60, "faces": 12}.get(which, 40)
-    s = simulate(scenario(replace(it, stated_noise=SIGMA), n=more, noise=EXACT, validation=RandomReadings(7)), seed)
+def exact(which):
+    """What an instrument measures without noise, the truth, and the true tool frames, 4x4."""
+    n = {"pixels": 400, "camera in the room": 60, "faces": 12}.get(which, 40)
+    of = scenario(INSTRUMENTS[which], n=n, noise=EXACT, stated_noise=SIGMA, validation=RandomReadings(7))
+    s = simulate(of)
     m = s.tables[0].measurements
-    return s, np.stack([tool_pose(s.true_robot, q) for q in m.readings])
+    return m, s.truth, np.stack([tool_pose(s.true_robot, q) for q in m.readings])
 
 
 def as_matrix(frame):
@@ -53,18 +43,16 @@ CLOSE = rounding(30.0)  # products of a few lengths of metres
 
 @pytest.mark.parametrize("which", ["pose", "orientations", "targets", "stations"])
 def test_a_tracker_sees_targets_from_its_stations(which):
-    s, T = exact(which)
-    m, frames = s.tables[0].measurements, s.truth["frames"]
+    m, truth, T = exact(which)
     targets = names_of(m.labels["target"]) if "target" in m.labels else [None] * len(T)
     stations = names_of(m.labels["station"]) if "station" in m.labels else [None] * len(T)
     for k, (target, station) in enumerate(zip(targets, stations, strict=True)):
-        X = as_matrix(frames["it" if station is None else f"it, station {station}"])
-        there = [0, 0, 0] if target is None else s.truth["targets"][target].xyz
-        seen = X @ T[k]
+        X = as_matrix(truth["frames"]["it" if station is None else f"it, station {station}"])
+        there = [0, 0, 0] if target is None else truth["targets"][target].xyz
         if m.position is not None:
-            assert m.position[k] == pytest.approx((seen @ [*there, 1.0])[:3], abs=CLOSE)
+            assert m.position[k] == pytest.approx((X @ T[k] @ [*there, 1.0])[:3], abs=CLOSE)
         if m.rotation is not None:
-            assert m.rotation[k] == pytest.approx(seen[:3, :3], abs=CLOSE)
+            assert m.rotation[k] == pytest.approx((X @ T[k])[:3, :3], abs=CLOSE)
     if which == "stations":
         assert stations[:4] == ["s1", "s1", "s2", "s2"]
         assert targets[:4] == ["a", "b", "a", "b"]
@@ -72,8 +60,8 @@ def test_a_tracker_sees_targets_from_its_stations(which):
 
 
 def test_pairs_are_measured_between_configurations():
-    s, T = exact("pairs")
-    pairs = s.tables[0].measurements.pairs
+    m, _, T = exact("pairs")
+    pairs = m.pairs
     assert pairs.n_pairs == 80 + 21  # and all of seven test rows
     step = T[pairs.b, :3, 3] - T[pairs.a, :3, 3]
     turn = np.swapaxes(T[pairs.a, :3, :3], 1, 2) @ T[pairs.b, :3, :3]
@@ -83,36 +71,29 @@ def test_pairs_are_measured_between_configurations():
 
 @pytest.mark.parametrize("which", ["anchors", "offset", "contact"])
 def test_lengths_go_to_anchors_in_turn(which):
-    s, T = exact(which)
-    m = s.tables[0].measurements
-    names = names_of(m.labels["anchor"])
-    anchors = np.array([s.truth["anchors"][name].xyz for name in names])
-    added = 0.12 if which == "offset" else 0.0
-    away = np.linalg.norm(T[:, :3, 3] - anchors, axis=1)
-    assert m.length == pytest.approx(away + added, abs=1e-9 if which == "contact" else CLOSE)
-    assert names == [m.labels["anchor"].names[k % len(m.labels["anchor"].names)] for k in range(len(T))]
-    assert s.truth.get("offsets", {}) == ({"it": 0.12} if added else {})
-    assert s.tables[0].offset == bool(added)
+    m, truth, T = exact(which)
+    names, every = names_of(m.labels["anchor"]), m.labels["anchor"].names
+    away = np.linalg.norm(T[:, :3, 3] - [truth["anchors"][name].xyz for name in names], axis=1)
+    assert m.length == pytest.approx(away + 0.12 * (which == "offset"), abs=1e-9 if which == "contact" else CLOSE)
+    assert names == [every[k % len(every)] for k in range(len(T))]
+    assert truth.get("offsets", {}) == ({"it": 0.12} if which == "offset" else {})
 
 
 @pytest.mark.parametrize("which", ["planes", "faces"])
 def test_distances_are_across_planes(which):
-    s, T = exact(which)
-    m = s.tables[0].measurements
-    planes = [s.truth["planes"][name] for name in names_of(m.labels["plane"])]
+    m, truth, T = exact(which)
+    planes = [truth["planes"][name] for name in names_of(m.labels["plane"])]
     away = np.array([p.normal @ t[:3, 3] - p.distance for p, t in zip(planes, T, strict=True)])
     assert away == pytest.approx(0.0 if m.length is None else m.length, abs=1e-9 if which == "faces" else CLOSE)
     assert (m.length is None) == (which == "faces")
-    normals = np.array([p.normal for p in s.truth["planes"].values()])[:3]
+    normals = np.array([p.normal for p in truth["planes"].values()])[:3]
     assert normals @ normals.T == pytest.approx(np.eye(3), abs=CLOSE)
 
 
 def test_a_camera_on_the_tool_sees_boards_in_front_of_it():
-    s, T = exact("board")
-    m = s.tables[0].measurements
-    wall = as_matrix(WALL["wall"])
+    m, _, T = exact("board")
     for k in range(len(T)):
-        seen = np.linalg.inv(T[k]) @ wall
+        seen = np.linalg.inv(T[k]) @ as_matrix(WALL["wall"])
         assert m.rotation[k] == pytest.approx(seen[:3, :3], abs=CLOSE)
         assert m.position[k] == pytest.approx(seen[:3, 3], abs=CLOSE)
         assert seen[2, 3] > 0.0
@@ -123,13 +104,12 @@ def test_a_camera_on_the_tool_sees_boards_in_front_of_it():
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("which", ["pixels", "camera in the room"])
 def test_corners_are_seen_where_a_pinhole_has_them_and_nowhere_else(which):
-    s, T = exact(which)
-    m = s.tables[0].measurements
+    m, truth, T = exact(which)
     seen = {}
     for k in range(len(T)):
         corner = [*m.image[k, 2:], 0.0, 1.0]
         on_tool = np.linalg.inv(T[k]) @ as_matrix(WALL["wall"])
-        X = on_tool if which == "pixels" else as_matrix(s.truth["frames"]["it"]) @ T[k]
+        X = on_tool if which == "pixels" else as_matrix(truth["frames"]["it"]) @ T[k]
         x, y, z = (X @ corner)[:3]
         assert z > 0.0
         assert X[:3, 2] @ X[:3, 3] < 0.0  # from its front
@@ -142,19 +122,18 @@ def test_corners_are_seen_where_a_pinhole_has_them_and_nowhere_else(which):
         seen.setdefault(m.ids[k], set()).add(tuple(corner[:2]))
     counts = [len(corners) for corners in seen.values()]
     assert max(counts) == 20  # all of 5 by 4
-    assert {tuple(c) for c in GRID.points.tolist()} >= set.union(*seen.values())
+    assert {tuple(c) for c in GRID.tolist()} >= set.union(*seen.values())
     assert min(counts) < 20  # where the board leaves the image
 
 
 @pytest.mark.slow
 def test_sockets_are_touched_in_turn_and_measured_against_each_other():
-    s, T = exact("sockets")
-    groups = s.tables[0].measurements.groups
-    places = np.array([s.truth["sockets"][name].xyz for name in groups.names])
-    assert T[:, :3, 3] == pytest.approx(places[groups.index], abs=1e-9)
-    assert groups.index[:4].tolist() == [0, 1, 2, 0]
+    m, truth, T = exact("sockets")
+    places = np.array([truth["sockets"][name].xyz for name in m.groups.names])
+    assert T[:, :3, 3] == pytest.approx(places[m.groups.index], abs=1e-9)
+    assert m.groups.index[:4].tolist() == [0, 1, 2, 0]
     apart = [np.linalg.norm(places[a] - places[b]) for a, b in ((0, 1), (0, 2), (1, 2))]
-    assert groups.pairs.distance == pytest.approx(apart, abs=CLOSE)
+    assert m.groups.pairs.distance == pytest.approx(apart, abs=CLOSE)
 
 
 NOISY = {
@@ -170,12 +149,8 @@ NOISY = {
 @pytest.mark.parametrize("which", NOISY)
 def test_noise_has_its_sigma(which):
     """The same seed with and without: standard normal numbers times sigma, to five of its own sigma."""
-    noisy, clean = (
-        simulate(scenario(replace(INSTRUMENTS[which], stated_noise=SIGMA), n=700, noise=noise), 3)
-        .tables[0]
-        .measurements
-        for noise in (SIGMA, EXACT)
-    )
+    of = scenario(INSTRUMENTS[which], n=700)
+    noisy, clean = (simulate(of, 3, exact=which).tables[0].measurements for which in (False, True))
     for name, sigma in NOISY[which]:
         a, b = getattr(noisy, name), getattr(clean, name)
         if name == "rotation":
@@ -203,7 +178,7 @@ def test_every_instrument_calibrates_as_it_is_simulated(which):
 
 
 @pytest.mark.sampled(1)
-@EVERY
+@pytest.mark.parametrize("which", INSTRUMENTS)
 def test_the_files_say_what_the_tables_do(which, tmp_path):
     s = simulate(scenario(INSTRUMENTS[which], n=300 if which == "pixels" else 12, length_unit="mm", angle_unit="deg",
                           validation=RandomReadings(9)), 4)  # fmt: skip
@@ -214,30 +189,26 @@ def test_the_files_say_what_the_tables_do(which, tmp_path):
     (read,), (made,) = job.measurements, s.tables
     for name in ("model", "pairing", "frame", "offset", "camera", "fixed_camera"):
         assert getattr(read, name) == getattr(made, name), name
-    assert list(read.known) == list(made.known)
+    assert {n: p.tolerance for n, p in read.known.items()} == {n: p.tolerance for n, p in made.known.items()}
     for name, point in made.known.items():
         assert read.known[name].xyz == pytest.approx(point.xyz)
-        assert read.known[name].tolerance == point.tolerance
-    same_measurements(read.measurements, made.measurements)
-
-
-def same_measurements(a, b):
-    """To the rounding of a change of units."""
-    assert a.ids.tolist() == b.ids.tolist()
-    assert a.test.tolist() == b.test.tolist()
-    for name in ("readings", "position", "rotation", "sigma_position", "sigma_orientation", "sigma_joint",
-                 "sigma_point", "length", "sigma_length", "image", "sigma_pixel"):  # fmt: skip
-        mine, others = getattr(a, name), getattr(b, name)
-        if others is not None:
-            assert mine == pytest.approx(others, rel=rounding(1, 10), abs=rounding(10.0)), name
-        else:
-            assert mine is None or name.startswith("sigma"), name
+    a, b = read.measurements, made.measurements
+    assert (a.ids.tolist(), a.test.tolist()) == (b.ids.tolist(), b.test.tolist())
     assert {k: names_of(v) for k, v in a.labels.items()} == {k: names_of(v) for k, v in b.labels.items()}
-    assert (a.groups is None) == (b.groups is None)
-    for mine, others in ((a.pairs, b.pairs), (a.groups and a.groups.pairs, b.groups and b.groups.pairs)):
-        if others is not None:
-            for name in ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle"):
-                assert getattr(mine, name) == pytest.approx(getattr(others, name), rel=rounding(1, 10), nan_ok=True)
+    measured = ("readings", "position", "rotation", "length", "image")
+    same(a, b, *measured, *(f"sigma_{kind}" for kind in ("position", "orientation", "joint", "point", "length")))
+    for x, y in ((a.pairs, b.pairs), (a.groups and a.groups.pairs, b.groups and b.groups.pairs)):
+        same(x, y, "a", "b", "distance", "angle", "sigma_distance", "sigma_angle")
+
+
+def same(a, b, *names):
+    """To the rounding of a change of units; sigmas may be there of what is not measured."""
+    for name in names if b is not None else ():
+        x, y = getattr(a, name), getattr(b, name)
+        if y is not None:
+            assert x == pytest.approx(y, rel=rounding(1, 10), abs=rounding(10.0), nan_ok=True), name
+        else:
+            assert x is None or name.startswith("sigma"), name
 
 
 # --- several at once --------------------------------------------------------------------------------------------------
@@ -245,50 +216,48 @@ def same_measurements(a, b):
 
 def test_the_same_configuration_has_the_same_joint_errors_in_all_tables():
     """Instruments without noise of their own, of an arm whose encoders have some."""
-    noise = replace(EXACT, joint=1e-3)
-    one = Tracker(model="position", name="one", frame="base", stated_noise=SIGMA)
-    s = simulate(scenario(one, replace(one, name="two"), LengthGauge(name="wire", stated_noise=SIGMA), noise=noise))
+    one, wire = Instrument(model="position", name="one", frame="base"), Instrument(model="anchor", name="wire")
+    of = scenario(one, replace(one, name="two"), wire, noise=replace(EXACT, joint=1e-3), stated_noise=SIGMA)
+    s = simulate(of)
     first, second, wire = (table.measurements for table in s.tables)
     assert first.ids.tolist() == second.ids.tolist() == wire.ids.tolist()
     assert first.position == pytest.approx(second.position, abs=0.0)
     anchors = np.array([s.truth["anchors"][name].xyz for name in names_of(wire.labels["anchor"])])
     assert wire.length == pytest.approx(np.linalg.norm(first.position - anchors, axis=1), abs=CLOSE)
-    there = np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in first.readings])
+    there, moved = (np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in of])
+                    for of in (first.readings, s.true_readings))  # fmt: skip
     assert np.abs(first.position - there).max() > 1e-4  # and not where the readings say
-    assert first.position == pytest.approx(
-        np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in s.true_readings]), abs=CLOSE
-    )
+    assert first.position == pytest.approx(moved, abs=CLOSE)
 
 
 def test_a_point_of_one_name_is_one_and_is_known_alike_in_all_tables():
     bolt = {"bolt": Spot([1.0, 0.5, 0.2], 1e-3)}
-    s = simulate(scenario(LengthGauge(name="wire", anchors=bolt), LengthGauge(name="bar", anchors=bolt)), 2)
-    known = [table.known["bolt"] for table in s.tables]
+    wire, bar = (Instrument(model="anchor", name=name, anchors=bolt) for name in ("wire", "bar"))
+    known = [table.known["bolt"] for table in simulate(scenario(wire, bar), 2).tables]
     assert known[0].xyz.tolist() == known[1].xyz.tolist()
     assert known[0].tolerance == 1e-3
     assert 0.0 < np.abs(known[0].xyz - bolt["bolt"].xyz).max() < 5e-3
-    assert calibrate(s.robot, s.tables).trustworthy
-    other = {"bolt": Spot([1.0, 0.5, 0.3])}
+    (table,) = simulate(scenario(wire), 2, exact=True).tables
+    assert table.known["bolt"].xyz.tolist() == [1.0, 0.5, 0.2]
     with pytest.raises(InputError) as caught:
-        simulate(scenario(LengthGauge(name="wire", anchors=bolt), LengthGauge(name="bar", anchors=other)))
+        simulate(scenario(wire, replace(bar, anchors={"bolt": Spot([1.0, 0.5, 0.3])})))
     assert str(caught.value) == "scenario: instruments: anchors: bolt: at two places, expected one, or other names"
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------
 
-ARM, FEW = paper_robot(), RandomReadings(2)  # no slide, which would go anywhere
+FAR = Instrument(model="anchor", name="it", anchors={"far": Spot([50.0, 0, 0])}, contact=True)
+AWAY = {"away": Placement(np.eye(3), np.array([0, 0, 900.0]))}
 CANNOT = [
-    (LengthGauge(name="it"), {"noise": EXACT},
-     "scenario: instruments: it: noise: distance: found 0, expected a number above 0; a calibration takes nothing "
+    (Instrument(model="anchor", name="it"), {"noise": EXACT},
+     "noise: distance: found 0, expected a number above 0; a calibration takes nothing "
      "for exact: specify what to assume under job: noise: distance"),
-    (LengthGauge(name="it", anchors={"far": Spot([50.0, 0, 0])}, contact=True), {"robot": ARM, "configurations": FEW},
-     "scenario: instruments: it: far not reached from 2 of 2 configurations, expected points within the joint limits"),
-    (BoardCamera(model="board", name="it"), {},
-     "scenario: instruments: it: boards: found none, expected boards by name, or configurations: {board: ...}"),
-    (BoardCamera(model="pixels", name="it", camera=CAMERA, corners=GRID,
-                 boards={"away": Placement(np.eye(3), np.array([0, 0, 900.0]))}), {},
-     "scenario: instruments: it: sees no board at any of 60 configurations; configurations: {board: ...} have the "
-     "camera look at one"),
+    (FAR, {"robot": paper_robot(), "configurations": RandomReadings(2)},
+     "nothing is reached from 2 configurations, expected points within the joint limits"),
+    (Instrument(model="board", name="it"), {},
+     "boards: found none, expected boards by name, or configurations: {board: ...}"),
+    (Instrument(model="pixels", name="it", camera=CAMERA, corners=GRID, boards=AWAY), {},
+     "sees no board at any of 60 configurations; configurations: {board: ...} have the camera look at one"),
 ]  # fmt: skip
 
 
@@ -297,4 +266,4 @@ CANNOT = [
 def test_what_cannot_be_measured_is_one_line(instrument, changes, message):
     with pytest.raises(InputError) as caught:
         simulate(scenario(instrument, **changes))
-    assert str(caught.value) == message
+    assert str(caught.value) == f"scenario: instruments: it: {message}"
