@@ -1,40 +1,40 @@
 """Unmodelled effects: lack of fit, a change point, a missing convention parameter, a forgotten instrument offset.
 
-Each is a score test: the rows are fitted again, linearly, with more columns than J of the model, whose priors are
-rows too, and what these gain is compared with chance,
+Each is a score test: the rows are fitted again, linearly, with more columns than the model has (`regress`), and what
+these gain is compared with chance,
 
     F = |Q^T r|^2 / m over |r - Q Q^T r|^2 / (n - rank J - m)
 
-with r the residuals of the model's fit, Q a basis of what the columns add to J, m its rank and n the residuals that
-noise can make differ freely. It has an F distribution whatever the size of the noise.
+with r the residuals of the model's fit, J its columns, those of the priors too, Q a basis of what the columns add to J,
+m its rank and n the residuals that noise can make differ freely. It has an F distribution whatever the size of the
+noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k.
 
-*Lack of fit* adds what real arms have beyond their model, stage by stage; the statistics of the stages are independent,
-so that the least of k p-values has the p-value 1 - (1 - p)^k:
+*Lack of fit* adds what real arms have beyond their model, stage by stage; the statistics of the stages are independent:
 
 1. compliance of joints: gravity along z of the base, loads at the tool and on every link after the joint;
 2. joints that are off by a part of how far the tool reaches out, every small motion of every link, and errors of each
    joint of one and two periods a turn (eccentric encoders and gears, gains of prismatic joints);
 3. the same loads of an arm that is mounted otherwise, gravity along x and y.
 
-A *change point* is a small motion of tool or base from one row of a table on, for every row tried (Bonferroni). Other
-effects explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all
-links. A *missing convention parameter* is the same test of small motions between links. An *offset* is added to every
-length of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made residuals 1.1 times as large
-as specified.
+A *change point* is a small motion of tool or base from one row of a table on, for every row tried. Other effects
+explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all links.
+A *missing convention parameter* is the same test of small motions between links. An *offset* is added to every length
+of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made residuals 1.1 times as large as
+specified.
 
 Loads: by virtual work the torque about joint k of a weight in direction g at the point x is g . dx / dq_k.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.graph import Problem, Solution, State, at_parameters, build_variables, prior_rows, unknown_prior_rows
+from fg_calib.graph import Problem, Solution, at_parameters, build_variables, prior_rows, unknown_prior_rows
 from fg_calib.inputs import Floats
 from fg_calib.measurements import LANDMARKS, Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
@@ -44,7 +44,7 @@ MAX_ROWS = 10_000
 """Rows up to which residuals are tested: more would take long, and are seldom needed."""
 
 LEAST_LEFT = 10
-"""Degrees of freedom that a stage must leave."""
+"""Degrees of freedom that a test must leave: else what it does is left to chance."""
 
 LEAST_SIDE, MAX_TRIED = 6, 100
 """Configurations before and after a change, and rows at which one is tried, evenly spaced if there are more."""
@@ -61,8 +61,8 @@ _RANK = 1e-8
 _NOTHING = 1e-10
 """Size of a column over the largest below which it is rounding errors."""
 
-LINK = "small motion of link "
-"""How names of the columns of links' small motions begin."""
+LINK, OFFSET, STAGE = "small motion of link ", "offset ", "joint errors of stage "
+"""How names of columns that a model does not have begin: see `regress`."""
 
 _STAGES = (1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3)
 """The stages of `_joint_errors`."""
@@ -118,24 +118,30 @@ class LinearFit:
         fitted = basis_of(columns)
         return cls(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1])
 
-    def new(self, columns: Floats) -> Floats:
-        """An orthonormal basis of what columns of the rows, shape (n_rows, m), add to the fit."""
-        none = np.zeros((len(self.r) - len(columns), columns.shape[1]))
-        return basis_of(np.concatenate([columns, none]), self.fitted)
+    def padded(self, columns: Floats) -> Floats:
+        """Columns of the rows, shape (n_rows, m), of the priors too."""
+        return np.pad(columns, ((0, len(self.r) - len(columns)), (0, 0)))
 
-    def extended(self, new: Floats) -> LinearFit:
-        """The fit with more columns, by `new`."""
-        fitted = np.hstack([self.fitted, new])
-        return LinearFit(self.r - new @ (new.T @ self.r), fitted, self.dof - new.shape[1])
+    def test(self, columns: Floats) -> tuple[float, float, LinearFit]:
+        """A score test of more columns of the rows, shape (n_rows, m).
 
-    def test(self, new: Floats) -> tuple[float, float]:
-        """P-value of what more columns, by `new`, explain, and the part of the excess of chi-square that they leave."""
-        total, drop, m = float(self.r @ self.r), float(np.sum((new.T @ self.r) ** 2)), new.shape[1]
-        if not m or self.dof - m < 1:
-            return 1.0, 1.0
-        ratio = (drop / m) / max((total - drop) / (self.dof - m), 1e-300)
-        left = max(total - drop - (self.dof - m), 0.0) / max(total - self.dof, 1e-300)
-        return float(special.fdtrc(m, self.dof - m, ratio)), left
+        Returns:
+            The p-value of what they explain, the part of the excess of chi-square that they leave, and the fit with
+            them; 1, 1 and this fit where they add nothing, or leave too few degrees of freedom.
+        """
+        new = basis_of(self.padded(columns), self.fitted)
+        after = LinearFit(self.r - new @ (new.T @ self.r), np.hstack([self.fitted, new]), self.dof - new.shape[1])
+        total, rest, m = float(self.r @ self.r), float(after.r @ after.r), new.shape[1]
+        if not m or after.dof < LEAST_LEFT:
+            return 1.0, 1.0, self
+        ratio = ((total - rest) / m) / max(rest / after.dof, 1e-300)
+        left = max(rest - after.dof, 0.0) / max(total - self.dof, 1e-300)
+        return float(special.fdtrc(m, after.dof, ratio)), left, after
+
+
+def of_several(p: float, n: int) -> float:
+    """The p-value of the least p-value of n tests."""
+    return -float(np.expm1(n * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
 def probability_of_noise(solution: Solution) -> float | None:
@@ -145,32 +151,23 @@ def probability_of_noise(solution: Solution) -> float | None:
         None where it cannot be told: too few rows or too many, a robust loss, landmarks (also known ones), joint values
         estimated, rows that share errors but are weighted as independent.
     """
-    problem, state = solution.problem, solution.problem.state
-    weighted = state.weights is not None or state.joint_errors is not None
-    several = problem.data.unknowns.names or problem.has_more or weighted or problem.missing_correlation
-    if several or problem.n_residuals > MAX_ROWS:
+    problem = solution.problem
+    if problem.data.unknowns.names or not _is_plain(problem) or problem.missing_correlation:
         return None
-    chains, names = with_link_motions(problem, solution.parameters)
-    chains = tuple(chain.with_joint_columns() for chain in chains)
-    of_stage = np.array([2 if name.startswith(LINK) else 0 for name in names])
-    of_stage = np.concatenate([of_stage, np.repeat(_STAGES, problem.robot.n_joints)])
-    errors = [_joint_errors(problem.robot, table.measurements.readings) for table in problem.data.tables]
-    found = []
-    for row_set in problem.rows:
-        private = [_with_joint_errors(part.block, chains[part.table], errors[part.table]) for part in row_set.parts]
-        rows = np.concatenate(private)
-        found.append(rows if row_set.states is None else row_set.states.whiten(rows))
-    rows = np.concatenate(found)
-    r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
-    model = np.concatenate([rows[:, :-1][:, of_stage == 0], J_prior])
-    fit = LinearFit.of(model, np.concatenate([rows[:, -1], r_prior]), problem.n_independent + len(r_prior))
-    least, stages = 1.0, 0
+    fit, J, names = regress(solution)
+    least, n = 1.0, 0
     for stage in range(1, max(_STAGES) + 1):
-        new = fit.new(rows[:, :-1][:, of_stage == stage])
-        if new.shape[1] and fit.dof - new.shape[1] >= LEAST_LEFT:  # else what it does is left to chance
-            least, stages = min(least, fit.test(new)[0]), stages + 1
-            fit = fit.extended(new)
-    return -float(np.expm1(stages * np.log1p(-min(least, 1.0 - 1e-16)))) if stages else None
+        links = np.char.startswith(names, LINK) & (stage == 2)
+        p, _, after = fit.test(J[:, links | (names == f"{STAGE}{stage}")])
+        if after is not fit:
+            least, n, fit = min(least, p), n + 1, after
+    return of_several(least, n) if n else None
+
+
+def _is_plain(problem: Problem) -> bool:
+    """Whether there are few enough rows, each of which counts as its noise says."""
+    weighted = problem.state.weights is not None or problem.state.joint_errors is not None
+    return not (problem.has_more or weighted or problem.n_residuals > MAX_ROWS)
 
 
 def find_change(solution: Solution) -> Change | None:
@@ -179,29 +176,26 @@ def find_change(solution: Solution) -> Change | None:
     Note:
         It is looked for in one table of poses, positions or orientations, without robust losses.
     """
-    problem, state = solution.problem, solution.problem.state
-    other = problem.data.unknowns.names or problem.has_more or state.weights is not None
-    parts = [part.block for rows in problem.rows for part in rows.parts]
+    problem = solution.problem
+    blocks = [part.block for rows in problem.rows for part in rows.parts]
     several = len(problem.data.tables) > 1 or any(rows.states is not None for rows in problem.rows)
-    pairs = any(block.kind.ends != 1 for block in parts)
-    if other or several or pairs or state.joint_errors is not None or problem.n_residuals > MAX_ROWS:
+    if several or not _is_plain(problem) or problem.data.unknowns.names or any(b.kind.ends != 1 for b in blocks):
         return None
-    fit, of_links = _with_links(solution)
+    fit, J, names = regress(solution)
     links = {"tool": problem.robot.n_joints, "base": 0}
-    motions = {what: of_links([f"{LINK}{link}: {kind}" for kind in FRAME_KINDS]) for what, link in links.items()}
-    at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in parts])
+    motions = {what: J[:, np.char.startswith(names, f"{LINK}{link}:")] for what, link in links.items()}
+    at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in blocks])
     first = np.unique(at)[LEAST_SIDE : 1 - LEAST_SIDE]
     first = first[np.unique(np.linspace(0, len(first) - 1, min(MAX_TRIED, len(first))).astype(np.int64))]
-    found = [(*fit.test(fit.new(J * (at >= k)[:, None])), what, int(k)) for k in first for what, J in motions.items()]
+    found = [(*fit.test(M * (at >= k)[:, None])[:2], what, int(k)) for k in first for what, M in motions.items()]
     if not found:
         return None
     p, left, what, k = min(found)
     moved = motions[what] * (at >= k)[:, None]
-    with_links, after = fit.extended(fit.new(of_links([]))), fit.extended(fit.new(moved))
-    p_with, left_with = with_links.test(with_links.new(moved))
-    if max(p * len(found), p_with) >= P_VALUE or max(left, left_with) > CHANGE_LEFT:
+    p_with, left_with, _ = fit.test(J[:, np.char.startswith(names, LINK)])[2].test(moved)
+    if max(of_several(p, len(found)), p_with) >= P_VALUE or max(left, left_with) > CHANGE_LEFT:
         return None
-    return Change(what, k, float(np.sum(after.r**2) / np.sum(fit.r**2)))
+    return Change(what, k, float(np.sum(fit.test(moved)[2].r ** 2) / np.sum(fit.r**2)))
 
 
 def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:
@@ -209,14 +203,10 @@ def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:
     problem = solution.problem
     if problem.n_residuals > MAX_ROWS:
         return True
-    if motion.frame:
-        link = min(max(motion.axes[0] - 1, 0), problem.robot.n_joints)
-        names = [f"{LINK}{link}: {kind}" for kind in ("roll", "pitch", "yaw")]
-    else:
-        kinds = {AXIS_OF_KIND[kind]: kind for kind in FRAME_KINDS}
-        names = [f"{LINK}{axis}: {kinds[axes]}" for axis in motion.axes[:-1] for axes in motion.motions]
-    fit, of_links = _with_links(solution)
-    p, left = fit.test(fit.new(of_links(names)))
+    kinds = {AXIS_OF_KIND[kind]: kind for kind in FRAME_KINDS}
+    wanted = [f"{LINK}{axis}: {kinds[one]}" for axis in motion.axes[:-1] for one in motion.motions]
+    fit, J, names = regress(solution)
+    p, left, _ = fit.test(J[:, np.isin(names, wanted)])
     return p < P_VALUE and left <= MISSING_LEFT
 
 
@@ -226,54 +216,66 @@ def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
     With a robust loss, which cuts residuals off, noise counts as specified at least.
     """
     problem, found = solution.problem, list[Offset]()
-    unknowns, series = problem.data.unknowns, [s for s in problem.data.series if len(s.train)]
-    offsets = [i for i, letter in enumerate(unknowns.letters) if LANDMARKS[letter].is_one]
-    if not offsets or problem.n_residuals > MAX_ROWS or problem.has_more:
+    if not _offsets(problem) or problem.n_residuals > MAX_ROWS or problem.has_more:
         return ()
-    at = at_parameters(problem, solution.parameters)
-    column, columns = at.n_columns + at.n_nuisance, at.columns
-    for place in np.flatnonzero(np.isin(unknowns.owners, offsets) & (columns < 0)).tolist():
-        tables = [s.table for s in series if np.any(s.nuisances[s.train] == place)]
-        if not tables:
-            continue  # contacts alone
-        wide = np.where(np.arange(len(columns)) == place, column, columns)
-        fit, J = _linear_fit(solution, replace(at, columns=wide, n_nuisance=at.n_nuisance + 1), [column])
-        new = fit.new(J)
-        if fit.test(new)[0] < P_VALUE:
-            after, per_metre = fit.extended(new), float(new[: len(J), 0] @ J[:, 0])
+    fit, J, names = regress(solution)
+    for table in _offsets(problem).values():
+        column = fit.padded(J[:, names == f"{OFFSET}{table}"])[:, 0]
+        p, _, after = fit.test(column[:, None])
+        if p < P_VALUE:
+            new = column - fit.fitted @ (fit.fitted.T @ column)
             least = 1e-300 if problem.state.weights is None else 1.0
-            sigma = np.sqrt(max(float(after.r @ after.r) / after.dof, least))
-            found.append(Offset(tables[0], -float(new[:, 0] @ fit.r) / per_metre, float(sigma) / abs(per_metre)))
+            sigma = np.sqrt(max(float(after.r @ after.r) / after.dof, least) / float(new @ new))
+            found.append(Offset(table, -float(new @ fit.r) / float(new @ new), float(sigma)))
     return tuple(found)
 
 
-def _with_links(solution: Solution) -> tuple[LinearFit, Callable[[Sequence[str]], Floats]]:
-    """The fit of a solution, and the rows' derivatives in links' small motions by name; in all where none is named."""
-    at = at_parameters(solution.problem, solution.parameters)
-    chains, names = with_link_motions(solution.problem, solution.parameters)
-    columns = np.where(at.columns >= 0, at.columns + len(names) - at.n_columns, -1)
-    wide = replace(at, chains=chains, n_columns=len(names), columns=columns)
-    links = [name for name in names if name.startswith(LINK)]
-    fit, J = _linear_fit(solution, wide, [names.index(name) for name in links])
-    return fit, lambda named: J[:, [links.index(name) for name in named or links]]
+def _offsets(problem: Problem) -> dict[int, int]:
+    """Tables with an offset that is not estimated, by the offset's place among the nuisance coordinates."""
+    unknowns, columns = problem.data.unknowns, problem.variables.coordinates
+    numbers = [i for i, letter in enumerate(unknowns.letters) if LANDMARKS[letter].is_one]
+    return {
+        place: s.table
+        for place in np.flatnonzero(np.isin(unknowns.owners, numbers) & (columns < 0)).tolist()
+        for s in problem.data.series
+        if np.any(s.nuisances[s.train] == place)
+    }
 
 
-def _linear_fit(solution: Solution, wide: State, more: Sequence[int]) -> tuple[LinearFit, Floats]:
-    """The fit of a solution, linearised, and the rows' derivatives in columns that it does not have, shape (n_rows, m).
+def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
+    """The fit of a solution, linearised, and columns that it does not have, by name.
 
-    Args:
-        solution: The solution.
-        wide: The arm and the landmarks at it, with more columns than were estimated.
-        more: Numbers of these.
+    These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of
+    tables that were not estimated (`OFFSET`, the number of the table), and joint errors (`STAGE` and the stage).
+
+    Returns:
+        The fit, the columns of the rows, shape (n_rows, m), and their names, shape (m,).
     """
-    problem = solution.problem
-    r, J = (np.concatenate(parts) for parts in zip(*(rows.linearise(wide) for rows in problem.rows), strict=True))
+    problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
+    chains, core = with_link_motions(problem, solution.parameters)
+    offsets, errors = (
+        _offsets(problem),
+        [_joint_errors(problem.robot, t.measurements.readings) for t in problem.data.tables],
+    )
+    columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)
+    columns[list(offsets)] = len(core) + at.n_nuisance + np.arange(len(offsets))
+    wide = replace(at, chains=chains, n_columns=len(core), columns=columns, n_nuisance=at.n_nuisance + len(offsets))
+    parts = list[Floats]()
+    for rows in problem.rows:
+        of_joints = [_by_joint_errors(part.at(wide), chains[part.table], errors[part.table]) for part in rows.parts]
+        private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
+        parts.append(private if rows.states is None else rows.states.whiten(private))
+    J, r = np.split(np.concatenate(parts), [-1], axis=1)
+    names = [f"{STAGE}{stage}" for stage in np.repeat(_STAGES, problem.robot.n_joints)]
+    names += [name if name.startswith(LINK) else "" for name in core] + [""] * at.n_nuisance
+    all_names = np.array(names + [f"{OFFSET}{table}" for table in offsets.values()])
+    more = all_names != ""
     r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
     r_unknown, J_unknown = unknown_prior_rows(problem.variables, solution.parameters)
-    of_core = np.hstack([J_prior, np.zeros((len(J_prior), problem.variables.n_nuisance))])
-    columns = np.concatenate([np.delete(J, list(more), axis=1), of_core, J_unknown])
+    J_prior = np.pad(J_prior, ((0, 0), (0, problem.variables.n_nuisance)))
     n = problem.n_independent + len(r_prior) + len(r_unknown)
-    return LinearFit.of(columns, np.concatenate([r, r_prior, r_unknown]), n), J[:, list(more)]
+    columns = np.concatenate([J[:, ~more], J_prior, J_unknown])
+    return LinearFit.of(columns, np.concatenate([r[:, 0], r_prior, r_unknown]), n), J[:, more], all_names[more]
 
 
 def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:
@@ -297,21 +299,20 @@ def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], 
     return tuple(chain.at(values) for chain in variables.chains), variables.names
 
 
-def _with_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:
-    """[J Z r] of a block before what its rows share is taken out, shape (n_rows, n_columns + n_errors * n_joints + 1).
+def _by_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:
+    """Derivatives of a block in joint errors, before what its rows share is taken out, shape (n_rows, m).
 
     Args:
         block: The block.
-        chain: The chain of its table, with joint columns.
+        chain: The chain of its table.
         errors: See `_joint_errors`.
     """
-    r, J = residuals.linearise(block, chain)
-    model, n = J[:, :, : chain.n_columns], chain.n_joints
-    moved = np.zeros((*r.shape, errors.shape[1], n))
+    r, J = residuals.linearise(block, chain.with_joint_columns())
+    moved, n = np.zeros((*r.shape, *errors.shape[1:])), chain.n_joints
     for k, rows in enumerate(block.ends.T):
-        of_end = J[:, :, chain.n_columns + k * n : chain.n_columns + (k + 1) * n]
-        moved += of_end[:, :, None, :] * errors[rows][:, None]
-    return np.concatenate([model, moved.reshape(*r.shape, -1), r[:, :, None]], axis=2).reshape(r.size, -1)
+        first = chain.n_columns + k * n
+        moved += J[:, :, None, first : first + n] * errors[rows][:, None]
+    return moved.reshape(r.size, -1)
 
 
 def _joint_errors(robot: Robot, readings: Floats) -> Floats:

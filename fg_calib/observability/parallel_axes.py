@@ -39,7 +39,7 @@ class MissingMotion:
     """A small motion between neighbouring axes that the convention has no parameter for.
 
     Attributes:
-        axes: 1-based numbers of the joints, neighbours in chain order.
+        axes: 1-based numbers of the joints, neighbours in chain order; of a frame the joints before and after it.
         motions: Small motions that are missing between each two of them, in the frame of the link from one to the next.
         convention: The robot's convention.
         use: The convention that has the parameters.
@@ -94,7 +94,8 @@ def _of_frames(robot: Robot) -> tuple[MissingMotion, ...]:
         name = angles["pitch"].name.removesuffix(".pitch")
         use = f"estimate all six of {name}" if outer else "describe the arm by mdh-hayati or dh-hayati"
         frame = f"the frame {name}" if outer else f"the origin of joint {name}"
-        found.append(MissingMotion((owner,), (Axis.RX,), robot.convention, use, 0.0, frame))
+        link = min(max(owner - 1, 0), robot.n_joints)
+        found.append(MissingMotion((link, link + 1), (Axis.RX, Axis.RY, Axis.RZ), robot.convention, use, 0.0, frame))
     return tuple(found)
 
 
