@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -108,10 +108,23 @@ class Setup:
         without = self.instrument.is_pose or self.instrument.uses_pairs
         return not without or "target" in self.table.measurements.labels
 
+    @property
+    def sees_lengths(self) -> bool:
+        """Whether lengths are measured."""
+        return self.instrument.sees_position and self.table.measurements.image is None
+
     def with_tool(self, fitted: frozenset[str]) -> Setup:
         """The set-up with these of the tool's parameters fitted."""
         names = [p.name for p in self.robot.parameters if p.estimated and p.name not in self.tool]
         return replace(self, robot=self.robot.with_estimated([*names, *sorted(fitted)]))
+
+    def with_values(self, values: Floats) -> Setup:
+        """The set-up with other nominal values of the robot."""
+        return replace(self, robot=self.robot.with_values(values))
+
+    def measuring(self, **changes: Any) -> Setup:
+        """The set-up with other measurements."""
+        return replace(self, table=replace(self.table, measurements=replace(self.table.measurements, **changes)))
 
 
 def setup_of(robot: Robot, table: Table) -> Setup | None:

@@ -36,8 +36,8 @@ EXPLAINED = 4.0
 REDUCTION = 5.0
 """Undoing a mistake divides the excess by this at least; undoing two, the excess that either alone leaves."""
 
-N_COMBINED = 4
-"""The best single mistakes, each of which is combined with any other; those after them are units with columns."""
+N_COMBINED = 6
+"""The best single mistakes, each of which is combined with any other."""
 
 NEGLIGIBLE_EXCESS = 1e-6
 """Excess below which there is nothing to explain: each unknown takes its own row up."""
@@ -274,14 +274,16 @@ def _doubles(single: Sequence[_Trial], given: float) -> list[_Trial]:
     def left(trial: Explanation) -> float:  # of all kinds: undoing one of two may leave one kind as bad as before
         return float(np.sum(np.log([r.excess for r in trial.residuals]))) if trial.residuals else np.inf
 
-    for rank, ((one,), _) in enumerate(sorted(single, key=lambda pair: left(pair[1]))):
-        others = list(About) if rank < N_COMBINED else [About.COLUMNS] if one.about == About.UNIT else []
-        for two in setup_hypotheses(one.without) if others else ():
-            words, same = frozenset((one.words, two.words)), one.values == two.values != ""
-            if words not in found and len(words) == 2 and not same and two.about in others:
+    for (one,), _ in sorted(single, key=lambda pair: left(pair[1]))[:N_COMBINED]:
+        for two in setup_hypotheses(one.without):
+            words, what = frozenset((one.words, two.words)), [m.words.partition(" are in ")[0] for m in (one, two)]
+            if words not in found and what[0] != what[1]:
                 found[words] = _trial(one, two)
-    return [trial for words, trial in found.items()
-            if trial[1].excess <= min(given, *(alone.get(w, np.inf) for w in words)) / REDUCTION]  # fmt: skip
+    return [
+        pair
+        for words, pair in found.items()
+        if pair[1].excess <= min(given, *(alone.get(word, np.inf) for word in words)) / REDUCTION
+    ]
 
 
 def _accepted(trials: Sequence[_Trial], most: float) -> tuple[Explanation, ...]:
