@@ -1,7 +1,7 @@
 from .check import Check, Explanation, check_rows
 from .fingerprints import counted_before
-from .new_data import Calibrated, Rows
-from .prior_information import at_nominal, knowledge_of
+from .new_data import Rows
+from .prior_information import Calibrated, at_nominal, knowledge_of
 from .update import predicted_before, updated
 
 __all__ = [

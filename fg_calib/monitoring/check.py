@@ -35,10 +35,11 @@ from fg_calib.monitoring.hypotheses import (
     rms_motion,
     zero_names,
 )
-from fg_calib.monitoring.new_data import Calibrated, Linear, Rows, linearise_new_data, place_new_data
+from fg_calib.monitoring.new_data import Linear, Rows, linearise_new_data, place_new_data
+from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.options import LIMITED, Limits
-from fg_calib.statistics import FACTOR, LEAST
-from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics import FACTOR, LEAST, HeldOut
+from fg_calib.statistics.residual_table import pooled
 
 Verdict = Literal["pass", "fail", "not_evaluated"]
 
@@ -143,22 +144,22 @@ def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
     Raises:
         ProblemError: The rows lack what their model needs.
     """
-    rows = replace(rows, tables=tuple(table.all_train() for table in rows.tables))
-    at = linearise_new_data(calibrated, place_new_data(calibrated, rows, calibrated.values))
-    few = _too_few(at)
-    gross: list[str] = []
-    found: list[HypothesisTest] = [] if few else fit_changes(calibrated, at)
-    likely = likely_changes(found)
-    most_gross = max(1, int(MOST_GROSS * at.placed.problem.n_configurations))
-    while len(likely) == 1 and likely[0].hypothesis.kind == "row" and len(gross) < most_gross:
-        gross += likely[0].hypothesis.names
-        at = at.without(likely[0].hypothesis.columns)
-        found = [f for f in fit_changes(calibrated, at) if f.hypothesis.names[0] not in gross]
+    rows = rows.all_train()
+    kept, gross = rows, list[str]()
+    while True:
+        at = linearise_new_data(place_new_data(calibrated, kept, calibrated.values))
+        data, few = at.placed.problem.data, _too_few(at)
+        found = [] if few else fit_changes(at)
         likely = likely_changes(found)
+        most_gross = max(1, int(MOST_GROSS * (at.placed.problem.n_configurations + len(gross))))
+        if len(likely) != 1 or likely[0].hypothesis.kind != "row" or len(gross) >= most_gross:
+            break
+        gross += likely[0].hypothesis.names
+        kept = rows.without([np.isin(np.array(data.names)[places], gross) for places in data.places])
     if any(f.hypothesis.kind != "row" for f in likely) and not gross:
         found = refine_best(calibrated, rows, found, likely)
         likely = likely_changes(found) or likely
-    return _judge(calibrated, at, limits, found, likely, gross, few, _rms(calibrated, rows, at, gross))
+    return _judge(calibrated, at, limits, found, likely, gross, few)
 
 
 def _too_few(rows: Linear) -> str:
@@ -170,15 +171,6 @@ def _too_few(rows: Linear) -> str:
     return f"{used}: {rows.dof} left to judge by, at least {LEAST_DOF} needed"
 
 
-@dataclass(frozen=True)
-class _Rms:
-    """RMS of residuals and of noise of a kind, [m] or [rad], and the number of measurements."""
-
-    residual: float
-    noise: float
-    n: int
-
-
 def _judge(
     calibrated: Calibrated,
     at: Linear,
@@ -187,8 +179,9 @@ def _judge(
     likely: list[HypothesisTest],
     gross: list[str],
     few: str,
-    rms: dict[str, _Rms],
 ) -> Check:
+    held = at.placed.errors()
+    rms = {kind: pooled([one for one in held if one.kind == kind]) for kind in dict.fromkeys(one.kind for one in held)}
     noise = {kind: one.noise for kind, one in rms.items()}
     names = {f.hypothesis.names for f in likely}
     likely = merge_alike(calibrated, likely, noise)
@@ -214,7 +207,7 @@ def _judge(
         chi2=at.chi2,
         dof=at.dof,
         p_value=p_value,
-        rms={kind: one.residual for kind, one in rms.items()},
+        rms={kind: one.after for kind, one in rms.items()},
         noise=noise,
         limits=limit,
         explanations=_explanations(found, likely),
@@ -252,43 +245,24 @@ def _detectable(calibrated: Calibrated, found: Sequence[HypothesisTest]) -> dict
     return {name: size if np.isfinite(size) else None for name, size in sizes.items()}
 
 
-def _rms(calibrated: Calibrated, rows: Rows, at: Linear, gross: Sequence[str]) -> dict[str, _Rms]:
-    """RMS by kind without gross errors, frames fitted without these, the arm as calibrated."""
-    solution, data = at.placed.solution, at.placed.problem.data
-    if gross:
-        wrong = [data.names.index(name) for name in gross]
-        tables = (t.tested_on(np.isin(k, wrong)) for t, k in zip(rows.tables, data.places, strict=True))
-        solution = place_new_data(calibrated, replace(rows, tables=tuple(tables)), calibrated.values).solution
-    table = residual_table(solution)
-    counted, first = table.used & ~table.test, table.is_first_of_family()
-    found = {}
-    for k, family in enumerate(table.families):
-        mine = counted & (table.family == k)
-        n = int(np.sum(mine & first))
-        if n:
-            residual, noise = (float(np.sqrt(np.sum(v[mine] ** 2) / n)) for v in (table.after, table.sigma))
-            found[family] = _Rms(residual, noise, n)
-    return found
-
-
 def _reasons(
     calibrated: Calibrated,
     at: Linear,
     p_value: float | None,
     found: Sequence[HypothesisTest],
     likely: Sequence[HypothesisTest],
-    rms: dict[str, _Rms],
+    rms: dict[str, HeldOut],
     limits: dict[str, float],
 ) -> tuple[list[str], list[str]]:
     """Why the calibration is not good any more, and cautions."""
     reasons, cautions = [], []
     for kind, limit in limits.items():
         one = rms.get(kind)
-        if one is None or one.n < LEAST or one.residual <= limit:
+        if one is None or one.n < LEAST or one.after <= limit:
             continue
-        if one.residual**2 - one.noise**2 <= limit**2:
+        if one.after**2 - one.noise**2 <= limit**2:
             cautions.append(f"{kind}: the specified noise hides whether the arm is within the limit")
-        reasons.append(f"{kind}: RMS error {_shown(one.residual, kind)}, limit {_shown(limit, kind)}")
+        reasons.append(f"{kind}: RMS error {_shown(one.after, kind)}, limit {_shown(limit, kind)}")
     change = next((f for f in likely if f.hypothesis.kind != "row"), None)
     excess = float(np.sqrt(at.chi2 / at.dof))
     if change is not None:

@@ -5,24 +5,22 @@ With a_i d_i what change i makes of all rows, old and new, and what is known and
 it when change j has been fitted. If i is true, chi-square with j is above that with i by about `D_ij + 1 +- 2
 sqrt(D_ij)`; so D must reach `(sqrt(threshold) + MARGIN)^2`.
 
-A row at a new configuration is like one there is: of the same table, noise and target. Instruments that measure at a
-configuration of one's choice have such rows: poses, positions, orientations, and pairs of these.
+A row at a new configuration is a pose, position or orientation of the tool, with the noise of such rows that there are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from fg_calib.graph import Problem, problem_at
 from fg_calib.inputs import Floats, FrozenArrays, Integers
-from fg_calib.measurements import Measurements, build_dataset
-from fg_calib.monitoring.hypotheses import HypothesisTest, columns_of, motion, quantile
-from fg_calib.monitoring.new_data import Calibrated, Linear, linearised
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, Pairing
-from fg_calib.robot import random_readings
+from fg_calib.monitoring.hypotheses import HypothesisTest, motion, quantile
+from fg_calib.monitoring.new_data import Linear
+from fg_calib.monitoring.prior_information import Calibrated
+from fg_calib.options import POSE_MODELS
+from fg_calib.robot import forward, random_readings
 
 N_CANDIDATES = 200
 """Configurations to choose from."""
@@ -71,15 +69,15 @@ def advise_configurations(
     """
     changes = [f for f in likely if f.hypothesis.kind != "row"]
     q = random_readings(calibrated.robot, N_CANDIDATES, np.random.default_rng(0))
-    new = _linearised_candidates(rows, q) if len(changes) > 1 else None
-    if new is None:
+    J = _candidate_rows(rows, q) if len(changes) > 1 else None
+    if J is None:
         return None
-    whole, of = new
-    n = rows.system.shape[1]
+    n, v = rows.system.shape[1], rows.placed.problem.variables
     spans = np.split(np.arange(sum(len(f.change) for f in changes)), np.cumsum([len(f.change) for f in changes])[:-1])
-    old = np.hstack([rows.system, *(rows.stacked(columns_of(f.hypothesis, calibrated, rows)) for f in changes)])
-    wide = np.hstack([whole.columns @ rows.directions, *(columns_of(f.hypothesis, calibrated, whole) for f in changes)])
-    grams = np.array([wide[of == k].T @ wide[of == k] for k in range(len(q))])
+    moves = np.hstack([f.hypothesis.directions for f in changes])
+    old = np.hstack([rows.system, rows.stacked(rows.of_arm @ moves)])
+    wide = np.concatenate([J @ rows.directions[: v.n_columns], J[:, :, : v.n_robot_columns] @ moves], axis=2)
+    grams = np.swapaxes(wide, 1, 2) @ wide
     needed = float(np.sqrt(quantile(probability, max(f.k for f in changes)))) + MARGIN
     total, pair = old.T @ old, (0, 1)
     chosen: list[int] = []
@@ -125,46 +123,19 @@ def _least_difference(
     return found[pair], pair
 
 
-def _linearised_candidates(rows: Linear, q: Floats) -> tuple[Linear, Integers] | None:
-    """Rows at configurations like those of the first table that is measured where one likes, and which is of which."""
+def _candidate_rows(rows: Linear, q: Floats) -> Floats | None:
+    """How poses that are measured like those of the first table of these depend on the core.
+
+    Returns:
+        In sigma of their noise, shape (n, residual_dim, n_columns); None where there is no such table.
+    """
     problem = rows.placed.problem
-    tables = list(problem.data.tables)
-    free = [i for i, t in enumerate(tables) if t.model in (*POSE_MODELS, *PAIR_MODELS)]
-    if not free:
+    of_poses = [i for i, table in enumerate(problem.data.tables) if table.model in POSE_MODELS]
+    if not of_poses:
         return None
-    table, m = tables[free[0]], tables[free[0]].measurements
-    if m.pairs is None:
-        like = m.select(np.arange(len(q)) % m.n_configurations)  # the noise and target of rows there are
-        made = replace(like, readings=q, ids=np.arange(len(q)).astype(str))
-    else:
-        made = _pairs_like(m, q)
-    tables[free[0]] = replace(table, measurements=made, pairing=Pairing("star"))
-    data = build_dataset(problem.robot, tables)
-    if data.unknowns.keys != problem.data.unknowns.keys:  # too many targets for so few configurations
-        return None
-    options = replace(problem.options, encoder="propagated", pair_errors="independent", loss="none")
-    at = problem_at(problem.robot, data, options, problem.variables, problem.start)
-    columns, joints, r = linearised(at)
-    whole = replace(rows, columns=columns, joints=joints, r=r, placed=replace(rows.placed, problem=at))
-    return whole, _configuration_of_rows(at, free[0])
-
-
-def _pairs_like(m: Measurements, q: Floats) -> Measurements:
-    """Each configuration as a pair with the first one, with figures and noise of pairs there are."""
-    assert m.pairs is not None
-    n = len(q)
-    pairs = m.pairs.select(np.arange(n - 1) % len(m.pairs.a))
-    columns = {name: getattr(pairs, name) for name in ("distance", "angle", "sigma_distance", "sigma_angle")}
-    columns = {name: values for name, values in columns.items() if np.isfinite(values).any()}
-    ends = {"a": np.zeros(n - 1, dtype=np.int64), "b": np.arange(1, n)}
-    return Measurements.from_arrays(q, pairs={**ends, **columns}, sigma_joint=m.sigma_joint, source=m.source)
-
-
-def _configuration_of_rows(problem: Problem, table: int) -> Integers:
-    """The configuration of each whitened row within a table, of a pair the second; -1 for rows of other tables."""
-    found = []
-    for row_set in problem.rows:
-        for part in row_set.parts:
-            k = part.block.ends.max(axis=1) if part.table == table else np.full(part.block.n, -1)
-            found.append(np.repeat(k, part.block.residual_dim))
-    return np.concatenate(found)
+    table = problem.data.tables[of_poses[0]]
+    m, chain = table.measurements, problem.variables.at(problem.start).chains[of_poses[0]]
+    J = forward(chain, problem.robot.trig(q)).jacobian
+    of = zip(POSE_MODELS[str(table.model)], (m.sigma_position, m.sigma_orientation), (J[:, 3:], J[:, :3]), strict=True)
+    found = [of_tool / np.sqrt(np.nanmean(sigma**2)) for uses, sigma, of_tool in of if uses and sigma is not None]
+    return np.concatenate(found, axis=1)

@@ -23,15 +23,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from scipy import special
 
-from fg_calib.graph import WhitenedBlock, build_variables
-from fg_calib.inputs import CalibrationError, Floats, Integers
-from fg_calib.monitoring.new_data import Calibrated, Linear, Placed, Rows, linearise_new_data, place_new_data
-from fg_calib.robot import Robot, forward, random_readings
+from fg_calib.graph import Variables, build_variables
+from fg_calib.inputs import CalibrationError, Floats
+from fg_calib.monitoring.new_data import Linear, Rows, ends_of_rows, linearise_new_data, place_new_data, whitened
+from fg_calib.monitoring.prior_information import Calibrated
+from fg_calib.robot import Robot, forward, names_of, random_readings
 from fg_calib.statistics import FACTOR
 
 WRONG = 0.01
@@ -56,10 +56,8 @@ MOST_REFINED = 6
 MOST_ROWS = 2400
 """Rows up to which gross errors are tested, 400 poses: their columns grow with the square of the rows."""
 
-POSES = {"tool": "tool", "frame": "base"}
-"""Hypotheses that are a pose, any turn and shift of it, and the variable that it is."""
-
-Kind = Literal["zero", "parameter", "tool", "frame", "zeros", "row"]
+POSES = {"tool": "tool", "base": "frame"}
+"""Variables that are a pose, and the hypothesis that it made any turn and shift."""
 
 
 @dataclass(frozen=True)
@@ -68,16 +66,18 @@ class ChangeHypothesis:
 
     Attributes:
         names: What changes.
-        kind: What that is.
+        kind: `zero`, `parameter`, `tool`, `frame`, `zeros`, or `row` of gross errors.
         units: `m` or `rad` of each.
         columns: Derivatives of the rows in it, shape (m, k).
+        directions: How it moves the arm's columns, shape (n_robot_columns, k); not at all of gross errors.
         same: Names of hypotheses that move the tool alike everywhere.
     """
 
     names: tuple[str, ...]
-    kind: Kind
+    kind: str
     units: tuple[str, ...]
     columns: Floats
+    directions: Floats
     same: tuple[str, ...] = ()
 
 
@@ -157,37 +157,20 @@ def fit_change(hypothesis: ChangeHypothesis, rows: Linear, n: int) -> Hypothesis
     return HypothesisTest(hypothesis, -root @ explained, sigma, drop, float(left @ left) - drop, k, rows.dof - k, n)
 
 
-def columns_of(hypothesis: ChangeHypothesis, calibrated: Calibrated, rows: Linear) -> Floats:
-    """Derivatives of rows in a hypothesis that is no gross error, shape (m, k)."""
-    v = rows.placed.problem.variables
-    if hypothesis.names[0] in POSES:
-        item = next(i for i in v.items if i.kind == POSES[hypothesis.names[0]])
-        out: Floats = rows.columns[:, item.columns]
-        return out
-    zeros, n = zero_names(calibrated.robot), v.n_robot_columns
-    E = v.tangent_derivative(rows.placed.problem.start)[:n, :n]
-    found = [
-        rows.joints[:, zeros.index(name)] if name in zeros else rows.columns[:, :n] @ E[:, v.names.index(name)]
-        for name in hypothesis.names
-    ]
-    return np.array(found).T
-
-
-def single_changes(calibrated: Calibrated, rows: Linear) -> list[ChangeHypothesis]:
+def single_changes(rows: Linear) -> list[ChangeHypothesis]:
     """Zeros of joints first, then the other parameters that were estimated, those of the tool, the tool, the frame."""
-    robot, zeros = calibrated.robot, zero_names(calibrated.robot)
-    changes: list[tuple[str, Kind, tuple[str, ...]]] = [
-        (name, "zero", (joint.unit,)) for name, joint in zip(zeros, robot.joints, strict=True)
-    ]
+    robot, six = rows.robot, ("rad",) * 3 + ("m",) * 3
+    directions, zeros = named_changes(all_variables(robot)), zero_names(robot)
     others = [p for p in robot.parameters if p.name not in zeros]
-    kept = [p for p in others if p.estimated and 1 <= p.owner <= robot.n_joints]
-    changes += [(p.name, "parameter", (p.unit,)) for p in kept]
-    changes += [(p.name, "tool", (p.unit,)) for p in others if p.owner == robot.n_joints + 1]
-    poses = {item.kind for item in rows.placed.problem.variables.items if item.is_pose}
-    six = ("rad",) * 3 + ("m",) * 3
-    changes += [(name, name, six) for name, item in POSES.items() if item in poses]  # type: ignore[misc]
-    bare = [ChangeHypothesis((name,), kind, units, np.zeros((0, 0))) for name, kind, units in changes]
-    return [replace(one, columns=columns_of(one, calibrated, rows)) for one in bare]
+    tool = robot.n_joints + 1
+    kinds: dict[str, tuple[str, tuple[str, ...]]] = {
+        **{name: ("zero", (joint.unit,)) for name, joint in zip(zeros, robot.joints, strict=True)},
+        **{p.name: ("parameter", (p.unit,)) for p in others if p.estimated and 1 <= p.owner < tool},
+        **{p.name: ("tool", (p.unit,)) for p in others if p.owner == tool},
+        **{name: (name, six) for name in POSES.values()},
+    }
+    known = [(name, kind, units, directions[name]) for name, (kind, units) in kinds.items() if name in directions]
+    return [ChangeHypothesis((name,), kind, units, rows.of_arm @ D, D) for name, kind, units, D in known]
 
 
 def zero_names(robot: Robot) -> tuple[str, ...]:
@@ -197,64 +180,57 @@ def zero_names(robot: Robot) -> tuple[str, ...]:
     return tuple(moving.get(j, f"{joint.name}.zero") for j, joint in enumerate(robot.joints))
 
 
+def named_changes(v: Variables) -> dict[str, Floats]:
+    """Changes of a robot by name, each as directions in its columns, shape (n_columns, k).
+
+    Parameters, the zeros of joints that the joint's own parameters can express, any turn and shift of `tool` and
+    `frame`.
+    """
+    robot, x = v.robot, v.nominal()
+    E, chain = v.tangent_derivative(x), v.chains[0].at(x).with_joint_columns()
+    q = random_readings(robot, 20, np.random.default_rng(0))
+    J, joints = np.split(forward(chain, robot.trig(q)).jacobian, [v.n_columns], axis=2)
+    found: dict[str, Floats] = dict(zip(v.names, E.T[:, :, None], strict=True))
+    for j, name in enumerate(zero_names(robot)):
+        own = [v.names.index(p.name) for p in robot.parameters if p.owner == j + 1 and p.name in v.names]
+        A, b = (J @ E[:, own]).reshape(-1, len(own)), joints[:, :, j].ravel()
+        amounts = np.linalg.lstsq(A, b, rcond=None)[0] if own else np.zeros(0)
+        if np.linalg.norm(A @ amounts - b) <= 1e-6 * np.linalg.norm(b):
+            found.setdefault(name, E[:, own] @ amounts[:, None])
+    return found | {POSES[i.kind]: np.eye(v.n_columns)[:, i.columns] for i in v.items if i.kind in POSES}
+
+
 def pairs_of_zeros(hypotheses: Sequence[ChangeHypothesis]) -> list[ChangeHypothesis]:
     """Two zeros together."""
     zeros = [one for one in hypotheses if one.kind == "zero"]
     return [
-        ChangeHypothesis(a.names + b.names, "zeros", a.units + b.units, np.hstack([a.columns, b.columns]))
+        replace(a, names=a.names + b.names, kind="zeros", units=a.units + b.units,
+                columns=np.hstack([a.columns, b.columns]), directions=np.hstack([a.directions, b.directions]))
         for a, b in combinations(zeros, 2)
-    ]
+    ]  # fmt: skip
 
 
 def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
-    """Errors of any size in the rows of each configuration that is in at most a quarter of a table's measurements.
+    """Errors of any size in the rows of each configuration that at most a third of the rows are of.
 
     None where there are more than `MOST_ROWS`.
     """
-    problem, m = rows.placed.problem, len(rows.columns)
-    if m > MOST_ROWS:
+    problem = rows.placed.problem
+    if len(rows.of_arm) > MOST_ROWS:
         return []
-    columns: dict[int, list[Floats]] = {}
-    start = 0
-    for row_set in problem.rows:
-        first = 0
-        for part in row_set.parts:
-            ends, h = problem.data.places[part.table][part.block.ends], part.block.residual_dim
-            for k in np.unique(ends):
-                measured = np.flatnonzero((ends == k).any(axis=1))
-                if 4 * len(measured) <= max(part.block.n, 4):
-                    at = (first + measured[:, None] * h + np.arange(h)).ravel()
-                    columns.setdefault(int(k), []).append(_columns_of_errors(row_set, start, at, m))
-            first += part.n_rows
-        start += first if row_set.states is None else row_set.states.n
-    found = []
-    for k, several in columns.items():
-        wide = np.hstack(several)
-        wide = wide[:, np.any(wide != 0.0, axis=0)]
-        found.append(ChangeHypothesis((problem.data.names[k],), "row", ("",) * wide.shape[1], wide))
+    ends, found = ends_of_rows(problem), []
+    for k in np.unique(ends[ends >= 0]).tolist():
+        mine = np.flatnonzero((ends == k).any(axis=1))
+        if 3 * len(mine) <= len(ends):
+            columns = whitened(problem, np.eye(len(ends))[:, mine])
+            columns, none = columns[:, columns.any(axis=0)], np.zeros((rows.of_arm.shape[1], 0))
+            found.append(ChangeHypothesis((problem.data.names[k],), "row", ("",) * columns.shape[1], columns, none))
     return found
 
 
-def _columns_of_errors(row_set: WhitenedBlock, start: int, at: Integers, m: int) -> Floats:
-    """Derivatives of all rows in errors of some rows of a set, shape (m, n).
-
-    Args:
-        row_set: The set.
-        start: Its first row of all.
-        at: Which of its rows, before what they share is taken out, shape (n,).
-        m: Number of all rows.
-    """
-    unit = np.zeros((sum(part.n_rows for part in row_set.parts), len(at)))
-    unit[at, np.arange(len(at))] = 1.0
-    whitened = unit if row_set.states is None else row_set.states.whiten(unit)
-    out = np.zeros((m, len(at)))
-    out[start : start + len(whitened)] = whitened
-    return out
-
-
-def fit_changes(calibrated: Calibrated, rows: Linear) -> list[HypothesisTest]:
+def fit_changes(rows: Linear) -> list[HypothesisTest]:
     """What each hypothesis explains, pairs of zeros among them where no single change explains the rows."""
-    hypotheses = [*single_changes(calibrated, rows), *gross_errors(rows)]
+    hypotheses = [*single_changes(rows), *gross_errors(rows)]
     found = [f for one in hypotheses if (f := fit_change(one, rows, len(hypotheses))) is not None]
     if not found or max(special.chdtrc(f.dof, f.left) for f in found) >= CERTAIN:
         return found
@@ -302,15 +278,15 @@ def refine_best(
 
 def _refined(found: HypothesisTest, calibrated: Calibrated, rows: Rows) -> HypothesisTest:
     """A test with the rows linearised where its change leads to: a large change is not linear."""
-    step, total = found, np.zeros(len(found.change))
+    step, total, D, v = found, np.zeros(len(found.change)), found.hypothesis.directions, all_variables(calibrated.arm)
     for _ in range(ROUNDS):
         total = total + step.change
+        values = v.moved(v.nominal(), D @ total)[v.robot_span]
         try:
-            there = linearise_new_data(calibrated, _place_changed(found.hypothesis, total, calibrated, rows))
+            there = linearise_new_data(place_new_data(calibrated, rows, values))
         except CalibrationError:
             return found
-        hypothesis = replace(found.hypothesis, columns=columns_of(found.hypothesis, calibrated, there))
-        again = fit_change(hypothesis, there, found.n)
+        again = fit_change(replace(found.hypothesis, columns=there.of_arm @ D), there, found.n)
         if again is None:
             return found
         step = again
@@ -320,44 +296,9 @@ def _refined(found: HypothesisTest, calibrated: Calibrated, rows: Rows) -> Hypot
     return replace(found, change=total + step.change, sigma=step.sigma, drop=drop, left=step.left)
 
 
-def _place_changed(hypothesis: ChangeHypothesis, change: Floats, calibrated: Calibrated, rows: Rows) -> Placed:
-    """The rows at the arm as a hypothesis would have it."""
-    robot, zeros = calibrated.robot, zero_names(calibrated.robot)
-    values, offsets = calibrated.values.copy(), np.zeros(robot.n_joints)
-    names = [p.name for p in robot.parameters]
-    if hypothesis.names[0] in POSES:
-        v = build_variables(robot.with_estimated(names), [False], False)
-        step = np.zeros(v.n_columns)
-        step[next(i for i in v.items if i.kind == POSES[hypothesis.names[0]]).columns] = change
-        values = v.moved(np.append(values, np.zeros(6)), step)[: len(values)]
-    else:
-        for name, amount in zip(hypothesis.names, change, strict=True):
-            if name in zeros:
-                offsets[zeros.index(name)] += amount
-            else:
-                values[names.index(name)] += amount
-    return place_new_data(calibrated, rows.turned(offsets), values)
-
-
-def motions(robot: Robot, readings: Floats) -> dict[str, Floats]:
-    """How the tool moves with each parameter and each joint's zero, with any turn and shift of tool and frame.
-
-    Args:
-        robot: The robot at its values.
-        readings: Shape (n, n_joints).
-
-    Returns:
-        By name, shape (n, 6, 1), of `tool` and `frame` (n, 6, 6); rotation first, about the base's axes.
-    """
-    v = build_variables(robot.with_estimated([p.name for p in robot.parameters]), [False], False)
-    x = np.append(robot.nominal, np.zeros(6))
-    at = forward(v.chains[0].at(x).with_joint_columns(), robot.trig(readings))
-    named = at.jacobian[:, :, : v.n_columns] @ v.tangent_derivative(x)
-    columns = np.concatenate([named, at.jacobian[:, :, v.n_columns :]], axis=2)
-    names = [*v.names, *zero_names(robot)]
-    found = {name: columns[:, :, [i]] for i, name in enumerate(names)}
-    poses = {item.kind: at.jacobian[:, :, item.columns] for item in v.items if item.is_pose}
-    return found | {name: poses[item] for name, item in POSES.items() if item in poses}
+def all_variables(robot: Robot) -> Variables:
+    """The variables of all parameters of a robot."""
+    return build_variables(robot.with_estimated(names_of(robot.parameters)), [False], False)
 
 
 def motion(calibrated: Calibrated, found: HypothesisTest, readings: Floats | None = None) -> Floats:
@@ -369,9 +310,9 @@ def motion(calibrated: Calibrated, found: HypothesisTest, readings: Floats | Non
         readings: The configurations, shape (n, n_joints); None for 200 random ones.
     """
     q = random_readings(calibrated.robot, 200, np.random.default_rng(0)) if readings is None else readings
-    of = motions(calibrated.robot.with_values(calibrated.values), q)
-    columns = np.concatenate([of[name] for name in found.hypothesis.names], axis=2)
-    out: Floats = (columns @ found.change).reshape(-1, 2, 3)
+    v = all_variables(calibrated.arm)
+    J = forward(v.chains[0].at(v.nominal()), v.robot.trig(q)).jacobian  # rotation first, about the base's axes
+    out: Floats = (J @ (found.hypothesis.directions @ found.change)).reshape(-1, 2, 3)
     return out
 
 

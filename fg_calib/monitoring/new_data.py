@@ -9,22 +9,17 @@ boards, touched points and offsets have no such rows. So the smallest sum of squ
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from fg_calib.diagnostics import basis_of
 from fg_calib.graph import (
-    JOINT_NOISE,
     Knowledge,
-    NoiseName,
-    NoiseState,
     Problem,
     Solution,
-    State,
-    WhitenedBlock,
     at_parameters,
     coordinates_of,
     problem_at,
@@ -35,59 +30,13 @@ from fg_calib.graph import (
     variables_of,
     with_factors,
 )
-from fg_calib.inputs import Floats, Integers, ProblemError
-from fg_calib.measurements import INSTRUMENTS, KnownPoint, Table, build_dataset, residuals
-from fg_calib.monitoring.prior_information import with_tolerances
+from fg_calib.inputs import Booleans, Floats, Integers, ProblemError
+from fg_calib.measurements import INSTRUMENTS, Dataset, KnownPoint, Table, build_dataset
+from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.options import Options
 from fg_calib.robot import Robot, names_of
-
-_NOTHING = 1e-9
-"""Part of a column's length that counts as nothing."""
-
-
-@dataclass(frozen=True)
-class Calibrated:
-    """An arm that was calibrated before.
-
-    Attributes:
-        robot: The nominal robot, with its tolerances; what the calibration is of is estimated.
-        values: Its parameters as calibrated, shape (n_parameters,).
-        knowledge: What the calibration's rows say; None where the arm was evaluated only.
-        options: Its options.
-        noise: What stated sigmas are multiplied by, by table and kind, where noise was estimated.
-        noise_degrees: Degrees of freedom that it was estimated by; None where it was stated, or is not known.
-    """
-
-    robot: Robot
-    values: Floats
-    knowledge: Knowledge | None
-    options: Options
-    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    noise_degrees: float | None = None
-
-    @cached_property
-    def information(self) -> Knowledge | None:
-        """What rows and tolerances say."""
-        if self.knowledge is None or not self.options.has_priors:
-            return self.knowledge
-        estimated = {p.name: p.tolerance for p in self.robot.parameters if p.estimated and p.tolerance is not None}
-        return with_tolerances(self.knowledge, self.robot.nominal, estimated)
-
-    def state_for(self, tables: Sequence[Table], like: Sequence[str]) -> NoiseState:
-        """The noise of new tables: as it was found, of the only table if there was one.
-
-        Args:
-            tables: The tables, those of one station each.
-            like: By the number of each which of the calibration's it is like.
-        """
-        factors: dict[NoiseName, float] = {}
-        of_tables = {name: kinds for name, kinds in self.noise.items() if name}
-        if "joint" in self.noise.get("", {}):
-            factors[JOINT_NOISE] = self.noise[""]["joint"]
-        for number, name in enumerate(like):
-            kinds = of_tables.get(name) or (next(iter(of_tables.values())) if len(of_tables) == 1 else {})
-            factors |= {(number, kind): factor for kind, factor in kinds.items()}
-        return NoiseState(factors=factors)
+from fg_calib.statistics import HeldOut
+from fg_calib.statistics.residual_table import residual_table
 
 
 @dataclass(frozen=True)
@@ -114,34 +63,30 @@ class Rows:
         parts = [(part, name) for t, name in zip(tables, like, strict=True) for part in tables_of([t], options)]
         return cls(tuple(part for part, _ in parts), tuple(name for _, name in parts))
 
-    def turned(self, offsets: Floats) -> Rows:
-        """The same with the joints turned by so much more than was read, shape (n_joints,)."""
-        moved = [
-            replace(t, measurements=replace(t.measurements, readings=t.measurements.readings + offsets))
-            for t in self.tables
-        ]
-        return replace(self, tables=tuple(moved))
+    def all_train(self) -> Rows:
+        """The rows with test rows as train rows."""
+        return replace(self, tables=tuple(table.all_train() for table in self.tables))
 
-    def at_known_places(self, known: Knowledge | None, tolerance: float | None) -> tuple[Table, ...]:
-        """The tables with targets and anchors where they were found to be.
+    def without(self, configurations: Sequence[Booleans]) -> Rows:
+        """The rows with those at some configurations, shape (n_configurations,) a table, as the only test rows."""
+        tables = (t.tested_on(which) for t, which in zip(self.tables, configurations, strict=True))
+        return replace(self, tables=tuple(tables))
 
-        Args:
-            known: What says where they are.
-            tolerance: Figure that lets them be estimated from there on; None to hold them.
-        """
-        if known is None:
-            return self.tables
+    def held_at(self, known: Knowledge | None) -> tuple[Table, ...]:
+        """The tables with targets and anchors held where they were found to be."""
+        found = {} if known is None else {name: known.place(name) for name in known.unknowns}
 
-        def with_places(table: Table) -> Table:
+        def held(table: Table) -> Table:
             letters = {kind.letter for kind in INSTRUMENTS[str(table.model)].landmarks} if table.model else set()
-            places = {
-                name: KnownPoint(known.place((letter, name)), tolerance)
-                for letter, name in known.unknowns
-                if letter in letters
-            }
+            places = {n: KnownPoint(at, None) for (letter, n), at in found.items() if letter in letters}
             return replace(table, known={**table.known, **places}).by_itself()
 
-        return tuple(map(with_places, self.tables))
+        return tuple(map(held, self.tables))
+
+    def free_of(self, known: Knowledge | None) -> tuple[Table, ...]:
+        """The tables with targets and anchors to be estimated of which the calibration says where they are."""
+        stays = () if known is None else {name for _, name in known.unknowns}
+        return tuple(replace(t, known={n: at for n, at in t.known.items() if n not in stays}) for t in self.tables)
 
 
 @dataclass(frozen=True)
@@ -149,14 +94,22 @@ class Placed:
     """New rows with the arm held, frames and all that does not stay with it fitted.
 
     Attributes:
+        calibrated: The arm.
         solution: The fit.
         problem: The same rows with every parameter of the robot, and targets, estimated; started there.
         pinned: Unknowns that the calibration says where they are.
     """
 
+    calibrated: Calibrated
     solution: Solution
     problem: Problem
     pinned: tuple[tuple[str, str], ...]
+
+    def errors(self) -> tuple[HeldOut, ...]:
+        """How well the arm predicts the rows, frames and what does not stay with it fitted, by table and kind."""
+        table = residual_table(self.solution)
+        tested = replace(table, test=table.used, n_fitted=0, seen=np.zeros_like(table.seen))
+        return tested.held_out(self.problem.data.labels)
 
 
 def place_new_data(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed:
@@ -171,35 +124,38 @@ def place_new_data(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed
         ProblemError: The rows lack what their model needs, or do not suffice for a frame.
     """
     robot, known = calibrated.robot.with_values(values), calibrated.knowledge
-    options = replace(
-        calibrated.options,
-        gauge="none",
-        encoder="propagated",
-        loss="none",
-        estimate_noise=False,
-        estimate_tolerance=None,
-        prefer=(),
-    )
-    state = calibrated.state_for(rows.tables, rows.like)
-
-    def problem(arm: Robot, tables: Sequence[Table], start: Solution | None) -> Problem:
-        data = build_dataset(arm, tables)
-        variables = variables_of(arm, data, options)
-        x = start_of(arm, data, variables) if start is None else variables.nominal()
-        if start is not None:
-            x[variables.frame_span] = start.parameters[variables.frame_span]
-            there = variables.coordinates >= 0
-            x[variables.coordinates[there]] = at_parameters(start.problem, start.parameters).coordinates[there]
-        return with_factors(problem_at(arm, data, options, variables, x), x, state)
-
-    held = problem(robot.with_estimated([]), rows.at_known_places(known, None), None)
+    options = replace(calibrated.fixed_options, gauge="none", encoder="propagated", loss="none", prefer=())
+    state, arm = calibrated.noise_of(rows.like), robot.with_estimated([])
+    data = build_dataset(arm, rows.held_at(known))
+    v = variables_of(arm, data, options)
+    x = start_of(arm, data, v)
+    held = with_factors(problem_at(arm, data, options, v, x), x, state)
     if not held.n_residuals:
-        raise ProblemError(held.data.source, "no row takes part", "rows that model and options use")
-    solution = solve(held)
-    wide = problem(robot.with_estimated(names_of(robot.parameters)), rows.at_known_places(known, 1.0), solution)
-    seen = () if known is None else known.unknowns
-    pinned = tuple(n for n in seen if coordinates_of(wide.variables, wide.data.unknowns, n) is not None)
-    return Placed(solution, wide, pinned)
+        raise ProblemError(data.source, "no row takes part", "rows that model and options use")
+    solution, arm = solve(held), robot.with_estimated(names_of(robot.parameters))
+    problem = started(arm, build_dataset(arm, rows.free_of(known)), options, values, solution)
+    seen, of = () if known is None else known.unknowns, problem.data.unknowns
+    pinned = tuple(name for name in seen if coordinates_of(problem.variables, of, name) is not None)
+    return Placed(calibrated, solution, problem, pinned)
+
+
+def started(arm: Robot, data: Dataset, options: Options, values: Floats, fit: Solution, **more: Any) -> Problem:
+    """The problem of new rows, started at the arm as it was calibrated and at what was fitted to the rows.
+
+    Args:
+        arm: The robot, with what is to be estimated.
+        data: The rows.
+        options: The options.
+        values: The robot's parameters as calibrated.
+        fit: The fit of the same rows with the arm held.
+        more: What else the problem has.
+    """
+    v = variables_of(arm, data, options)
+    x, there = v.nominal(), v.coordinates >= 0
+    x[v.robot_span], x[v.frame_span] = values, fit.parameters[v.frame_span]
+    x[v.coordinates[there]] = at_parameters(fit.problem, fit.parameters).coordinates[there]
+    made = problem_at(arm, data, options, v, x, **more)
+    return with_factors(made, x, replace(made.state, factors=fit.problem.state.factors))
 
 
 @dataclass(frozen=True)
@@ -212,8 +168,7 @@ class Linear:
         system: The rows by what is fitted, then what is known of that, shape (m + k, n).
         directions: What is fitted, in the columns of `placed.problem`, shape (n_columns + n_nuisance, n).
         fitted: Basis of `system`, shape (m + k, rank).
-        columns: Derivatives in the columns of `placed.problem`, shape (m, n_columns + n_nuisance).
-        joints: Derivatives in the joints' zeros, shape (m, n_joints).
+        of_arm: Derivatives in the arm's columns, shape (m, n_robot_columns).
         dof: Degrees of freedom of chi-square.
         n_free: Directions that were fitted to the new rows alone.
     """
@@ -223,10 +178,14 @@ class Linear:
     system: Floats
     directions: Floats
     fitted: Floats
-    columns: Floats
-    joints: Floats
+    of_arm: Floats
     dof: int
     n_free: int
+
+    @property
+    def robot(self) -> Robot:
+        """The arm with its values where the rows are linearised."""
+        return self.placed.problem.robot
 
     @property
     def left(self) -> Floats:
@@ -243,18 +202,6 @@ class Linear:
         """Columns of the rows with zeros for what is known, shape (m + k, n)."""
         return np.vstack([columns, np.zeros((len(self.r) - len(columns), columns.shape[1]))])
 
-    def without(self, columns: Floats) -> Linear:
-        """The same with more columns fitted, such as those of gross errors, shape (m, n)."""
-        U, s, _ = np.linalg.svd(self.new(columns), full_matrices=False)
-        more = U[:, s > _NOTHING * s.max(initial=0.0)]
-        return replace(
-            self,
-            system=np.hstack([self.system, self.stacked(columns)]),
-            directions=np.hstack([self.directions, np.zeros((len(self.directions), columns.shape[1]))]),
-            fitted=np.hstack([self.fitted, more]),
-            dof=self.dof - more.shape[1],
-        )
-
     def new(self, columns: Floats) -> Floats:
         """What columns of the rows have that is not fitted, shape (m + k, n)."""
         wide = self.stacked(columns)
@@ -263,28 +210,28 @@ class Linear:
         return wide
 
 
-def linearise_new_data(calibrated: Calibrated, at: Placed) -> Linear:
+def linearise_new_data(at: Placed) -> Linear:
     """The rows and what is known as a linear system.
 
     What is fitted are the arm and the landmarks that the calibration knows, held by its information, and everything
     else of the rows, held by what the job says of it.
     """
-    problem, v = at.problem, at.problem.variables
-    J, joints, r = linearised(problem)
+    calibrated, problem, v = at.calibrated, at.problem, at.problem.variables
+    wide = v.n_columns + v.n_nuisance
+    every = whitened(problem, np.vstack([block.private(v.at(problem.start)) for block in problem.rows]))
+    J, r = every[:, :wide], every[:, wide]
     stated, J_stated = unknown_prior_rows(v, problem.start)
-    pinned = np.concatenate([np.zeros(0, dtype=np.int64), *(_columns_of(problem, name) for name in at.pinned)])
-    own = ~np.any(J_stated[:, pinned] != 0.0, axis=1)  # what it says of landmarks that the calibration knows is in it
-    stated, J_stated = stated[own], J_stated[own]
-    every, known = np.eye(v.n_columns + v.n_nuisance), np.zeros((v.n_columns + v.n_nuisance, 0))
-    information = np.zeros((0, 0))
+    places = [coordinates_of(v, problem.data.unknowns, name) for name in at.pinned]
+    pinned = np.array([place for place in places if place is not None], dtype=np.int64).ravel()
+    pinned = pinned - v.nuisance_span.start + v.n_columns
+    unit, known, information = np.eye(wide), np.zeros((wide, 0)), np.zeros((0, 0))
     if calibrated.information is not None:
         knowledge = calibrated.information.about(at.pinned)
-        arm = np.zeros((len(every), knowledge.variables.n_columns))
-        arm[: v.n_columns] = v.columns_of(knowledge.variables, problem.start)
-        known, information = np.hstack([arm, every[:, pinned]]), knowledge.rows
+        arm = np.pad(v.columns_of(knowledge.variables, problem.start), ((0, wide - v.n_columns), (0, 0)))
+        known, information = np.hstack([arm, unit[:, pinned]]), knowledge.rows
     frames = [np.arange(v.n_columns)[f.columns] for f in v.frames]
-    free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, len(every)), pinned)])
-    directions = np.hstack([known, every[:, free.astype(np.int64)]])
+    free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, wide), pinned)])
+    directions = np.hstack([known, unit[:, free.astype(np.int64)]])
     of_known = np.hstack([information, np.zeros((len(information), len(free)))])
     system = np.vstack([J @ directions, of_known, J_stated @ directions])
     fitted = basis_of(system)
@@ -295,40 +242,26 @@ def linearise_new_data(calibrated: Calibrated, at: Placed) -> Linear:
         system=system,
         directions=directions,
         fitted=fitted,
-        columns=J,
-        joints=joints,
+        of_arm=J[:, : v.n_robot_columns],
         dof=problem.n_independent + n_given - fitted.shape[1],
         n_free=fitted.shape[1] - n_given,
     )
 
 
-def linearised(problem: Problem) -> tuple[Floats, Floats, Floats]:
-    """Whitened rows: derivatives in all columns, in the joints' zeros, and residuals."""
-    at = problem.variables.at(problem.start)
-    n = at.n_columns + at.n_nuisance
-    blocks = []
-    for rows in problem.rows:
-        wide = np.hstack([rows.private(at), _of_joints(rows, at)])
-        blocks.append(wide if rows.states is None else rows.states.whiten(wide))
-    every = np.vstack(blocks)
-    return every[:, :n], every[:, n + 1 :], every[:, n]
-
-
-def _of_joints(rows: WhitenedBlock, at: State) -> Floats:
-    """Derivatives of rows in the joints' zeros, the same for all configurations, shape (n_rows, n_joints)."""
-    found = []
-    for part in rows.parts:
-        chain, block = at.chains[part.table], part.at(at)
-        ends = block.kind.ends
-        J = residuals.linearise(block, chain.without_columns().with_joint_columns())[1]
-        J = J[:, :, : ends * chain.n_joints].reshape(*J.shape[:2], ends, chain.n_joints).sum(axis=2)
-        found.append(J.reshape(-1, chain.n_joints))
+def whitened(problem: Problem, rows: Floats) -> Floats:
+    """Rows that are whitened by their private noise, shape (n, k), whitened by all they share, shape (m, k)."""
+    found, first = [], 0
+    for block in problem.rows:
+        mine = rows[first : first + sum(part.n_rows for part in block.parts)]
+        found.append(mine if block.states is None else block.states.whiten(mine))
+        first += len(mine)
     return np.vstack(found)
 
 
-def _columns_of(problem: Problem, name: tuple[str, str]) -> Integers:
-    v = problem.variables
-    place = coordinates_of(v, problem.data.unknowns, name)
-    assert place is not None
-    out: Integers = place - v.nuisance_span.start + v.n_columns
-    return out
+def ends_of_rows(problem: Problem) -> Integers:
+    """The configurations of each row that is whitened by its private noise, -1 for no second one, shape (n, 2)."""
+    found = []
+    for part in (part for block in problem.rows for part in block.parts):
+        ends = np.pad(problem.data.places[part.table][part.block.ends], ((0, 0), (0, 2)), constant_values=-1)
+        found.append(np.repeat(ends[:, :2], part.block.residual_dim, axis=0))
+    return np.concatenate(found)

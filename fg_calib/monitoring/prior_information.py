@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph import (
+    JOINT_NOISE,
     SIZE,
     STAYING,
     Knowledge,
     Name,
+    NoiseName,
+    NoiseState,
     Problem,
     Solution,
     coordinates_of,
@@ -22,6 +27,62 @@ from fg_calib.graph import (
 )
 from fg_calib.inputs import Floats
 from fg_calib.observability import ObservedQuantities
+from fg_calib.options import Options
+from fg_calib.robot import Robot
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """An arm that was calibrated before.
+
+    Attributes:
+        robot: The nominal robot, with its tolerances; what the calibration is of is estimated.
+        values: Its parameters as calibrated, shape (n_parameters,).
+        knowledge: What the calibration's rows say; None where the arm was evaluated only.
+        options: Its options.
+        noise: What stated sigmas are multiplied by, by table and kind, where noise was estimated.
+        noise_degrees: Degrees of freedom that it was estimated by; None where it was stated, or is not known.
+    """
+
+    robot: Robot
+    values: Floats
+    knowledge: Knowledge | None
+    options: Options
+    noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    noise_degrees: float | None = None
+
+    @cached_property
+    def information(self) -> Knowledge | None:
+        """What rows and tolerances say."""
+        if self.knowledge is None or not self.options.has_priors:
+            return self.knowledge
+        estimated = {p.name: p.tolerance for p in self.robot.parameters if p.estimated and p.tolerance is not None}
+        return with_tolerances(self.knowledge, self.robot.nominal, estimated)
+
+    @property
+    def arm(self) -> Robot:
+        """The calibrated robot."""
+        return self.robot.with_values(self.values)
+
+    @property
+    def fixed_options(self) -> Options:
+        """Its options, noise and prior sigmas as they were found."""
+        return replace(self.options, estimate_noise=False, estimate_tolerance=None)
+
+    def noise_of(self, like: Sequence[str]) -> NoiseState:
+        """The noise of new tables: as it was found, of the only table if there was one.
+
+        Args:
+            like: Of each table the name of the calibration's table that it is like.
+        """
+        factors: dict[NoiseName, float] = {}
+        of_tables = {name: kinds for name, kinds in self.noise.items() if name}
+        if "joint" in self.noise.get("", {}):
+            factors[JOINT_NOISE] = self.noise[""]["joint"]
+        for number, name in enumerate(like):
+            kinds = of_tables.get(name) or (next(iter(of_tables.values())) if len(of_tables) == 1 else {})
+            factors |= {(number, kind): factor for kind, factor in kinds.items()}
+        return NoiseState(factors=factors)
 
 
 def knowledge_of(solution: Solution) -> Knowledge | None:

@@ -19,21 +19,16 @@ from fg_calib.graph import (
     Knowledge,
     Problem,
     Solution,
-    at_parameters,
-    coordinates_of,
     kept_of,
-    problem_at,
     solve,
-    variables_of,
-    with_factors,
 )
 from fg_calib.inputs import NEAR, Floats, InputError, ProblemError, did_you_mean, known_names
 from fg_calib.measurements import TARGET, build_dataset
-from fg_calib.monitoring.hypotheses import motions, zero_names
-from fg_calib.monitoring.new_data import Calibrated, Placed, Rows, place_new_data
-from fg_calib.robot import Robot, names_of, random_readings, tolerance_kind
+from fg_calib.monitoring.hypotheses import named_changes
+from fg_calib.monitoring.new_data import Rows, place_new_data, started
+from fg_calib.monitoring.prior_information import Calibrated
+from fg_calib.robot import Robot, tolerance_kind
 from fg_calib.statistics import HeldOut
-from fg_calib.statistics.residual_table import residual_table
 
 
 def updated(
@@ -63,10 +58,10 @@ def updated(
     if growth or changed:
         information = replace(calibrated, knowledge=known).information
         assert information is not None
-        known = _with_change(calibrated, information, growth, changed)
+        known = _with_change(information, growth, changed)
         robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
-    at = place_new_data(replace(calibrated, knowledge=known), rows, calibrated.values)
-    return solve(_problem(calibrated, robot, known, rows, at))
+    fit = place_new_data(replace(calibrated, knowledge=known), rows, calibrated.values).solution
+    return solve(_problem(calibrated, robot, known, rows, fit))
 
 
 def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[HeldOut, ...]:
@@ -76,37 +71,16 @@ def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[HeldOut, ...]:
         calibrated: The arm.
         rows: The rows; test rows count as the others do.
     """
-    rows = replace(rows, tables=tuple(table.all_train() for table in rows.tables))
-    solution = place_new_data(calibrated, rows, calibrated.values).solution
-    table = residual_table(solution)
-    tested = replace(table, test=np.ones_like(table.test), n_fitted=0, seen=np.zeros_like(table.seen))
-    found = tested.held_out(solution.problem.data.labels)
+    found = place_new_data(calibrated, rows.all_train(), calibrated.values).errors()
     return tuple(replace(held, by="the arm before this update") for held in found)
 
 
-def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, at: Placed) -> Problem:
+def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, fit: Solution) -> Problem:
     """The problem of the rows with what is known, started at the arm as it was calibrated."""
-    options = replace(calibrated.options, estimate_noise=False, estimate_tolerance=None)
-    stays = {name for _, name in known.unknowns}
-    tables = tuple(
-        replace(t, known={name: place for name, place in t.known.items() if name not in stays}) for t in rows.tables
-    )
-    data = build_dataset(robot, tables)
-    state = calibrated.state_for(rows.tables, rows.like)
-    places = at_parameters(at.solution.problem, at.solution.parameters).coordinates
+    options, data = calibrated.fixed_options, build_dataset(robot, rows.free_of(known))
 
     def problem(arm: Robot, whole: Problem | None) -> Problem:
-        v = variables_of(arm, data, options)
-        x = np.append(calibrated.values, np.zeros(v.nuisance_span.stop - len(calibrated.values)))
-        x[v.frame_span] = at.solution.parameters[v.frame_span]
-        there = v.coordinates >= 0
-        x[v.coordinates[there]] = places[there]
-        for name in known.unknowns:
-            place = coordinates_of(v, data.unknowns, name)
-            if place is not None:
-                x[place] = known.place(name)
-        made = problem_at(arm, data, options, v, x, whole=whole, knowledge=known)
-        return with_factors(made, x, replace(made.state, factors=state.factors))
+        return started(arm, data, options, calibrated.values, fit, whole=whole, knowledge=known)
 
     whole = problem(robot, None)
     if not whole.n_residuals:
@@ -135,80 +109,38 @@ def _require_determined(robot: Robot, kept: Sequence[str]) -> None:
         raise InputError("update", found, "a calibration with gauge keep or prior")
 
 
-def _with_change(
-    calibrated: Calibrated, known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]
-) -> Knowledge:
+def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]) -> Knowledge:
     """What is known of an arm that may have changed since, the tolerances among it."""
-    sigma = _growth_of(calibrated.robot, known, growth)
-    named = _named_columns(known)
-    directions = [named[name] * size for name, size in sigma.items()]
-    free = _changes(known, changed)
-    every = _wide(known, [*directions, *free])
-    grown = known.grown(every, np.arange(len(directions) + len(free)) >= len(directions))
+    wandered, free = _growth(known, growth), _changes(known, changed)
+    grown = known.grown(np.hstack([wandered, free]), np.arange(wandered.shape[1] + free.shape[1]) >= wandered.shape[1])
     if known.nominal is None:
         return grown
     free = _changes(known.nominal, changed)
-    nominal = known.nominal.grown(_wide(known.nominal, free), np.ones(len(free), dtype=np.bool_))
-    return replace(grown, nominal=nominal)
+    return replace(grown, nominal=known.nominal.grown(free, np.ones(free.shape[1], dtype=np.bool_)))
 
 
-def _named_columns(known: Knowledge) -> dict[str, Floats]:
-    """A change of each parameter in the arm's columns."""
-    E = known.variables.tangent_derivative(np.append(known.robot.nominal, np.zeros(6)))
-    return dict(zip(known.variables.names, E.T, strict=True))
-
-
-def _wide(known: Knowledge, directions: Sequence[Floats]) -> Floats:
-    """Directions of the arm as columns by all that is known, shape (n_columns + len(at), n)."""
-    n = known.variables.n_columns
-    out = np.zeros((known.rows.shape[1], len(directions)))
-    out[:n] = np.array(directions).reshape(len(directions), n).T
-    return out
-
-
-def _growth_of(robot: Robot, known: Knowledge, growth: Mapping[str, float]) -> dict[str, float]:
-    """1 sigma of growth by parameter; that of a name counts before that of its kind."""
-    of_kind = {p.name: tolerance_kind(p) or "" for p in robot.parameters}
-    kinds = {of_kind[name] for name in known.variables.names if of_kind[name]}
+def _growth(known: Knowledge, growth: Mapping[str, float]) -> Floats:
+    """Changes of 1 sigma of growth as columns of what is known; that of a name counts before that of its kind."""
+    of_kind = {p.name: tolerance_kind(p) or "" for p in known.robot.parameters}
+    names = known.variables.names
     for key in growth:
-        _check_name("growth", key, [*known.variables.names, *sorted(kinds)])
-    found = {name: growth.get(name, growth.get(of_kind[name], 0.0)) for name in known.variables.names}
-    return {name: size for name, size in found.items() if size > 0.0}
+        _check_name("growth", key, [*names, *sorted({of_kind[name] for name in names if of_kind[name]})])
+    sigma = {name: growth.get(name, growth.get(of_kind[name], 0.0)) for name in names}
+    return _columns(known, {name: size for name, size in sigma.items() if size > 0.0})
 
 
-def _changes(known: Knowledge, changed: Sequence[str]) -> list[Floats]:
-    """Directions of what has changed, in the arm's columns."""
-    by_name, robot = _named_columns(known), known.robot
-    zeros = [name for name in zero_names(robot) if name not in names_of(robot.parameters)]
-    tool = [name for name in by_name if name.startswith("tool.")]
-    possible = [*by_name, *zeros, *(["tool"] if tool else [])]
-    found = []
+def _changes(known: Knowledge, changed: Sequence[str]) -> Floats:
+    """Directions of what has changed as columns of what is known."""
     for name in changed:
-        _check_name("changed", name, possible)
-        if name == "tool":
-            found += [by_name[part] for part in tool]
-        elif name in by_name:
-            found.append(by_name[name])
-        else:
-            found.append(_zero(robot, name, by_name))
-    return found
+        _check_name("changed", name, list(named_changes(known.variables)))
+    return _columns(known, dict.fromkeys(changed, 1.0))
 
 
-def _zero(robot: Robot, name: str, by_name: Mapping[str, Floats]) -> Floats:
-    """A joint's zero as a combination of what was estimated of its origin.
-
-    Raises:
-        InputError: It is none.
-    """
-    of = motions(robot, random_readings(robot, 20, np.random.default_rng(0)))
-    owner = f"{name.removesuffix('.zero')}."
-    own = [n for n in by_name if n.startswith(owner)]
-    A, b = np.array([of[n].ravel() for n in own]).T, of[name].ravel()
-    v = np.linalg.lstsq(A, b, rcond=None)[0] if own else np.zeros(0)
-    if not own or np.linalg.norm(A @ v - b) > 1e-6 * np.linalg.norm(b):
-        raise InputError("changed", f"{name} cannot be expressed by what was estimated of that joint", "its roll, ...")
-    out: Floats = sum((by_name[n] * x for n, x in zip(own, v, strict=True)), np.zeros(len(by_name)))
-    return out
+def _columns(known: Knowledge, sizes: Mapping[str, float]) -> Floats:
+    """Named changes of some size as columns of what is known, shape (n_columns + len(at), n)."""
+    of, n = named_changes(known.variables), known.variables.n_columns
+    columns = np.hstack([np.zeros((n, 0)), *(size * of[name] for name, size in sizes.items())])
+    return np.pad(columns, ((0, len(known.at)), (0, 0)))
 
 
 def _check_name(key: str, name: str, possible: Sequence[str]) -> None:

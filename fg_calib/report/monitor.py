@@ -28,8 +28,8 @@ KINDS = {
 """What each kind of explanation changes."""
 
 NO_ADVICE = (
-    "no configurations are advised: random ones cannot be measured like these rows (contacts, fixed lengths), or do not"
-    " distinguish these changes; another instrument may"
+    "no configurations are advised: random ones cannot be measured like these rows (pairs, contacts, fixed lengths), or"
+    " do not distinguish these changes; another instrument may"
 )
 
 

@@ -1,18 +1,13 @@
 """`check` and `update` of rows of every instrument: p-values, slips, updates, and what to measure next."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
-from month import OF_INSTRUMENTS, calibrated, measured, months_of, placed
+from month import OF_INSTRUMENTS, months_of
 from scenarios import SIGMA, TOLERANCE
 from scipy import stats
 from simulated import small_arm
 
 from fg_calib import calibrate
 from fg_calib.measurements.dataset import Noise
-from fg_calib.monitoring.discriminating_design import _linearised_candidates
-from fg_calib.monitoring.new_data import linearise_new_data, linearised, place_new_data
 from fg_calib.simulation.scenario import Errors
 
 
@@ -68,22 +63,3 @@ def test_an_update_is_a_calibration_of_all_rows_whatever_the_instrument(kind):
         assert one.identifiability == other.identifiability
         assert abs(one.estimate - other.estimate) < 1e-4 * other.sigma
         assert one.sigma == pytest.approx(other.sigma, rel=1e-5)
-
-
-def test_columns_of_candidates_are_differences_of_their_residuals():
-    """With the arm and the frame that the rows have fitted moved by a little."""
-    calibration, true, rng = calibrated(2, unknown=True)
-    rows, _ = calibration._rows(measured(true, 8, rng, frame=placed(rng)), None, None)
-    known = calibration.calibrated
-    at = linearise_new_data(known, place_new_data(known, rows, known.values))
-    q = np.random.default_rng(0).uniform(-1.0, 1.0, (5, 6))
-    found, of = _linearised_candidates(at, q)
-    problem = found.placed.problem
-    v = problem.variables
-    step = 1e-6 * np.random.default_rng(1).normal(size=v.n_columns + v.n_nuisance)
-
-    def residuals(sign):
-        return linearised(replace(problem, start=v.moved(problem.start, sign * step[: v.n_columns])))[2]
-
-    assert found.columns @ step == pytest.approx(0.5 * (residuals(1.0) - residuals(-1.0)), rel=1e-5, abs=1e-9)
-    assert [int(np.sum(of == k)) for k in range(5)] == [6] * 5
