@@ -69,11 +69,11 @@ def walk(chain, trig, row, rotation, point, twist):  # type: ignore[no-untyped-d
         rotation: Filled: rotation matrix, [column, component, lane], shape (3, 3, LANES).
         point: Filled: tool point, shape (3, LANES), [m].
         twist: Filled: (w, v) of each column, then of each joint, shape (n_columns + n_own, 6, LANES): the sum over the
-            elements that it belongs to. Must come with w = 0 for columns of translations alone.
+            elements that it belongs to.
     """
     axis, value, cosine, sine, sign, joint, column, n_columns, n_own, _, basis = chain
     reading = np.empty(2 * LANES)
-    written = np.zeros(twist.shape[0], np.bool_)
+    twist[:] = 0.0
     R, p = rotation.reshape(9 * LANES), point.reshape(3 * LANES)
     R[:] = 0.0
     p[:] = 0.0
@@ -85,19 +85,11 @@ def walk(chain, trig, row, rotation, point, twist):  # type: ignore[no-untyped-d
         k, j = axis[e], joint[e]
         if basis[e] >= 0:
             own = n_columns + j if n_own > 0 and j >= 0 else -1
-            _walk_basis(k, value[e], sign[e], trig, row, basis[e], column[e], own, reading, R, p, twist, written)
+            _walk_basis(k, value[e], sign[e], trig, row, basis[e], column[e], own, reading, R, p, twist)
             continue
         for target in (column[e], n_columns + j if n_own > 0 and j >= 0 else -1):
-            if target < 0:
-                continue
-            if written[target]:
+            if target >= 0:
                 _add_twist(sign[e], R, k, p, twist[target])
-                continue
-            written[target] = True
-            if k >= 3:
-                _write_rotation_twist(sign[e], R, k - 3, p, twist[target])
-            else:
-                _write_translation_twist(sign[e], R, k, twist[target])
         if j >= 0:
             for i in range(LANES):
                 reading[i] = trig[row[i], j, 0]
@@ -115,36 +107,24 @@ def walk(chain, trig, row, rotation, point, twist):  # type: ignore[no-untyped-d
 
 
 @inlined
-def _write_rotation_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
-    w = 3 * k * LANES
+def _add_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
+    """Add the twist of an element along or about its axis."""
+    if k < 3:
+        for c in range(3):
+            for i in range(LANES):
+                twist[3 + c, i] += sign * R[(3 * k + c) * LANES + i]
+        return
+    w = 3 * (k - 3) * LANES
     for i in range(LANES):
         w0 = sign * R[w + i]
         w1 = sign * R[w + LANES + i]
         w2 = sign * R[w + 2 * LANES + i]
-        twist[0, i] = w0
-        twist[1, i] = w1
-        twist[2, i] = w2
-        twist[3, i] = p[LANES + i] * w2 - p[2 * LANES + i] * w1
-        twist[4, i] = p[2 * LANES + i] * w0 - p[i] * w2
-        twist[5, i] = p[i] * w1 - p[LANES + i] * w0
-
-
-@inlined
-def _write_translation_twist(sign, R, k, twist):  # type: ignore[no-untyped-def]
-    for c in range(3):
-        for i in range(LANES):
-            twist[3 + c, i] = sign * R[(3 * k + c) * LANES + i]
-
-
-@part
-def _add_twist(sign, R, k, p, twist):  # type: ignore[no-untyped-def]
-    """The twist of a further element of a column: it moves with all of them."""
-    more = np.zeros((6, LANES))
-    if k >= 3:
-        _write_rotation_twist(sign, R, k - 3, p, more)
-    else:
-        _write_translation_twist(sign, R, k, more)
-    twist += more
+        twist[0, i] += w0
+        twist[1, i] += w1
+        twist[2, i] += w2
+        twist[3, i] += p[LANES + i] * w2 - p[2 * LANES + i] * w1
+        twist[4, i] += p[2 * LANES + i] * w0 - p[i] * w2
+        twist[5, i] += p[i] * w1 - p[LANES + i] * w0
 
 
 @inlined
@@ -209,21 +189,15 @@ def _turn_about_by_reading(k, reading, R):  # type: ignore[no-untyped-def]
 
 
 @part
-def _walk_basis(k, coefficient, sign, trig, row, basis, column, own, reading, R, p, twist, written):  # type: ignore[no-untyped-def]
+def _walk_basis(k, coefficient, sign, trig, row, basis, column, own, reading, R, p, twist):  # type: ignore[no-untyped-def]
     """An element whose value is a coefficient times a basis function, which `trig` has with its slope."""
     for target, which in ((column, 0), (own, 1)):
         if target >= 0:
-            factor = sign if which == 0 else coefficient
-            more = np.zeros((6, LANES))
-            if k >= 3:
-                _write_rotation_twist(factor, R, k - 3, p, more)
-            else:
-                _write_translation_twist(factor, R, k, more)
+            unit = np.zeros((6, LANES))
+            _add_twist(sign if which == 0 else coefficient, R, k, p, unit)
             for c in range(6):
                 for i in range(LANES):
-                    known = twist[target, c, i] if written[target] else 0.0
-                    twist[target, c, i] = known + trig[row[i], basis, which] * more[c, i]
-            written[target] = True
+                    twist[target, c, i] += trig[row[i], basis, which] * unit[c, i]
     for i in range(LANES):
         angle = coefficient * trig[row[i], basis, 0]
         reading[i] = angle if k < 3 else np.cos(angle)

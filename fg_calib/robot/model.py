@@ -402,10 +402,7 @@ class Robot:
         names = (names,) if isinstance(names, str) else listed(self.name, names)
         check_names(self.name, names, names_of(self.parameters))
         wanted = set(names)
-        changed = (
-            p if p.estimated == (p.name in wanted) else replace(p, estimated=not p.estimated) for p in self.parameters
-        )
-        return replace(self, parameters=tuple(changed))
+        return replace(self, parameters=tuple(replace(p, estimated=p.name in wanted) for p in self.parameters))
 
     @checked
     def with_values(self, values: Floats | Sequence[float]) -> Robot:
@@ -419,9 +416,7 @@ class Robot:
             found = f"{len(figures)} values" if figures.ndim == 1 else f"shape {figures.shape}"
             raise InputError(self.name, found, f"{n}, one a parameter")
         check_sizes(self.name, figures)
-        changed = (
-            p if p.nominal == v else replace(p, nominal=float(v)) for p, v in zip(self.parameters, figures, strict=True)
-        )
+        changed = (replace(p, nominal=float(v)) for p, v in zip(self.parameters, figures, strict=True))
         return replace(self, parameters=tuple(changed))
 
 

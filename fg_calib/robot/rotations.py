@@ -57,14 +57,10 @@ def yaw_pitch_roll(rotation: Floats, near: Floats | None = None) -> Floats:
 
 def rotation_of(yaw: float, pitch: float, roll: float) -> Floats:
     """The matrix Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3); angles in [rad]."""
-    (a, b, c), (d, e, f) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
-    return np.array(
-        [
-            [a * b, a * e * f - d * c, a * e * c + d * f],
-            [d * b, d * e * f + a * c, d * e * c - a * f],
-            [-e, b * f, b * c],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    matrix: Floats = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
+    return matrix
 
 
 def nearest_rotation(M: Floats) -> Floats:
