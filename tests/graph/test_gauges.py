@@ -1,91 +1,30 @@
 """Gauges that leave parameters out: what is said of the others, of combinations and of predictions is true."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.problem import linear_system
 from fg_calib.graph.solver import solve
-from fg_calib.io.columns import write_csv
-from fg_calib.io.robot_file import write_robot
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.monitoring.prior_information import knowledge_of
-from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.covariance import Spread
 
 TOLERANCE = {"a": 1e-3, "d": 2e-3, "alpha": 1e-3, "theta": 1.5e-3, "tool": 2e-3}
 TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}
 HAYATI = TOLERANCE | {"beta": 1e-3}
-Z = 1.959964
-"""Half the width of a 95 % interval, in sigma."""
 
 
 def assessed(robot, true, rng, model, gauge="keep", n=40, **options):
     measurements = measure(true, n, rng, sigma=(2e-4, 1e-4), frame=options.pop("seen_from", None))
     return assess(solve(build_problem(robot, measurements, model=model, gauge=gauge, **options)))
-
-
-def coverage(robot, model, gauge, n_draws, seed, **options):
-    """Share of 95 % intervals that hold the truth, by what they are of: shape (draws, intervals) of hits."""
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(-2, 2, (4, robot.n_joints))
-    hits = {"independent": [], "relative": [], "ineffective": [], "combination": [], "tool": []}
-    for _ in range(n_draws):
-        true = true_robot(robot, rng)
-        found = assessed(robot, true, rng, model, gauge, **options)
-        values = dict(zip([p.name for p in robot.parameters], true.nominal, strict=True))
-        nominal = dict(zip([p.name for p in robot.parameters], robot.nominal, strict=True))
-        for p in found.estimates.parameters:
-            if p.sigma:
-                hits[p.identifiability].append(abs(p.estimate - values[p.name]) < Z * p.sigma)
-            if p.stands_for:
-                truth = sum(factor * (values[name] - nominal[name]) for name, factor in p.stands_for.items())
-                hits["combination"].append(abs(p.estimate - p.nominal - truth) < Z * p.sigma_of_combination)
-        predicted = found.predict(lambda r: pose(r, q).position)
-        error = predicted.value - pose(true, q).position.ravel()
-        known = np.isfinite(predicted.sigma)
-        hits["tool"] += (np.abs(error) < Z * predicted.sigma)[known].tolist()
-    return {of: (np.mean(h), len(h)) for of, h in hits.items() if h}
-
-
-CELLS = {
-    "poses, kept": (paper_robot(tolerance=HAYATI), "pose", "keep", {}),
-    "pairs, kept": (paper_robot(tolerance=HAYATI), "distance-rotation", "keep", {}),
-    "positions in an unknown frame, kept": (paper_robot(tolerance=HAYATI), "position", "keep", {"frame": "unknown"}),
-    "a tool, kept": (small_arm(tolerance=TOLERANCE, estimate=TOOL), "pose", "keep", {}),
-    "pairs, none": (paper_robot(tolerance=HAYATI), "distance-rotation", "none", {}),
-    "poses, none": (paper_robot(tolerance=HAYATI), "pose", "none", {}),
-}
-EVERY_CELL = pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=CELLS.keys())
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("without_reasons")
-@pytest.mark.parametrize(("robot", "model", "gauge", "options"), CELLS.values(), ids=list(CELLS))
-def test_intervals_hold_the_truth(robot, model, gauge, options):
-    """Roughly: 4 draws, the intervals of one of which depend on each other. Sigmas half as large hold 67 %."""
-    for of, (share, n) in coverage(robot, model, gauge, 4, seed=1, **options).items():
-        assert share > 0.8, (of, n)
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("without_reasons")
-@EVERY_CELL
-def test_intervals_hold_the_truth_95_times_in_100(robot, model, gauge, options):
-    """Were the intervals of a draw one and the same, the share would be within the bounds in 99.9 % of all runs."""
-    n_draws = 150
-    low, high = binom.ppf([0.0005, 0.9995], n_draws, 0.95) / n_draws
-    for of, (share, n) in coverage(robot, model, gauge, n_draws, seed=2, **options).items():
-        assert low < share < high, (of, n)
 
 
 def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
@@ -107,26 +46,6 @@ def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
     assert covariance[index("d5"), index("d4")] == pytest.approx(-(4e-3**2), rel=2e-5)
     ones = np.isin(found.names, ["d3", "d4", "d5"])
     assert ones @ covariance @ ones == pytest.approx(d5.sigma_of_combination**2, rel=1e-3)
-
-
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("model", ["pose", "distance-rotation"])
-def test_the_covariance_of_a_kept_arm_is_that_of_its_bound(model):
-    """`cramer_rao` has the same errors from another formula, at the truth; here the truth is nominal."""
-    rng = np.random.default_rng(8)
-    robot = paper_robot(tolerance=HAYATI)
-    measurements = measure(robot, 40, rng, sigma=(1e-9, 1e-9))
-    stated = replace(measurements, sigma_position=np.full((40, 3), 2e-4), sigma_orientation=np.full((40, 3), 1e-4))
-    solution = solve(build_problem(robot, stated, model=model, gauge="keep"))
-    kept = [p.name for p in solution.problem.estimated]
-    bound = cramer_rao(robot, stated, model=model, prior=False, kept=kept)
-    found = assess(solution)
-    assert found.names == bound.names
-    sigma = np.sqrt(np.diag(bound.covariance))
-    # rows near kinks are judged by measured values, which have noise of 1e-9
-    assert found.covariance / np.outer(sigma, sigma) == pytest.approx(
-        bound.covariance / np.outer(sigma, sigma), abs=1e-6
-    )
 
 
 @pytest.mark.sampled(1)
@@ -181,52 +100,6 @@ def test_the_derivative_behind_predictions_is_that_in_the_columns():
         h = 1e-4 * np.eye(v.n_columns)[k]
         # two step widths: their difference is that of third derivatives
         assert J[:, k] == pytest.approx((at(h) - at(-h)) / 2e-4, abs=1e-7)
-
-
-def job_files(folder, robot, gauge):
-    rng = np.random.default_rng(7)
-    m = measure(true_robot(robot, rng), 40, rng, sigma=(2e-4, 1e-4))
-    write_robot(folder / "robot.yaml", robot)
-    columns = {f"q{i + 1}": m.readings[:, i] for i in range(robot.n_joints)}
-    columns |= dict(zip("xyz", m.position.T, strict=True))
-    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation.copy()).as_quat().T, strict=True))
-    write_csv(folder / "poses.csv", columns)
-    noise = "{position: 0.0002, orientation: 0.0001}"
-    (folder / "job.yaml").write_text(
-        f"robot: robot.yaml\nmeasurements: poses.csv\nmodel: distance-rotation\ngauge: {gauge}\nnoise: {noise}\n"
-    )
-    return folder / "job.yaml"
-
-
-@pytest.mark.slow
-def test_results_and_report_name_what_a_kept_parameter_stands_for(tmp_path, fg_calib):
-    ended = fg_calib("calibrate", job_files(tmp_path, paper_robot(tolerance=HAYATI), "keep"), "--out", tmp_path / "out")
-    assert ended.code == 0
-    result = json.loads((tmp_path / "out" / "result.json").read_text())
-    combined = {p["name"]: p["stands_for"] for p in result["parameters"] if "stands_for" in p}
-    assert combined == {
-        "theta2": {"theta2": 1.0, "beta1": 1.0},
-        "theta3": {"theta3": 1.0, "beta2": 1.0},
-        "d5": {"d5": 1.0, "d3": 1.0, "d4": 1.0},
-        "theta6": {"theta6": 1.0, "beta5": -1.0},
-    }
-    d5 = next(p for p in result["parameters"] if p["name"] == "d5")
-    assert d5["sigma"] > 2e-3 > d5["sigma_of_combination"]
-    names, matrix = result["covariance"]["names"], np.array(result["covariance"]["matrix"], dtype=float)
-    assert len(names) == 35
-    assert matrix[names.index("d5"), names.index("d5")] == pytest.approx(d5["sigma"] ** 2)
-    section = ended.out.partition("What kept parameters were estimated for")[2].partition("\n\n")[0]
-    shown = {line.split()[0]: line.split() for line in section.splitlines() if line.strip()}
-    assert shown["d5"] == ["d5", f"{d5['sigma_of_combination'] * 1e3:.4f}", "mm", "d5", "+", "d3", "+", "d4"]
-    assert shown["theta6"][3:] == ["theta6", "-", "beta5"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("gauge", ["prior", "none"])
-def test_where_nothing_was_left_out_parameters_stand_for_themselves(tmp_path, fg_calib, gauge):
-    ended = fg_calib("calibrate", job_files(tmp_path, paper_robot(tolerance=HAYATI), gauge), "--json")
-    assert not any("stands_for" in p for p in json.loads(ended.out)["parameters"])
-    assert "kept parameters" not in fg_calib("calibrate", tmp_path / "job.yaml").out
 
 
 @pytest.mark.parametrize("loss", ["none", "huber"])

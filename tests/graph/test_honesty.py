@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import measure, paper_robot, small_arm, true_robot
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
@@ -25,6 +25,13 @@ def poses(rng, *, joint=3e-4, n=20, wrong=0):
     off = np.zeros((n, 3))
     off[1 : wrong + 1] = 0.05
     return robot, true, replace(m, position=m.position + off)
+
+
+def left_out(rng):
+    """An arm of parallel axes, of whose parameters the gauge leaves some at nominal."""
+    robot = paper_robot(dict.fromkeys(("a", "d", "alpha", "theta", "beta"), 1e-3))
+    true = true_robot(robot, rng)
+    return robot, true, measure(true, 30, rng, sigma=(2e-4, 1e-4))
 
 
 def small_motions(rng):
@@ -53,6 +60,7 @@ CASES = {
     "star": (poses, {}, PAIRS),
     "all pairs": (poses, {}, PAIRS | {"pairing": Pairing("all")}),
     "all pairs of small motions": (small_motions, {}, PAIRS | {"pairing": Pairing("all")}),
+    "gauge keep": (left_out, {}, PAIRS | {"gauge": "keep"}),
     "touches": (touches, {}, {"model": "distance"}),
     "gnc with outliers": (poses, {"n": 40, "wrong": 4, "joint": 0.0}, {"model": "pose", "loss": "gnc"}),
     **{name: (lambda rng, name=name: measured_by(name, rng, sigma_joint=5e-4), {}, {})

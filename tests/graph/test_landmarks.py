@@ -10,7 +10,7 @@ import pytest
 from instruments import CAMERA, TARGETS, measured_by
 from scipy.stats import chi2
 from simulated import small_arm, true_robot, write_job
-from sparing import as_case, diagonal
+from sparing import diagonal
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
@@ -328,31 +328,6 @@ def test_rows_of_the_tool_itself_are_of_no_target():
     rows = residual_table(solve(build_problem(robot, some), SolverOptions(max_iterations=1)))
     assert set(rows.of[rows.table_row % 3 == 0]) == {""}
     assert set(rows.of[rows.table_row % 3 == 2]) == {"t2"}
-
-
-OF_ONE_STATION = "all 9 suspicious rows are of measurements, station s1, as are 45 of all 90 rows"
-
-
-@pytest.mark.parametrize(
-    ("instrument", "rows", "said"),
-    [
-        ("anchors", [1, 22, 25, 3], "3 of 4 suspicious rows are of a1, as are 10 of all 30 rows"),
-        as_case(("targets stations", [3, 16, 11], OF_ONE_STATION), is_slow=True),
-        as_case(("targets", [0, 13, 26], None), is_slow=True),
-    ],
-)
-def test_what_suspicious_rows_have_in_common_is_named(instrument, rows, said):
-    """60 rows to fit and 30 to test, of which some are off, counted from the first test row."""
-    n, k = (20, 10) if "targets" in instrument else (60, 30)
-    robot, _, table = measured_by(instrument, np.random.default_rng(5), n=n, n_test=k)
-    m = table.measurements
-    name, values = ("position", m.position) if m.length is None else ("length", m.length)
-    values = values.copy()
-    values[60 + np.array(rows)] += 0.05
-    text = str(calibrate(robot, [replace(table, measurements=replace(m, **{name: values}))]))
-    section = text.split("Suspicious test rows\n")[1].split("\n\n", maxsplit=1)[0]
-    assert said is None or section.startswith(f"  {said}\n")
-    assert ("suspicious rows are of" in section) == (said is not None)
 
 
 def test_a_station_without_rows_has_no_frame():

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
-from tolerances import rounding
 
 from fg_calib import Calibration, InputError, Measurements, Pairing, Table, assess, solve
 from fg_calib.graph import noise_models, solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import whitening_of
-from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, row_triangles, subsampled
-from fg_calib.measurements import residuals
-from fg_calib.measurements.residuals import pack, unpack
+from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, subsampled
 from fg_calib.parallel import processors
 from fg_calib.robot import kinematics
 from fg_calib.robot.kinematics import SPAN, pose
@@ -91,31 +88,6 @@ def test_rows_with_weights_of_their_own_are_all_taken(problem, change):
     assert subsampled(replace(problem, options=replace(problem.options, **change)), 0.1) is None
 
 
-def test_a_triangle_that_is_remembered_is_that_of_its_parameters_and_columns(problem):
-    (rows,), at = problem.rows, problem.variables.at
-    first, other = problem.start, problem.start + 1e-3 * np.arange(len(problem.start))
-    (there,) = row_triangles(problem, first)
-    (anew,) = relinearized_at(problem, first).rows
-    for parameters in (other, first, other):
-        r, J = rows.linearise(at(parameters))
-        expected, found = np.column_stack([J, r]).T @ np.column_stack([J, r]), rows.triangle(at(parameters))
-        assert np.abs(found.T @ found - expected).max() < 1e-12 * expected.max()
-    assert np.array_equal(rows.triangle(at(first)), there)
-    assert np.array_equal(anew.triangle(at(first)), there)
-    assert rows.triangle(at(first).without_columns()).shape == (1, 1)
-    there[:] = 0.0  # what was handed out is the caller's own
-    assert rows.triangle(at(first)).any()
-
-
-def test_squares_along_directions_are_those_of_the_derivatives(problem):
-    block, chain = problem.rows[0].parts[0].block, problem.variables.at(problem.start).chains[0]
-    _, J = residuals.linearise(block, chain)
-    directions = np.random.default_rng(1).normal(size=(J.shape[2], 3))
-    expected = np.sum((J @ directions) ** 2, axis=2)
-    found = residuals.squares_along(block, chain, directions)
-    assert np.abs(found - expected).max() < rounding(1000, expected.max())
-
-
 @pytest.mark.parametrize("d", [2, 3, 6])
 def test_small_covariances_are_whitened_by_the_rows_in_use(d):
     rng = np.random.default_rng(d)
@@ -155,15 +127,6 @@ def test_every_bit_is_the_same_on_any_number_of_threads(monkeypatch):
     assert all(found[n] == found[1] for n in found)
 
 
-def test_noise_is_that_of_the_start_where_rows_were_whitened(problem):
-    (noise,), (rows,) = problem.noises, problem.rows
-    W = whitening_of(noise.own_at(noise.series.train), noise.series.used[noise.series.train])
-    plain = noise.rows_at(noise.series.train)
-    assert np.array_equal(rows.parts[0].block.data, plain.data)
-    assert np.array_equal(rows.parts[0].block.whitening, pack(W @ unpack(plain.whitening, 2)))
-    assert "noises" not in pickle.loads(pickle.dumps(problem)).__dict__
-
-
 def test_noise_of_many_rows_is_computed_on_demand_and_is_the_same(problem, monkeypatch):
     (of_few,) = noises_at(problem, problem.start)
     monkeypatch.setattr(noise_models, "SPAN", 64)
@@ -186,14 +149,3 @@ def test_rows_whitened_at_the_optimum_leave_nothing_to_go(problem, n_sigma):
     found = solve(problem, start=problem.variables.moved(expected.parameters, off))
     assert found.converged
     assert linear_system(relinearized_at(found.problem, found.parameters), found.parameters).decrement < 3e-7
-
-
-def test_readings_are_prepared_for_the_kernels_once_and_left_out_of_pickles(problem):
-    data, robot = problem.data, problem.robot
-    (trig,) = data.trigs(robot)
-    assert np.array_equal(trig, robot.trig(data.tables[0].measurements.readings))
-    assert problem.rows[0].parts[0].block.trig is trig
-    assert data.trigs(robot.with_values(robot.nominal + 0.1))[0] is trig  # parameters change nothing of it
-    again = pickle.loads(pickle.dumps(data))
-    assert again._trigs == {}
-    assert np.array_equal(again.trigs(robot)[0], trig)

@@ -17,20 +17,15 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, small_arm, true_robot
 from touches import TOOL_POINT, corners, touch
 
-from fg_calib import Pairing, ProblemError, assess, build_problem, solve
+from fg_calib import assess, build_problem, solve
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 1e-3}
 
 CASES = {
     "pose in an unknown frame": {"model": "pose", "frame": "unknown"},
-    "star with shared errors": {"model": "distance-rotation"},
-    "a robust loss": {"model": "distance", "pairing": Pairing("chain"), "loss": "huber"},
-    "true joint values of poses": {"model": "pose", "encoder": "estimated"},
-    "true joint values of pairs": {"model": "distance", "encoder": "estimated"},
+    "star by a robust loss": {"model": "distance-rotation", "loss": "huber"},
     "kept parameters": {"model": "distance-rotation", "gauge": "keep"},
-    "touched points": {"model": "distance"},
-    "touched points by a robust loss": {"model": "distance", "loss": "cauchy"},
-    "true joint values of touched points": {"model": "distance", "encoder": "estimated"},
+    "joint values of touched points": {"model": "distance", "encoder": "estimated"},
 }
 
 
@@ -40,12 +35,10 @@ def problem(name):
         robot = small_arm(TOLERANCE, estimate=TOOL_POINT)
         true = true_robot(robot, rng)
         m = touch(true, corners(true, 2, rng), 10, rng, distances=[(0, 1, 1e-4)])
-        m = replace(m, sigma_joint=np.full(4, 1e-4 if CASES[name].get("encoder") else 0.0))
-        return build_problem(robot, m, **CASES[name])
+        return build_problem(robot, replace(m, sigma_joint=np.full(4, 1e-4)), **CASES[name])
     robot = small_arm(TOLERANCE, estimate=TOOL if "frame" in name else ())
     frame = (Rotation.from_rotvec([0.3, -0.2, 1.0]), np.array([0.5, 1.0, -0.3]))
-    noisy = {"sigma_joint": 1e-4} if CASES[name].get("encoder") else {}
-    return build_problem(robot, measure(true_robot(robot, rng), 14, rng, frame=frame, n_test=3, **noisy), **CASES[name])
+    return build_problem(robot, measure(true_robot(robot, rng), 14, rng, frame=frame, n_test=3), **CASES[name])
 
 
 def same(a, b):
@@ -73,10 +66,10 @@ def through_pickle(thing):
     return pickle.loads(pickle.dumps(thing))
 
 
-@pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("name", "again"),
-    [*((name, through_pickle) for name in CASES), ("touched points", copy.deepcopy)],
+    [*((name, through_pickle) for name in CASES), ("kept parameters", copy.deepcopy)],
 )
 def test_nothing_changes_on_the_way(name, again):
     given = problem(name)
@@ -88,7 +81,6 @@ def test_nothing_changes_on_the_way(name, again):
     assert same(assess(again(found)), uncertainty)
     assert same(again(uncertainty), uncertainty)
     assert again(uncertainty).identifiability.lost == uncertainty.identifiability.lost
-    assert again(uncertainty).identifiability.looked_at is None  # the problem is no part of what is judged of it
     anew = solve(again(given))
     assert (anew.cost, anew.iterations) == (found.cost, found.iterations)
     assert np.array_equal(anew.parameters, found.parameters)
@@ -100,7 +92,7 @@ sys.path[:0] = sys.argv[1:]
 from test_pickle import problem
 from fg_calib import assess, solve
 from fg_calib.robot import kernels
-for name in ("pose in an unknown frame", "star with shared errors", "true joint values of poses"):
+for name in ("pose in an unknown frame", "star by a robust loss"):
     assess(pickle.loads(pickle.dumps(solve(pickle.loads(pickle.dumps(problem(name)))))))
 compiled = [f for f in vars(kernels).values() if hasattr(f, "signatures")]
 print({"readonly" in str(argument) for f in compiled for signature in f.signatures for argument in signature})
@@ -118,19 +110,10 @@ def test_kernels_are_not_compiled_again_for_read_only_arrays():
 @pytest.mark.slow
 def test_a_worker_process_returns_solutions():
     """Spawned, not forked: a process of its own that has only what was sent to it."""
-    problems = [problem("pose in an unknown frame"), problem("star with shared errors")]
+    problems = [problem("pose in an unknown frame"), problem("star by a robust loss")]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         found = list(pool.map(solve, problems))
     for one, here in zip(found, map(solve, problems), strict=True):
         assert np.array_equal(one.parameters, here.parameters)
         assert one.cost == here.cost
         assert np.array_equal(assess(one).covariance, assess(here).covariance, equal_nan=True)
-
-
-def test_factors_of_somebody_else_are_not_lost_in_silence():
-    given = problem("star with shared errors")
-    given.graph.add(gtsam.PriorFactorVector(gtsam.symbol("K", 1), np.zeros(4), gtsam.noiseModel.Unit.Create(4)))
-    with pytest.raises(ProblemError, match=r"problem\.graph: added factors, expected none: GTSAM's factors cannot"):
-        pickle.dumps(given)
-    with pytest.raises(ProblemError, match=r"problem\.graph: added factors"):
-        pickle.dumps(solve(given))

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import ProblemError
 from fg_calib.measurements.dataset import Measurements, Pairs
@@ -59,25 +58,25 @@ def planar_pairs(angles, measured=None, distance=None, sigma=(1e-3, 1e-3)):
     )
 
 
-def test_rows_near_the_kinks_take_part_and_say_what_they_can():
-    """An angle of sigma s near 0 or pi has the mean and the variance of a folded one, and the slope of that mean."""
-    s, from_kink = 1e-3, np.array([0.0, 1.0, 2.0, 30.0, 30.0, 2.0, 1.0])
-    angles = np.where(np.arange(7) < 4, s * np.maximum(from_kink, 1e-9), np.pi - s * from_kink)
+def test_angles_near_0_and_180_degrees_have_the_moments_of_drawn_ones():
+    """Of a noisy angle of sigma s near 0 or pi the absolute value is measured: its mean and its variance."""
+    s, off = 1e-3, np.array([0.0, 1.0, 2.0, 30.0, 30.0, 2.0, 1.0])
+    angles = np.where(np.arange(7) < 4, s * np.maximum(off, 1e-9), np.pi - s * off)
     problem = build_problem(planar_robot(), planar_pairs(angles, sigma=(1e-5, s)), model="rotation")
     (series,), (noise,) = problem.data.series, problem.noises
     assert series.kind.names == ("angle",)
     assert series.used.all()
     assert problem.n_excluded == {"same_configuration": 0}
     z = np.random.default_rng(0).normal(size=(200_000, 1))
-    seen = np.abs(from_kink + z)  # from the kink, in sigma; 0.0016 and 0.0022 are 1 sigma of the mean's and sd's errors
+    seen = np.abs(off + z)  # from 0 or pi, in sigma; 0.0016 and 0.0022 are 1 sigma of the mean's and sd's errors
     sign = np.where(np.arange(7) < 4, 1.0, -1.0)
     residual = noise.residual()[:, 0]
-    assert residual / s == pytest.approx(sign * (seen.mean(axis=0) - from_kink), abs=0.01)
+    assert residual / s == pytest.approx(sign * (seen.mean(axis=0) - off), abs=0.01)
     assert noise.sigma[:, 0] / s == pytest.approx(seen.std(axis=0), abs=0.01)
 
 
 @pytest.mark.parametrize(("measured", "predicted"), [(0.0, 1.0), (np.pi, 1.0), (1.0, 1e-6), (1.0, np.pi)])
-def test_an_angle_at_a_kink_that_contradicts_the_arm_is_in_chi_square(measured, predicted):
+def test_an_angle_of_0_or_180_degrees_that_contradicts_the_arm_is_in_chi_square(measured, predicted):
     problem = build_problem(
         planar_robot({"a": 0.01, "theta": 0.01}), planar_pairs([predicted, 1.5], [measured, 1.5]), model="rotation"
     )
@@ -129,62 +128,6 @@ def test_same_points_calibrate_an_arm_without_any_frame():
     assert solution.problem.n_residuals == 60
     found = dict(zip([p.name for p in robot.parameters], solution.parameters, strict=False))
     assert found["theta2"] == pytest.approx(0.008, abs=1e-6)
-
-
-def test_rows_are_whitened_anew_elsewhere():
-    robot = planar_robot({"a": 0.01, "theta": 0.01})
-    noisy = replace(planar_pairs([0.0, 1.0], sigma=(1e-3, 1e-3)), sigma_joint=np.full(2, 1e-3))
-    problem = build_problem(robot, noisy, model="distance")
-    elsewhere = problem.start.copy()
-    elsewhere[[p.name for p in robot.parameters].index("a1")] += 0.1
-    again = relinearized_at(problem, elsewhere)
-    assert again is not problem
-    assert np.array_equal(again.start, elsewhere)
-    whitening = [p.rows[0].parts[0].block.whitening for p in (problem, again, relinearized_at(problem, problem.start))]
-    assert not np.allclose(whitening[1], whitening[0], rtol=1e-3)
-    assert np.array_equal(whitening[2], whitening[0])
-    assert again.noises[0].sigma[0] > 1.01 * problem.noises[0].sigma[0]  # a longer arm moves farther
-
-
-def test_test_rows_are_counted_nowhere_and_give_no_residual():
-    rng = np.random.default_rng(1)
-    robot = small_arm()
-    for model in ("pose", "distance-rotation"):
-        problem = build_problem(robot, measure(robot, 10, rng, n_test=5), model=model, pairing=Pairing("star"))
-        assert problem.n_configurations == 10
-        assert problem.n_residuals == (60 if model == "pose" else 18)
-        (noise,) = problem.noises
-        assert len(noise.residual()) == (15 if model == "pose" else 9 + 4)
-        (rows,) = problem.rows
-        assert sum(part.n_rows for part in rows.parts) == (60 if model == "pose" else 18)
-
-
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("model", ["pose", "position", "orientation", "distance", "rotation", "distance-rotation"])
-def test_whitened_residuals_of_noise_have_unit_covariance(model):
-    """Joint noise, position and orientation noise together: the whitening is what Monte Carlo says."""
-    rng = np.random.default_rng(2)
-    robot = small_arm()
-    n, q = 4000, rng.uniform(-2, 2, (2, robot.n_joints))
-    measurements = measure(robot, 2 * n, rng, sigma=(1e-3, 5e-4), sigma_joint=4e-4, readings=np.tile(q, (n, 1)))
-    rows = np.arange(n)
-    if model in ("pose", "position", "orientation"):
-        problem = build_problem(robot, measurements, model=model)
-    else:
-        noise = np.sqrt(2) * np.array([1e-3, 5e-4])  # of a difference of two poses
-        p, R = measurements.position, Rotation.from_matrix(measurements.rotation.copy())
-        distance, angle = np.linalg.norm(p[1::2] - p[::2], axis=1), (R[::2].inv() * R[1::2]).magnitude()
-        pairs = replace(
-            direct_pairs(distance, angle), sigma_distance=np.full(n, noise[0]), sigma_angle=np.full(n, noise[1])
-        )
-        assert np.array_equal(pairs.a, 2 * rows)
-        problem = build_problem(robot, replace(measurements, pairs=pairs), model=model)
-    (noise,), (rows,) = problem.noises, problem.rows
-    w = rows.linearise(problem.variables.at(problem.start))[0].reshape(-1, noise.series.kind.residual_dim)
-    w = w if problem.pair_series else w[::2]
-    covariance = w.T @ w / len(w)
-    # standard error of a variance from n draws: sqrt(2 / n) = 2.2 % at 4000; bound at 4 of them
-    assert covariance == pytest.approx(np.eye(w.shape[1]), abs=0.09)
 
 
 def test_a_pair_that_lacks_a_measurement_gives_the_other_row_only():
@@ -243,19 +186,6 @@ def test_priors_count_as_rows_when_there_are_few():
     assert build_problem(robot, measure(robot, 60, rng), model="distance", prior=False).n_priors == 0
 
 
-def test_frame_and_tool_start_near_the_truth_from_far_away():
-    rng = np.random.default_rng(5)
-    robot = small_arm(estimate=TOOL)
-    values = robot.nominal
-    values[-6:] = [0.5, -0.3, 0.2, 2.0, 0.9, -2.5]  # x y z yaw pitch roll, far from nominal
-    true = robot.with_values(values)
-    frame = (Rotation.from_rotvec(np.pi * np.array([0.6, 0.8, 0.0])), np.array([30.0, -4.0, 9.0]))
-    measurements = measure(true, 30, rng, frame=frame)
-    problem = build_problem(robot, measurements, model="pose", frame="unknown")
-    r = np.concatenate([rows.linearise(problem.variables.at(problem.start))[0] for rows in problem.rows])
-    assert np.sqrt(np.mean(r**2)) < 2.0  # the nominal arm is the true one here, so only noise is left
-
-
 def test_frame_of_a_pair_model_does_not_matter():
     robot = true_robot(small_arm(), np.random.default_rng(6))
     measurements = measure(robot, 12, np.random.default_rng(7))
@@ -272,3 +202,41 @@ def test_a_configuration_against_itself_says_nothing_of_the_arm():
     )
     assert problem.n_excluded["same_configuration"] == 1
     assert problem.n_residuals == 2
+
+
+def test_numbers_of_rows_pairs_and_priors():
+    """Of all pairs of n poses only 6 n - 12 numbers differ freely: frame and tool are unknown to them."""
+    rng = np.random.default_rng(3)
+    robot = small_arm(tolerance={"a": 1e-3, "theta": 1e-3})
+    m = measure(robot, 17, rng, n_test=5)
+    poses = build_problem(robot, m, model="pose", frame="unknown")
+    assert (poses.n_configurations, poses.n_residuals, poses.n_priors, poses.n_pairs) == (17, 102, 8, 0)
+    assert (poses.n_independent, poses.n_added, poses.n_known, poses.has_more) == (102, 0, 0, False)
+    assert "17 configurations\n  102 residuals and 8 priors on 22 unknowns in 5 variables" in repr(poses)
+    star = build_problem(robot, m, model="distance-rotation")
+    assert (star.n_configurations, star.n_residuals, star.n_pairs, star.n_independent) == (17, 32, 16, 32)
+    assert star.formed
+    assert not star.missing_correlation
+    every = {"model": "distance-rotation", "pairing": Pairing("all")}
+    both = [build_problem(robot, m, **every, pair_errors=errors) for errors in ("shared", "independent")]
+    assert [p.n_residuals for p in both] == [2 * 136] * 2
+    assert [p.missing_correlation for p in both] == [False, True]
+    assert both[0].n_independent == pytest.approx(6 * 17 - 12, abs=1)
+
+
+def test_test_rows_alone_evaluate_the_arm_as_it_is():
+    """Frame and tool are fitted, the arm is not: chi-square is that of an arm without estimated joints."""
+    rng, robot = np.random.default_rng(4), small_arm({"a": 1e-3, "tool": 1e-2}, TOOL)
+    frame = (Rotation.from_rotvec([0.3, -0.2, 1.0]), np.array([0.5, 1.0, -0.3]))
+    m = measure(true_robot(robot, rng), 20, rng, frame=frame)
+    held_out = replace(m, test=np.ones(20, dtype=bool))
+    options = {"model": "pose", "frame": "unknown"}
+    evaluated = build_problem(robot, held_out, **options, gauge="keep", encoder="estimated")
+    assert evaluated.evaluated
+    assert [v.symbol for v in evaluated.variables.items] == ["T(0)", "X(0)"]
+    expected = solve(build_problem(robot.with_estimated(TOOL), m, **options, gauge="none"))
+    assert solve(evaluated).cost == pytest.approx(expected.cost, rel=1e-9)
+    fixed = small_arm({"a": 1e-3})
+    as_it_is = solve(build_problem(fixed, replace(m, test=held_out.test), model="distance"))
+    assert (as_it_is.parameters[: len(fixed.nominal)] == fixed.nominal).all()
+    assert as_it_is.message == "nothing to fit"
