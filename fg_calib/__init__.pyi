@@ -9,6 +9,7 @@ from .graph.factors import DistanceFactor, RotationAngleFactor
 from .graph.problem import Problem
 from .graph.solver import Solution, SolverOptions, solve
 from .inputs import CalibrationError, InputError, ProblemError, SolverError
+from .inputs.options import Limits, Options, Pairing
 from .io.job import read_job
 from .io.result import Result
 from .io.robot_file import read_robot
@@ -16,7 +17,6 @@ from .job import Job
 from .measurements.dataset import Measurements, Noise
 from .measurements.table import CustomMeasurements, KnownPoint, Table
 from .observability.identifiability import observe_configurations, observe_structure
-from .options import Limits, Options, Pairing
 from .predictions import correct, predict
 from .robot.model import Robot
 from .simulation.scenario import Scenario

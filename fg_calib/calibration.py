@@ -27,6 +27,7 @@ from fg_calib.graph import SIZE, Knowledge, Solution, build_variables, frame_of,
 from fg_calib.inputs import (
     Floats,
     InputError,
+    Options,
     SolverError,
     as_floats,
     check,
@@ -61,7 +62,6 @@ from fg_calib.io import Knowledge as SavedKnowledge
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
-from fg_calib.options import Options
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import predict_poses
 from fg_calib.report import (

@@ -6,9 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fg_calib.inputs import Brief, check_fields
+from fg_calib.inputs import Brief, Options, check_fields
 from fg_calib.measurements import Measurements, Table
-from fg_calib.options import Options
 from fg_calib.robot import Robot
 
 

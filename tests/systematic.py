@@ -8,7 +8,7 @@ from simulated import measure, true_robot
 
 from fg_calib import Robot
 from fg_calib.graph.build import build_problem
-from fg_calib.options import Pairing
+from fg_calib.inputs import Pairing
 
 QUARTER = np.pi / 2
 PLACED = (Rotation.from_rotvec([0.3, 0.2, -0.5]), np.array([1.0, 2.0, 3.0]))

@@ -17,7 +17,6 @@ import fg_calib
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
     "inputs",
-    "options",
     "parallel",
     "robot",
     "initialization",

@@ -14,12 +14,11 @@ from fg_calib import (
     build_problem,
     observe_configurations,
     observe_structure,
-    options,
     simulate,
     solve,
 )
 from fg_calib.diagnostics import check_setup
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, options
 from fg_calib.io import Units, read_measurements
 from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot import pose

@@ -19,8 +19,7 @@ from fg_calib.cli.output import (
     say,
     show_result,
 )
-from fg_calib.inputs import check_number
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model, check_number
 
 Sigma = Annotated[
     float | None, option("--position-noise", "SIGMA", "1 sigma of a position in TABLE; 1 mm if not given.")
@@ -57,10 +56,10 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
+    from fg_calib.inputs import Pairing
     from fg_calib.io import Units, read_measurements, read_robot
     from fg_calib.measurements import Noise
     from fg_calib.observability import observe_configurations, observe_structure
-    from fg_calib.options import Pairing
     from fg_calib.report import build_identifiability_report, observability_document, write_observability
 
     _refuse_options_without_effect(context, model, structural=configurations is None)

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fg_calib.inputs import printable
-from fg_calib.options import AngleUnit, LengthUnit
+from fg_calib.inputs import AngleUnit, LengthUnit, printable
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
-from fg_calib.inputs import Brief, Floats, InputError, Integers
+from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
 from fg_calib.measurements import Landmarks, Table
-from fg_calib.options import PAIR_MODELS, Gauge, Model, Options, Pairing
 from fg_calib.robot import Robot
 from fg_calib.simulation import (
     BoardViews,

@@ -27,6 +27,7 @@ from fg_calib.inputs import (
     FrozenArrays,
     InputError,
     Integers,
+    Pairing,
     ProblemError,
     as_floats,
     check,
@@ -37,7 +38,6 @@ from fg_calib.inputs import (
 from fg_calib.job import Job
 from fg_calib.measurements import Table
 from fg_calib.observability import Observability
-from fg_calib.options import Pairing
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import PoseRms
 from fg_calib.robot import Robot, random_readings

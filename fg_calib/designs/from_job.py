@@ -18,10 +18,9 @@ from fg_calib.assessment import solve_job
 from fg_calib.designs.candidates import NONE, REFERENCE, Pool, build_pool, draw_groups
 from fg_calib.designs.information import gather_rows
 from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
-from fg_calib.inputs import Floats, InputError
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
 from fg_calib.measurements import Noise, Table
-from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot import pose
 from fg_calib.simulation import (
     BoardViews,

@@ -31,10 +31,9 @@ from fg_calib.graph import (
     reduced_graph,
     tables_of,
 )
-from fg_calib.inputs import Floats, InputError, ProblemError, SolverError
+from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
 from fg_calib.measurements import INSTRUMENTS, Measurements, Table, residuals
 from fg_calib.measurements.kinds import Instrument
-from fg_calib.options import Options, Pairing
 from fg_calib.robot import Poses, Robot, forward
 
 USUAL_LENGTH, USUAL_ANGLE = 2e-3, 5e-3

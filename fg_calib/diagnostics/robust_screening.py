@@ -22,9 +22,8 @@ from scipy import special
 
 from fg_calib.diagnostics.nominal_residuals import evenly, fit_landmarks, nominal_problem, with_arm_errors
 from fg_calib.graph import Problem, RowNoise, relinearized_at, whitening_of
-from fg_calib.inputs import Floats, InputError, ProblemError, SolverError
+from fg_calib.inputs import Floats, InputError, Options, ProblemError, SolverError
 from fg_calib.measurements import INSTRUMENTS, Table
-from fg_calib.options import Options
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 from fg_calib.statistics import MAX_OUTLIER_SHARE

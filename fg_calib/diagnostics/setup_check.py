@@ -21,9 +21,8 @@ import numpy as np
 from fg_calib.diagnostics.nominal_residuals import Setup, TypicalResidual, nominal_residuals, residuals_at, setup_of
 from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypotheses, still_joints
 from fg_calib.graph import Problem
-from fg_calib.inputs import Brief, Floats, checked
+from fg_calib.inputs import Brief, Floats, FrameKnowledge, Model, checked
 from fg_calib.measurements import Measurements, Table
-from fg_calib.options import FrameKnowledge, Model
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 

@@ -21,7 +21,19 @@ from fg_calib.graph.problem import (
     variables_of,
 )
 from fg_calib.graph.variables import Variables, preference, prior_rows
-from fg_calib.inputs import Floats, ProblemError, check_names, checked
+from fg_calib.inputs import (
+    Floats,
+    FrameKnowledge,
+    Gauge,
+    Model,
+    Options,
+    PairErrors,
+    Pairing,
+    ProblemError,
+    as_pairing,
+    check_names,
+    checked,
+)
 from fg_calib.job import Job
 from fg_calib.measurements import (
     INSTRUMENTS,
@@ -34,7 +46,6 @@ from fg_calib.measurements import (
     warn_of_copies,
 )
 from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
-from fg_calib.options import FrameKnowledge, Gauge, Model, Options, PairErrors, Pairing, as_pairing
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, forward, names_of, random_readings
 

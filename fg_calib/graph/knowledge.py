@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 from fg_calib.graph.factors import CheckedFactor
 from fg_calib.graph.normal_system import determined, eliminate
 from fg_calib.graph.variables import Variables, build_variables, pose_of
-from fg_calib.inputs import Floats, FrozenArrays, Integers
+from fg_calib.inputs import Floats, FrameKnowledge, FrozenArrays, Integers, Model
 from fg_calib.measurements import LANDMARKS, Landmarks
-from fg_calib.options import FrameKnowledge, Model
 from fg_calib.robot import Robot
 
 STAYING = tuple(letter for letter, kind in LANDMARKS.items() if kind.stays)

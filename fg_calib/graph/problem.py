@@ -38,9 +38,8 @@ from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSyste
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, Integers, ProblemError, SolverError, shown
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, Integers, Options, ProblemError, SolverError, shown
 from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, by_station, start_frames
-from fg_calib.options import Options
 from fg_calib.robot import Chain, Parameter, Robot, forward
 
 

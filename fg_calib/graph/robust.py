@@ -39,8 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.inputs import Floats
-from fg_calib.options import Loss
+from fg_calib.inputs import Floats, Loss
 
 EFFICIENCY = 0.95
 """Of the estimate from clean Gaussian measurements, for the losses that do not reject."""

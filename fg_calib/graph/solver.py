@@ -43,8 +43,7 @@ from fg_calib.graph.problem import (
 )
 from fg_calib.graph.robust import Weighting, constants, cost
 from fg_calib.graph.variables import Variables
-from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, SolverError, check_number, checked
-from fg_calib.options import Options
+from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, Options, SolverError, check_number, checked
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 

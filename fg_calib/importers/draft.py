@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fg_calib.inputs import InputError, printable
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, printable
 from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_CONFIGURATIONS, OF_PAIRS, Table, names_of, read_robot, read_yaml
 from fg_calib.measurements import COVARIANCE, INSTRUMENTS
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, Model
 from fg_calib.robot import Robot
 
 _TABLES = (".csv", ".parquet", ".pq")

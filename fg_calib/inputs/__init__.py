@@ -1,4 +1,4 @@
-"""Errors, array types, and checks of what comes from outside."""
+"""Errors, array types, checks of what comes from outside, and every choice of a calibration."""
 
 import lazy_loader
 

@@ -11,7 +11,24 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool, create_model
 
-from fg_calib.inputs import InputError, check_names, checked, did_you_mean
+from fg_calib.inputs import (
+    LIMITED,
+    POSE_MODELS,
+    EncoderNoise,
+    FrameKnowledge,
+    Gauge,
+    InputError,
+    Limits,
+    Loss,
+    Model,
+    Options,
+    PairErrors,
+    Pairing,
+    SharedScale,
+    check_names,
+    checked,
+    did_you_mean,
+)
 from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.columns import Column
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
@@ -33,20 +50,6 @@ from fg_calib.io.yaml import (
 from fg_calib.job import Job
 from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
 from fg_calib.measurements.kinds import Camera
-from fg_calib.options import (
-    LIMITED,
-    POSE_MODELS,
-    EncoderNoise,
-    FrameKnowledge,
-    Gauge,
-    Limits,
-    Loss,
-    Model,
-    Options,
-    PairErrors,
-    Pairing,
-    SharedScale,
-)
 from fg_calib.robot import Robot, names_of
 
 _log = logging.getLogger(__name__)

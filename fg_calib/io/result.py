@@ -31,14 +31,13 @@ from fg_calib import __version__
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import SetupCheck
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale
-from fg_calib.inputs import NORM_TOLERANCE, Figure, Floats, InputError, checked
+from fg_calib.inputs import NORM_TOLERANCE, Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
 from fg_calib.measurements import Table
 from fg_calib.monitoring import knowledge_of
 from fg_calib.monitoring.fingerprints import fingerprints
 from fg_calib.observability import Identifiability
-from fg_calib.options import FrameKnowledge, Model, Options
 from fg_calib.prediction import ExpectedError
 from fg_calib.statistics import (
     Acceptance,

@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.inputs import NORM_TOLERANCE, Booleans, Floats, FrozenArrays, InputError, check_number, checked, once
+from fg_calib.inputs import (
+    NORM_TOLERANCE,
+    Booleans,
+    Floats,
+    FrozenArrays,
+    InputError,
+    Model,
+    check_number,
+    checked,
+    once,
+)
 from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of
 from fg_calib.io.units import Units
 from fg_calib.measurements import (
@@ -32,7 +42,6 @@ from fg_calib.measurements import (
     outside_limits,
     pairs_from_arrays,
 )
-from fg_calib.options import Model
 from fg_calib.robot import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it

@@ -10,9 +10,8 @@ from typing import Annotated
 
 from pydantic import BeforeValidator
 
-from fg_calib.inputs import LEAST_SIZE, InputError, did_you_mean, set_checked
+from fg_calib.inputs import LEAST_SIZE, AngleUnit, InputError, LengthUnit, did_you_mean, set_checked
 from fg_calib.io.yaml import Positive, Schema, refuse_unknown_keys, shown, validate
-from fg_calib.options import AngleUnit, LengthUnit
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Metres in one unit of length."""

@@ -15,6 +15,7 @@ from fg_calib.inputs import (
     FrozenArrays,
     InputError,
     Integers,
+    Pairing,
     as_floats,
     check_number,
     checked,
@@ -34,7 +35,6 @@ from fg_calib.measurements.checks import (
     checked_rotation,
     checked_sigma,
 )
-from fg_calib.options import Pairing
 from fg_calib.robot import over_spans, rotation_angle
 
 MOST_PAIRS = 10_000_000

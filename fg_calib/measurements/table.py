@@ -12,12 +12,17 @@ from fg_calib.initialization import Camera
 from fg_calib.inputs import (
     LEAST_SIZE,
     ORDINARY,
+    PAIR_MODELS,
+    POSE_MODELS,
     Booleans,
     Brief,
     Floats,
+    FrameKnowledge,
     FrozenArrays,
     InputError,
     Integers,
+    Model,
+    Pairing,
     ProblemError,
     as_figures,
     as_floats,
@@ -32,7 +37,6 @@ from fg_calib.inputs import (
 )
 from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
 from fg_calib.measurements.kind import Kind, check_kind
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Model, Pairing
 
 
 @dataclass(frozen=True)

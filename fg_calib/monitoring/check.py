@@ -19,6 +19,7 @@ import numpy as np
 from scipy import special
 
 from fg_calib.diagnostics import check_tables, reporting
+from fg_calib.inputs import LIMITED, Limits
 from fg_calib.monitoring.discriminating_design import Advice, advise_configurations
 from fg_calib.monitoring.hypotheses import (
     CERTAIN,
@@ -37,7 +38,6 @@ from fg_calib.monitoring.hypotheses import (
 )
 from fg_calib.monitoring.new_data import Linear, Rows, linearise_new_data, place_new_data
 from fg_calib.monitoring.prior_information import Calibrated
-from fg_calib.options import LIMITED, Limits
 from fg_calib.statistics import FACTOR, LEAST, HeldOut
 from fg_calib.statistics.residual_table import pooled
 

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fg_calib.inputs import Floats, FrozenArrays, Integers
+from fg_calib.inputs import POSE_MODELS, Floats, FrozenArrays, Integers
 from fg_calib.monitoring.hypotheses import HypothesisTest, motion, quantile
 from fg_calib.monitoring.new_data import Linear
 from fg_calib.monitoring.prior_information import Calibrated
-from fg_calib.options import POSE_MODELS
 from fg_calib.robot import forward, random_readings
 
 N_CANDIDATES = 200

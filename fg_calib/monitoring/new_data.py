@@ -30,10 +30,9 @@ from fg_calib.graph import (
     variables_of,
     with_factors,
 )
-from fg_calib.inputs import Booleans, Floats, Integers, ProblemError
+from fg_calib.inputs import Booleans, Floats, Integers, Options, ProblemError
 from fg_calib.measurements import INSTRUMENTS, Dataset, KnownPoint, Table, build_dataset
 from fg_calib.monitoring.prior_information import Calibrated
-from fg_calib.options import Options
 from fg_calib.robot import Robot, names_of
 from fg_calib.statistics import HeldOut
 from fg_calib.statistics.residual_table import residual_table

@@ -25,9 +25,8 @@ from fg_calib.graph import (
     row_triangles,
     unknown_prior_rows,
 )
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Floats, Options
 from fg_calib.observability import ObservedQuantities
-from fg_calib.options import Options
 from fg_calib.robot import Robot
 
 

@@ -31,9 +31,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from fg_calib.graph import correlation, named_triangle, predicted_problem, true_problem
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, check, check_flag, check_names, checked, shown
+from fg_calib.inputs import (
+    Booleans,
+    Brief,
+    Floats,
+    FrameKnowledge,
+    InputError,
+    Model,
+    Options,
+    PairErrors,
+    Pairing,
+    check,
+    check_flag,
+    check_names,
+    checked,
+    shown,
+)
 from fg_calib.measurements import Measurements, Table
-from fg_calib.options import FrameKnowledge, Model, Options, PairErrors, Pairing
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, build_chain, forward, without_rigid_motion
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fg_calib.graph import Problem
+from fg_calib.inputs import FrameKnowledge, Model
 from fg_calib.measurements import INSTRUMENTS, Table
-from fg_calib.options import FrameKnowledge, Model
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from fg_calib.graph import Places, Problem, places_of, problem_at, start_of, variables_of
-from fg_calib.inputs import Floats
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, Options, Pairing
 from fg_calib.measurements import INSTRUMENTS, Labels, Measurements, Table, build_dataset
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, Options, Pairing
 from fg_calib.robot import Robot, build_chain, forward, random_readings
 
 LEAST = 60

@@ -9,8 +9,8 @@ from rich.console import Group
 from rich.table import Table
 
 from fg_calib.diagnostics import probability
+from fg_calib.inputs import LIMITED
 from fg_calib.monitoring import Check, Explanation
-from fg_calib.options import LIMITED
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, figure, in_words, line, quantities, section, table_of
 

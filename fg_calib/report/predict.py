@@ -13,9 +13,8 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Floats, LengthUnit
 from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
-from fg_calib.options import LengthUnit
 from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, WorstConfiguration, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import write_charts

@@ -18,10 +18,9 @@ from rich.text import Text
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
 from fg_calib.graph import Solution
-from fg_calib.inputs import Booleans, Floats
+from fg_calib.inputs import LIMITED, Booleans, Floats
 from fg_calib.io import Result, key_of
 from fg_calib.measurements import LANDMARKS
-from fg_calib.options import LIMITED
 from fg_calib.prediction import ExpectedError, PredictedErrors, ToolPoseUncertainty, predict_errors
 from fg_calib.report import tables
 from fg_calib.report.tables import Section, figure, in_order, in_words, line, quantities, section, shortened, table_of

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Booleans, Floats, InputError, Integers
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Floats, FrameKnowledge, InputError, Integers, Pairing
 from fg_calib.measurements import (
     INSTRUMENTS,
     Groups,
@@ -39,7 +39,6 @@ from fg_calib.measurements import (
     no_pairs,
 )
 from fg_calib.measurements.kinds import Camera
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, FrameKnowledge, Pairing
 from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import (
     BoardViews,

@@ -92,7 +92,24 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import NEAR, Brief, Floats, InputError, as_floats, check, checked, did_you_mean, known_names
+from fg_calib.inputs import (
+    NEAR,
+    PAIR_MODELS,
+    POSE_MODELS,
+    AngleUnit,
+    Brief,
+    Floats,
+    FrameKnowledge,
+    InputError,
+    LengthUnit,
+    Model,
+    Pairing,
+    as_floats,
+    check,
+    checked,
+    did_you_mean,
+    known_names,
+)
 from fg_calib.io import (
     NOISE_UNITS,
     Bound,
@@ -121,7 +138,6 @@ from fg_calib.io import (
 )
 from fg_calib.measurements import Noise
 from fg_calib.measurements.kinds import Camera
-from fg_calib.options import PAIR_MODELS, POSE_MODELS, AngleUnit, FrameKnowledge, LengthUnit, Model, Pairing
 from fg_calib.robot import Robot, names_of, tolerance_kind
 
 MOST_DRAWN = 1_000_000

@@ -14,10 +14,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats, checked
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, checked
 from fg_calib.io import NOISE_UNITS, Units, fill_folder, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
-from fg_calib.options import PAIR_MODELS, POSE_MODELS
 from fg_calib.robot import Robot
 from fg_calib.simulation.scenario import Placement, Plane, Spot
 from fg_calib.simulation.simulator import Simulation

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from fg_calib.options import Limits
+from fg_calib.inputs import Limits
 from fg_calib.statistics.residual_table import HeldOut, pooled
 
 Verdict = Literal["pass", "fail", "not evaluated"]

@@ -71,8 +71,7 @@ from fg_calib.graph import (
     unknown_prior_rows,
     with_factors,
 )
-from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, checked
-from fg_calib.options import SharedScale
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, SharedScale, checked
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread

@@ -16,13 +16,12 @@ from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
 from fg_calib.baseline.least_squares import fit_least_squares
 from fg_calib.graph.build import problem_of
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Options
 from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job
 from fg_calib.measurements.table import Table
-from fg_calib.options import Options
 from fg_calib.report.compare import comparison_document, format_comparison
 from fg_calib.robot.kinematics import pose
 

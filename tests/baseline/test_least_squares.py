@@ -13,11 +13,10 @@ from fg_calib.assessment import assess
 from fg_calib.baseline import least_squares
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Pairing
 from fg_calib.measurements.build import build_dataset
 from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
 

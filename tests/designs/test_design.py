@@ -10,10 +10,9 @@ from fg_calib import Pairing
 from fg_calib.designs.design import design
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Options
 from fg_calib.job import Job
 from fg_calib.measurements.dataset import Noise
-from fg_calib.options import Options
 from fg_calib.prediction.tool_pose import errors_at
 from fg_calib.simulation.scenario import (
     Errors,

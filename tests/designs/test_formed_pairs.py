@@ -8,8 +8,8 @@ from fg_calib import Measurements, Pairing
 from fg_calib.graph.build import true_problem
 from fg_calib.graph.noise_models import PRIVATE_SHARE
 from fg_calib.graph.problem import square_root
+from fg_calib.inputs import Options
 from fg_calib.measurements.table import Table
-from fg_calib.options import Options
 from fg_calib.robot.kinematics import forward, pose
 
 ARM = small_arm()

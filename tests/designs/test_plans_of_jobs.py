@@ -12,8 +12,8 @@ from fg_calib.designs.design import design
 from fg_calib.designs.from_job import solve_for_design
 from fg_calib.designs.information import Posterior
 from fg_calib.graph.problem import square_root
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Noise
-from fg_calib.options import Pairing
 from fg_calib.prediction.tool_pose import errors_at
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation.scenario import (

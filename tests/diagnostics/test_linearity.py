@@ -14,7 +14,7 @@ from fg_calib.diagnostics.linearity import AmbiguousRows, Nonlinearity, check_li
 from fg_calib.diagnostics.verdict import check_linear
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve, unsolved
-from fg_calib.options import Pairing
+from fg_calib.inputs import Pairing
 from fg_calib.robot import pose
 
 WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}

@@ -17,9 +17,8 @@ from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_se
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import SolverError
+from fg_calib.inputs import MODELS, PAIR_MODELS, POSE_MODELS, SolverError
 from fg_calib.io.job import read_job
-from fg_calib.options import MODELS, PAIR_MODELS, POSE_MODELS
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker next to the robot."""

@@ -14,13 +14,12 @@ from fg_calib.assessment import assess
 from fg_calib.baseline.comparison import compare
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Options
 from fg_calib.job import Job
 from fg_calib.measurements.kinds import Kind, Rows
 from fg_calib.measurements.kinds.pair import Distance
 from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.observability.reasons import NOT_EXCITED
-from fg_calib.options import Options
 from fg_calib.report.compare import format_comparison
 from fg_calib.robot.kinematics import pose
 

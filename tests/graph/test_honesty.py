@@ -13,7 +13,7 @@ from touches import TOOL_POINT, corners, touch
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.options import Pairing
+from fg_calib.inputs import Pairing
 
 TOLERANCE = dict.fromkeys(("a", "d", "alpha", "theta"), 2e-3)
 

@@ -20,9 +20,9 @@ from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
 from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import solve
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
 

@@ -9,9 +9,8 @@ from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_
 
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import ProblemError
+from fg_calib.inputs import Pairing, ProblemError
 from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import build_chain, pose
 
 

@@ -16,12 +16,11 @@ from touches import TOOL_POINT, corners, touch
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.inputs import InputError, SolverError
+from fg_calib.inputs import InputError, Pairing, SolverError
 from fg_calib.io.robot_file import read_robot
 from fg_calib.io.tables import read_measurements
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Axis, Element, Joint, RobotBuilder
 from fg_calib.robot.rotations import rotation_angle

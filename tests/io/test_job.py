@@ -6,9 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Options, Pairing
 from fg_calib.io.job import read_job
-from fg_calib.options import Options, Pairing
 
 ROBOT = """\
 convention: mdh

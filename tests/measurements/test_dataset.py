@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm
 from tolerances import rounding
 
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Pairing
 from fg_calib.measurements.dataset import form_pairs
-from fg_calib.options import Pairing
 from fg_calib.robot.rotations import rotation_angle
 
 

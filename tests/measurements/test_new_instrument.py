@@ -78,7 +78,7 @@ def run(tmp_path_factory):
     source = Path(fg_calib.__file__).parent
     shutil.copytree(source, folder / "fg_calib", ignore=shutil.ignore_patterns("*.pyc"))
     (folder / "fg_calib/measurements/kinds/inclinometer.py").write_text(INCLINOMETER)
-    options = folder / "fg_calib/options.py"
+    options = folder / "fg_calib/inputs/options.py"
     registered = options.read_text().replace(
         '    "plane": "plane",\n', '    "plane": "plane",\n    "inclination": "inclinometer",\n'
     )

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from simulated import measure, small_arm
 
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import form_pairs
 from fg_calib.measurements.table import Table
 from fg_calib.monitoring.fingerprints import MAX_FINGERPRINTS, counted_before, fingerprints
-from fg_calib.options import Pairing
 
 ARM = small_arm()
 

@@ -6,9 +6,9 @@ from simulated import measure, paper_robot
 from tolerances import rounding
 
 from fg_calib.graph.build import build_problem
+from fg_calib.inputs import Pairing
 from fg_calib.observability.identifiability import observability_of
 from fg_calib.observability.indices import RelativeGroup, observability_indices, observability_of_rows
-from fg_calib.options import Pairing
 from fg_calib.robot.model import Parameter
 
 # Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.

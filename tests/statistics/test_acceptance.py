@@ -8,7 +8,7 @@ import pytest
 from simulated import measure, small_arm, true_robot, write_job
 
 from fg_calib import InputError, calibrate
-from fg_calib.options import Limits, Options
+from fg_calib.inputs import Limits, Options
 
 TOOL = ("tool.x", "tool.y", "tool.z")
 

@@ -11,9 +11,8 @@ from tolerances import rounding
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, Pairing
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.options import Pairing
 from fg_calib.prediction.tool_pose import pose_rms
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot

@@ -10,9 +10,9 @@ from sparing import as_case
 from touches import reach, reach_faces
 
 from fg_calib.calibration import calibrate
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 
 SIGMA = 1e-4

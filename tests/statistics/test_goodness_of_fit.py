@@ -16,9 +16,9 @@ from fg_calib.graph import problem as problem_module
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import NoiseState
 from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics import variance_components as noise

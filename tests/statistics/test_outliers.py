@@ -17,7 +17,7 @@ from systematic import measured, of_joint, problem_of
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.options import Pairing
+from fg_calib.inputs import Pairing
 from fg_calib.statistics import outliers
 from fg_calib.statistics.outliers import find_outliers, log_chance
 from fg_calib.statistics.residual_covariance import RowErrors

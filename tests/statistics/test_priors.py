@@ -12,8 +12,7 @@ from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 from fg_calib.assessment import assess
 from fg_calib.graph.build import FIRST_TOLERANCE, build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError
-from fg_calib.options import Options
+from fg_calib.inputs import InputError, Options
 from fg_calib.statistics.priors import (
     COMMON_SIGMA,
     GROUP_SIGMA,

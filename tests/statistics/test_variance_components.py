@@ -18,9 +18,9 @@ from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.graph.problem import relinearized_at
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.table import Table
-from fg_calib.options import Pairing
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import variance_components as estimation
 from fg_calib.statistics.covariance import spread_of

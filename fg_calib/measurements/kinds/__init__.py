@@ -6,6 +6,7 @@
 from importlib import import_module
 
 from fg_calib.initialization import Camera
+from fg_calib.inputs import MODELS
 from fg_calib.measurements.kind import (
     Frames,
     Kind,
@@ -22,7 +23,6 @@ from fg_calib.measurements.kinds.custom import UNKNOWN
 from fg_calib.measurements.kinds.instrument import Column, Instrument
 from fg_calib.measurements.kinds.stacked import stack
 from fg_calib.measurements.landmarks import LandmarkKind
-from fg_calib.options import MODELS
 
 INSTRUMENTS: dict[str, Instrument] = {
     instrument.model: instrument

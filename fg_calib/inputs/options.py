@@ -6,17 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from fg_calib.inputs import (
-    InputError,
-    as_hinted,
-    check,
-    check_flag,
-    check_names,
-    check_number,
-    listed,
-    set_checked,
-    shown,
-)
+from fg_calib.inputs.arguments import as_hinted, check, check_flag, check_names, check_number, listed, set_checked
+from fg_calib.inputs.errors import InputError, shown
 
 MODELS: dict[str, str] = {
     "pose": "pose",
