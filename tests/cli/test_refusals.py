@@ -85,7 +85,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "one id twice": (
         replaced(POSES, "^p1,", "p0,"),
         CALIBRATE,
-        "poses.csv:3: id: found 'p0', expected different ids; the same as poses.csv:2",
+        "poses.csv:3: id: found 'p0', expected different ids",
     ),
     "a table as the job": (
         nothing,
