@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from scipy import special
 
 from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
@@ -270,11 +269,9 @@ def check_test_rows(case: Case) -> list[Statement]:
     fit, of_fitted = case.fit.goodness.test, case.fit.chi_square.ratio
     if fit is None:
         return []
-    count = fit.outliers
-    most = min(1.0, (count.fitted + 1.0 + 3.0 * np.sqrt(count.fitted + 1.0)) / max(count.n_fitted, 1))
-    if count.test and special.bdtrc(count.test - 1, count.n_test, most) < (1.0 - CONFIDENCE) / 2.0:
-        text = f"test rows: the loss takes {count.test} of {count.n_test} measurements for outliers"
-        return [Statement("error", f"{text}, of those fitted {count.fitted} of {count.n_fitted}")]
+    if fit.n_outliers > MAX_OUTLIER_SHARE * fit.n_measurements:
+        text = f"test rows: {fit.n_outliers} of {fit.n_measurements} measurements are outliers"
+        return [Statement("error", f"{text}: more than a robust loss can tell from noise")]
     if not fit.n or fit.p_value >= (1.0 - CONFIDENCE) / 2.0:
         return []
     ratio = fit.chi2 / fit.expected

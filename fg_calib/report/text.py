@@ -253,8 +253,8 @@ def _prediction(result: Result) -> list[Section]:
     for kind in fit.kinds:
         cells = f"{kind.n}", f"{kind.chi2:.4g}", f"{kind.expected:.4g}", _ratio(kind.seen_over_stated / kind.factor)
         rows.append((_named(result, kind), *cells, _p_value(kind.p_value), PREDICTION_VERDICTS[kind.verdict]))
-    if fit.outliers.test:
-        notes.append(f"{fit.outliers.test} of {fit.outliers.n_test} measurements do not count: outliers by the loss")
+    if fit.n_outliers:
+        notes.append(f"{fit.n_outliers} of {fit.n_measurements} measurements do not count: outliers by the loss")
     if fit.n_unknown:
         notes.append(f"{fit.n_unknown} rows are not judged: they depend on what is not determined")
     headings = ("", "rows", "chi-square", "expected", "ratio", "p-value", "")

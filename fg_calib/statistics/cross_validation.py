@@ -206,23 +206,17 @@ def _without_fold(table: Table, fold: Integers, k: int) -> Table:
 def _divided(data: Dataset, n: int, rng: np.random.Generator) -> Integers:
     """The fold of each configuration, -1 where it is never held out, shape (n_configurations,).
 
-    One set of equal readings after the other goes to a fold that has fewest of the landmarks that it sees, then
-    fewest of all.
+    Sets of equal readings, those that see the same landmarks one after the other, go to the folds in turn.
     """
     observers, place = list(_observers(data)), same_readings(data.readings)
-    landmarks: list[set[int]] = [set() for _ in range(place.max() + 1)]
+    n_sets = int(place.max(initial=-1)) + 1
+    landmarks: list[list[int]] = [[] for _ in range(n_sets)]
     for label, (configurations, _) in enumerate(observers):
-        for k in configurations:
-            landmarks[place[k]].add(label)
-    kept = np.isin(np.arange(len(landmarks)), place[_reference_poses(data)])
-    fold = np.full(len(landmarks), -1)
-    load, size = np.zeros((len(observers), n)), np.zeros(n)
-    for k in rng.permutation(np.flatnonzero(~kept)).tolist():
-        of_labels = load[list(landmarks[k])].sum(axis=0)
-        best = np.flatnonzero(of_labels == of_labels.min())
-        fold[k] = rng.choice(best[size[best] == size[best].min()])
-        load[list(landmarks[k]), fold[k]] += 1.0
-        size[fold[k]] += 1.0
+        for k in np.unique(place[configurations]).tolist():
+            landmarks[k].append(label)
+    dealt = rng.permutation(np.setdiff1d(np.arange(n_sets), place[_reference_poses(data)])).tolist()
+    fold = np.full(n_sets, -1)
+    fold[sorted(dealt, key=lambda k: landmarks[k])] = np.arange(len(dealt)) % n
     found = fold[place]
     for configurations, needed in observers:
         left = len(configurations) - np.bincount(found[configurations] + 1, minlength=n + 1)[1:].max()

@@ -16,7 +16,7 @@ that of all rows, shared among the kinds by leverage.
 Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off. Each kind is judged by
 the sum of its studentised squares. All of them together are judged by `r^T A^-1 r`, which is sensitive where the arm is
 well known although it may be off by more elsewhere. Where the noise was estimated, this is a ratio of two variances
-(F); with a robust loss measurements that it would call outliers count for nothing.
+(F); with a robust loss measurements with suspect rows count for nothing.
 
 References:
     Satterthwaite (1946), An approximate distribution of estimates of variance components. Biometrics Bulletin 2(6).
@@ -27,14 +27,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
-from fg_calib.graph import JOINT_NOISE, Solution, effect, linear_system, mahalanobis_distances, tuning, weight
+from fg_calib.graph import JOINT_NOISE, Solution, effect, linear_system, mahalanobis_distances
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
@@ -206,15 +205,6 @@ class GrossErrors:
     ratio: float
 
 
-class OutlierCounts(NamedTuple):
-    """Test and fitted measurements, and those among them that a robust loss takes for outliers; zeros without one."""
-
-    test: int = 0
-    n_test: int = 0
-    fitted: int = 0
-    n_fitted: int = 0
-
-
 @dataclass(frozen=True)
 class PredictedFit(FrozenArrays):
     """How well the calibrated arm predicts the test rows.
@@ -224,7 +214,8 @@ class PredictedFit(FrozenArrays):
             estimate may be off included.
         n_rows: Number of scalar rows.
         n: Number of them behind chi-square: evenly spaced ones if there are many to be whitened (`MAX_WHITENED`).
-        outliers: Measurements that count for nothing because a robust loss would call them outliers.
+        n_measurements: Number of test measurements.
+        n_outliers: Those among them that count for nothing because a robust loss is to pass over outliers.
         n_unknown: Rows not judged because they depend on what neither data nor priors determine.
         chi2: Sum of the squares of the rows, whitened by their noise and by what the estimate may be off.
         expected: Its mean, were the noise as taken and the arm known as well as is claimed.
@@ -236,7 +227,8 @@ class PredictedFit(FrozenArrays):
     kinds: tuple[KindFit, ...]
     n_rows: int
     n: int
-    outliers: OutlierCounts
+    n_measurements: int
+    n_outliers: int
     n_unknown: int
     chi2: Figure
     expected: Figure
@@ -403,7 +395,6 @@ class RowStatistics:
         weight: See `Goodness`.
         robust: Whether a robust loss weights the rows.
         fitted: The rows fitted.
-        errors: What the fitted rows follow from, over sigma; None where that is not known, or takes too much memory.
         predicted: The rows predicted that can be judged.
     """
 
@@ -428,8 +419,7 @@ class RowStatistics:
             self.studentised: Floats = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
             squares = (table.after / table.sigma) ** 2
         self.studentised[variance < LEAST_VARIANCE] = np.nan
-        self.errors = of_kept.at(np.searchsorted(kept, fitted)) if known else None
-        covariance = None if self.errors is None else self.errors.fitted(spread.tangent)
+        covariance = of_kept.at(np.searchsorted(kept, fitted)).fitted(spread.tangent) if known else None
         chosen = slice(None) if len(fitted) == table.n else fitted
         of_fitted, means = w[chosen] * squares[chosen], w[chosen] * variance[chosen]
         self.fitted = JudgedRows(table, fitted, of_fitted, means, covariance, self._shared)
@@ -480,11 +470,12 @@ class RowStatistics:
         Args:
             suspects: The rows of the table among them that are too large.
         """
-        part, table = self.predicted, self.table
-        test, n = np.flatnonzero(table.test & (table.reason_code == 0)), len(part.rows)
-        outliers = self._count_outliers(test)
-        if not (n or outliers.test):
+        part, table, n = self.predicted, self.table, len(self.predicted.rows)
+        test = table.test & (table.reason_code == 0)
+        able = test & (self.leverage >= LEAST_VARIANCE - 1.0)
+        if not able.any():
             return None
+        n_judged, n_measurements = (len(np.unique(table.measurement_number[of])) for of in (part.rows, able))
         chosen = np.arange(n)
         if part.covariance is not None and n:
             chosen = np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
@@ -497,7 +488,8 @@ class RowStatistics:
             kinds=self._fit_kinds(part, np.zeros(len(table.groups)), known=True),
             n_rows=n,
             n=len(chosen),
-            outliers=outliers,
+            n_measurements=n_measurements,
+            n_outliers=n_measurements - n_judged,
             n_unknown=int(np.sum(~np.isfinite(self.leverage[test]))),
             chi2=chi2,
             expected=expected,
@@ -568,9 +560,12 @@ class RowStatistics:
             kept: Rows of the table that `of_kept` is of.
             of_kept: What these follow from.
         """
-        judged = np.isfinite(self.leverage[test]) & (self._robust_weights(test) >= OUTLIER_WEIGHT)
-        judged &= ~(self.leverage[test] < LEAST_VARIANCE - 1.0)
-        rows, table = test[judged], self.table
+        table = self.table
+        judged = np.isfinite(self.leverage[test]) & ~(self.leverage[test] < LEAST_VARIANCE - 1.0)
+        if self.robust:
+            far = test[judged & (np.abs(self.studentised[test]) > suspect_level(len(test)))]
+            judged &= ~np.isin(table.measurement_number[test], table.measurement_number[far])
+        rows = test[judged]
         means, covariance = 1.0 + self.leverage[rows], None
         if np.isin(rows, kept).all():
             errors, of = of_kept.at(np.searchsorted(kept, rows)), (self.spread.tangent, self.spread.actual)
@@ -579,24 +574,6 @@ class RowStatistics:
             with np.errstate(invalid="ignore"):
                 self.studentised[rows] = table.after[rows] / (table.sigma[rows] * np.sqrt(means))
         return JudgedRows(table, rows, squares[judged] / means, np.ones(len(rows)), covariance, self._shared)
-
-    def _count_outliers(self, test: Integers) -> OutlierCounts:
-        if not self.robust:
-            return OutlierCounts()
-        fitted, number = self.fitted.rows, self.table.measurement_number
-        outliers = (test[self._robust_weights(test) < OUTLIER_WEIGHT], fitted[self.weight[fitted] < OUTLIER_WEIGHT])
-        return OutlierCounts(*(len(np.unique(number[rows])) for rows in (outliers[0], test, outliers[1], fitted)))
-
-    def _robust_weights(self, rows: Integers) -> Floats:
-        """The weights that the loss would give to predicted rows, shape (n,)."""
-        if not (self.robust and len(rows)):
-            return np.ones(len(rows))
-        table, loss = self.table, self.solution.problem.options.loss
-        variance = table.sigma[rows] ** 2 * np.maximum(1.0 + np.nan_to_num(self.leverage[rows]), LEAST_VARIANCE)
-        _, of, n_rows = np.unique(table.measurement_number[rows], return_inverse=True, return_counts=True)
-        length = np.sqrt(np.bincount(of, table.after[rows] ** 2 / variance))
-        out: Floats = weight(loss, length, np.array([tuning(loss, n) for n in n_rows.tolist()]))[of]
-        return out
 
 
 def upper_probability(ratio: float, nu: float, of_noise: float = np.inf) -> float:

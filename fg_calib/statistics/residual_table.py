@@ -35,9 +35,9 @@ READING_DECIMALS = 9
 """Decimals of readings, [rad] or [m], that distinguish configurations."""
 
 
-def suspect_level(n: int) -> float:
-    """|studentised residual| that the largest of n clean rows exceeds with a probability of `ALARM` (Sidak 1967)."""
-    return float(special.ndtri(0.5 + 0.5 * (1.0 - ALARM) ** (1.0 / max(1, n))))
+def suspect_level(n: int, alarm: float = ALARM) -> float:
+    """|studentised residual| that the largest of n clean rows exceeds with a probability (Sidak 1967)."""
+    return float(special.ndtri(0.5 + 0.5 * (1.0 - alarm) ** (1.0 / max(1, n))))
 
 
 @dataclass(frozen=True)
@@ -87,20 +87,10 @@ class HeldOut:
 
 def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
     """Several groups of measurements of one kind together, under the name of one table."""
-    n = np.array([part.n for part in parts])
-
-    def rms(of: str) -> float:
-        return float(np.sqrt(n @ np.array([getattr(part, of) for part in parts]) ** 2 / n.sum()))
-
-    return replace(
-        parts[0],
-        table=table,
-        n=int(n.sum()),
-        before=rms("before"),
-        after=rms("after"),
-        noise=rms("noise"),
-        few=any(part.few for part in parts),
-    )
+    n, names = np.array([part.n for part in parts]), ("before", "after", "noise")
+    squares = n @ np.array([[getattr(part, name) ** 2 for name in names] for part in parts]) / n.sum()
+    rms = dict(zip(names, np.sqrt(squares).tolist(), strict=True))
+    return replace(parts[0], table=table, n=int(n.sum()), few=any(part.few for part in parts), **rms)
 
 
 @dataclass(frozen=True)
@@ -219,7 +209,8 @@ class ResidualTable(FrozenArrays):
         number: Integers = self.series.astype(np.int64) * 2**32 + self.measurement
         return number
 
-    def is_first_of_family(self) -> Booleans:
+    @cached_property
+    def begins(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
         first = np.ones(self.n, dtype=np.bool_)
         number, family = self.measurement_number, self.family
@@ -239,17 +230,22 @@ class ResidualTable(FrozenArrays):
             table: Of which table; of all if None.
         """
         found: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
-        counted, first, family = self.reason_code == 0, self.is_first_of_family(), self.family
+        counted = self.reason_code == 0
         if table is not None:
             counted = counted & np.array([kind.table == table for kind in self.kinds] or [False])[self.kind_code]
         for code, split in enumerate(found):
             for k, name in enumerate(self.families):
-                rows = counted & (self.split == code) & (family == k)
-                n = int(np.sum(rows & first))
-                if n:
-                    both = (("before", self.before), ("after", self.after))
-                    found[split][name] = {when: float(np.sqrt(np.sum(v[rows] ** 2) / n)) for when, v in both}
+                rows = np.flatnonzero(counted & (self.split == code) & (self.family == k))
+                if len(rows):
+                    _, before, after, _ = self._rms_of(rows)
+                    found[split][name] = {"before": before, "after": after}
         return found
+
+    def _rms_of(self, rows: Integers) -> tuple[int, float, float, float]:
+        """Number of measurements of some rows; RMS of their lengths before, after, and of their noise."""
+        n = int(np.sum(self.begins[rows]))
+        before, after, noise = (float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma))
+        return n, before, after, noise
 
     def of_configurations(self, held_out: Booleans) -> tuple[Integers, Floats, dict[str, Floats]]:
         """How many rows that count each configuration takes part in, the sum of their squares, and RMS by kind.
@@ -267,7 +263,7 @@ class ResidualTable(FrozenArrays):
         row, end = row[end < n], end[end < n]
         counted = (self.reason_code[row] == 0) & (self.split[row] == held_out[end])
         row, end = row[counted], end[counted]
-        family, first = self.family[row], self.is_first_of_family()[row]
+        family, first = self.family[row], self.begins[row]
         rms = {}
         with np.errstate(divide="ignore", invalid="ignore"):  # of rows that have no sigma
             for k, name in enumerate(self.families):
@@ -283,17 +279,12 @@ class ResidualTable(FrozenArrays):
         Args:
             labels: Of the tables; a single one has none here.
         """
-        found, first, group = [], self.is_first_of_family(), self.group
+        found, counted = [], (self.reason_code == 0) & (self.split == 1) & ~self.seen
         for k, (number, family) in enumerate(self.groups):
-            rows = np.flatnonzero((self.reason_code == 0) & (self.split == 1) & ~self.seen & (group == k))
-            n = int(np.sum(first[rows]))
-            if n:
-                before, after, noise = (
-                    float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma)
-                )
-                few = bool(len(rows) < ROWS_PER_FITTED * self.n_fitted)
-                table = labels[number] if len(labels) > 1 else ""
-                found.append(HeldOut(table, family, n, before, after, noise, few))
+            rows = np.flatnonzero(counted & (self.group == k))
+            if len(rows):
+                table, few = labels[number] if len(labels) > 1 else "", len(rows) < ROWS_PER_FITTED * self.n_fitted
+                found.append(HeldOut(table, family, *self._rms_of(rows), few))
         return tuple(found)
 
     def rows_of(self, number: int) -> slice:

@@ -14,9 +14,9 @@ with `T_ij = a_ij / sqrt(q_i q_j / t_i t_j)`, which does not depend on the size 
 where there is one origin, or all are off by the same. The fit is repeated with the new factors until they settle.
 
 What the residuals cannot distinguish keeps its specified noise: an origin that `1 / (T^-1)_ii` gives fewer than
-`LEAST_REDUNDANCY` degrees of freedom next to the others, both where it is estimated and where it is as specified with
-the others estimated, unless what was specified is then `UNLIKELY` sigma from the estimate. So noise that is specified
-but absent goes to nothing, and noise too small to be determined stays.
+`LEAST_REDUNDANCY` degrees of freedom next to the others, both where it is estimated and where it is as specified,
+unless what was specified is then `UNLIKELY` sigma from the estimate. So noise that is specified but absent goes to
+nothing, and noise too small to be determined stays.
 
 Where rows are weighted by more than their noise (`WhitenedBlock.spare`: C = sum V_i + S), t_i is tr(P V_i) -
 tr(P V_i P S). A row with robust weight w counts as w rows. Noise of formed pairs beyond the first order counts as that
@@ -31,7 +31,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,7 +52,7 @@ from fg_calib.graph import (
     solve,
     whitener_of,
 )
-from fg_calib.inputs import Floats, checked
+from fg_calib.inputs import Floats, Integers, checked
 from fg_calib.parallel import single_threaded
 
 Sparse = scipy.sparse.csr_array
@@ -99,9 +99,9 @@ class NoiseComponents:
     expected: Floats
     information: Floats
 
-    def degrees(self, i: int, others: Floats) -> float:
+    def degrees(self, i: int, others: Integers) -> float:
         """Degrees of freedom of one origin next to others that are estimated too, by their numbers."""
-        chosen = np.append(others[others != i], i).astype(np.int64)
+        chosen = np.append(others[others != i], i)
         return 1.0 / max(float(_solve(self.information[np.ix_(chosen, chosen)], np.eye(len(chosen))[-1])[-1]), TINY)
 
 
@@ -208,37 +208,38 @@ def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> So
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    best, asked = _settle(problem, options, frozenset()), set[NoiseName]()
-    seconds = best.solution.seconds
-    while weak := {name: n for name, n in best.degrees.items() if n < LEAST_REDUNDANCY and name not in asked}:
+    kept, seconds, asked = frozenset[NoiseName](), 0.0, set[NoiseName]()
+    while True:
+        solution, degrees = _settle(problem, options, kept)
+        seconds += solution.seconds
+        weak = {name: n for name, n in degrees.items() if n < LEAST_REDUNDANCY and name not in asked}
+        if not weak:
+            return replace(solution, seconds=seconds)
         name = min(weak, key=lambda name: weak[name])
         asked.add(name)
-        as_specified = _scaled(problem, {**best.solution.problem.state.factors, name: 1.0})
-        other = _settle(as_specified, options, best.kept | {name})
-        seconds += other.solution.seconds
-        best = other if name in other.indeterminate else best
-    return replace(best.solution, seconds=seconds)
+        as_specified = _scaled(problem, {**solution.problem.state.factors, name: 1.0})
+        if _is_indeterminate(noise_components(solve(as_specified, options)), name, tuple(degrees)):
+            problem, kept = as_specified, kept | {name}
+            asked = set(kept)
 
 
-@dataclass(frozen=True)
-class _Settled:
-    """A solution with the noise that its residuals show; not converged where the factors have not settled.
+def _is_indeterminate(found: NoiseComponents, name: NoiseName, estimated: Sequence[NoiseName]) -> bool:
+    """Whether the residuals say next to nothing of noise of one origin that is as specified."""
+    i = found.names.index(name)
+    degrees = found.degrees(i, np.array([found.names.index(other) for other in estimated]))
+    off = abs(found.squares[i] - found.expected[i]) / np.sqrt(2.0 * degrees)
+    return bool(degrees < LEAST_REDUNDANCY and off < UNLIKELY)
 
-    Attributes:
-        solution: The solution.
-        degrees: Degrees of freedom of each origin that was estimated, next to the others.
-        kept: Origins whose noise was kept as specified.
-        indeterminate: Origins among them that could not be estimated.
+
+def _settle(
+    problem: Problem, options: SolverOptions | None, kept: frozenset[NoiseName]
+) -> tuple[Solution, dict[NoiseName, float]]:
+    """Solve and scale the noise until its components are as expected; steps back are at most half of the last one.
+
+    Returns:
+        The solution, not converged where the factors have not settled, and the degrees of freedom of each origin that
+        was estimated, next to the others.
     """
-
-    solution: Solution
-    degrees: Mapping[NoiseName, float]
-    kept: frozenset[NoiseName]
-    indeterminate: frozenset[NoiseName]
-
-
-def _settle(problem: Problem, options: SolverOptions | None, kept: frozenset[NoiseName]) -> _Settled:
-    """Solve and scale the noise until its components are as expected; steps back are at most half of the last one."""
     seconds, last = 0.0, dict[NoiseName, float]()
     for _ in range(MAX_ROUNDS):
         solution = solve(problem, options)
@@ -257,15 +258,8 @@ def _settle(problem: Problem, options: SolverOptions | None, kept: frozenset[Noi
     else:
         message = f"not converged: the estimated noise still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
         solution = replace(solution, converged=False, message=message if solution.converged else solution.message)
-    free = np.array([i for i, name in enumerate(found.names) if name in steps], dtype=np.float64)
-    degrees = {name: found.degrees(i, free) for i, name in enumerate(found.names)}
-    off = np.abs(found.squares - found.expected) / np.sqrt(2.0 * np.array(list(degrees.values())))
-    poor = {
-        name
-        for name, d, o in zip(found.names, degrees.values(), off, strict=True)
-        if d < LEAST_REDUNDANCY and o < UNLIKELY
-    }
-    return _Settled(solution, {name: degrees[name] for name in steps}, kept, kept & poor)
+    free = np.array([found.names.index(name) for name in steps], dtype=np.int64)
+    return solution, {name: found.degrees(i, free) for name, i in zip(steps, free.tolist(), strict=True)}
 
 
 def _steps(found: NoiseComponents, kept: frozenset[NoiseName]) -> dict[NoiseName, float]:
