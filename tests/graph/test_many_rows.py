@@ -1,6 +1,5 @@
 """Tables of very many rows: a start from some of them, what is remembered, the same bits on any number of threads."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -8,14 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
-from fg_calib import Calibration, InputError, Measurements, Pairing, Table, assess, solve
+from fg_calib import InputError, Measurements, Pairing, Table, assess, solve
 from fg_calib.graph import noise_models, solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import whitening_of
 from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, subsampled
-from fg_calib.parallel import processors
-from fg_calib.robot import kinematics
-from fg_calib.robot.kinematics import SPAN, pose
+from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -100,31 +97,6 @@ def test_small_covariances_are_whitened_by_the_rows_in_use(d):
     assert np.abs(W @ (C * both) @ np.swapaxes(W, 1, 2) - np.eye(d) * both).max() < 1e-12
     with pytest.raises(InputError, match="lost in rounding"):
         whitening_of(-C, np.ones_like(used))
-
-
-def test_every_bit_is_the_same_on_any_number_of_threads(monkeypatch):
-    robot = small_arm(TOLERANCE)
-    table = pairs_of(3 * SPAN + 17, robot, np.random.default_rng(1))
-    monkeypatch.setattr(solver, "MAX_AT_ONCE", SPAN)  # so that some rows are solved first
-    found = {}
-    try:
-        for n in (1, 2, 3, 4):
-            monkeypatch.setenv("FG_CALIB_THREADS", str(n))
-            for cached in (processors, kinematics._pool):
-                cached.cache_clear()
-            assert processors() == n
-            solution = solve(build_problem(robot, table, model="distance-rotation"))
-            result = Calibration.of(solution, assess(solution), date="2026-01-01T00:00:00+00:00").result
-            document = result.document()
-            document["solver"].pop("seconds")
-            goodness = assess(solution).fit.goodness
-            arrays = (solution.parameters, solution.problem.rows[0].parts[0].block.data, goodness.leverage)
-            found[n] = pickle.dumps((document, [array.tobytes() for array in arrays]))
-    finally:
-        monkeypatch.undo()
-        for cached in (processors, kinematics._pool):
-            cached.cache_clear()
-    assert all(found[n] == found[1] for n in found)
 
 
 def test_noise_of_many_rows_is_computed_on_demand_and_is_the_same(problem, monkeypatch):
