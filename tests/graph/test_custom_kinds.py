@@ -230,67 +230,50 @@ def test_a_kind_of_ours_cannot_be_changed_under_its_compiled_twin():
         CustomMeasurements(Longer(), np.ones(3), SIGMA, ends=np.zeros((3, 2), int))
 
 
-def test_figures_are_checked_before_anything_is_solved():
+def test_numbers_that_a_kind_shows_are_checked_and_want_of_memory_is_no_fault_of_it():
     class Mine(AnchorDistance):
         def figures(self, data):
+            if len(data) != 12:
+                raise MemoryError
             return data.ravel()
 
     with pytest.raises(InputError, match=r"^lengths: kind Mine: figures: shape \(12,\), expected \(12, 1\)$"):
         of_kind(Mine())
-
-
-def test_want_of_memory_is_no_fault_of_a_kind():
-    class Mine(AnchorDistance):
-        def figures(self, data):
-            raise MemoryError
-
+    robot, _, table = lengths_to_anchors(5)
     with pytest.raises(MemoryError):
-        of_kind(Mine())
+        build_problem(robot, replace(table, own=(replace(table.own[0], kind=Mine()),)))
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"data": "far"}, "own: data: found 'far', expected finite numbers"),
-        ({"data": np.full(60, np.nan)}, "own: data: row 0: found nan, expected a finite number$"),
-        ({"data": np.zeros((60, 2))}, r"own: data: shape \(60, 2\), expected \(60, 1\)"),
-        ({"sigma": -1.0}, "own: sigma: found -1, expected a number above 0"),
-        ({"which": np.full((60, 1), 3)}, "own: which: found 3, expected 0 to 2"),
-        ({"ends": np.full((60, 1), -1)}, "own: ends: found -1, expected 0 and above"),
-        ({"names": ("A", "A", "B")}, r"own: names: found \('A', 'A', 'B'\), expected 3 different names"),
-        ({"unknowns": np.zeros((0, 0))}, r"own: unknowns: shape \(0, 0\), expected a start for each unknown; "),
-        ({"test": [True]}, r"own: test: bool of shape \(1,\), expected True or False for each of 60"),
-        ({"kind": AnchorDistance}, "own: kind: found <class .*>, expected an object of a class derived from Kind"),
+        ({"data": "far"}, "data: found 'far', expected finite numbers"),
+        (
+            {"data": ["1.0"] * 60},
+            "data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite numbers",
+        ),
+        ({"data": np.full(60, np.nan)}, "data: row 0: found nan, expected a finite number"),
+        ({"data": np.zeros((60, 2))}, "data: shape (60, 2), expected (60, 1)"),
+        ({"data": np.ma.masked_array(np.ones(60))}, "data: found a masked array, expected finite numbers; nan "),
+        ({"data": (x for x in range(60))}, "data: found a generator, expected finite numbers; list(...) makes a list"),
+        ({"sigma": -1.0}, "sigma: found -1, expected a number above 0"),
+        ({"sigma": "1e-3"}, "sigma: found '1e-3', expected finite numbers"),
+        ({"sigma": 1e-200}, "sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances no "),
+        ({"which": np.full((60, 1), 3)}, "which: found 3, expected 0 to 2"),
+        ({"ends": np.full((60, 1), -1)}, "ends: found -1, expected 0 and above"),
+        ({"names": ("A", "A", "B")}, "names: found ('A', 'A', 'B'), expected 3 different names"),
+        ({"names": (1, 2, 3)}, "names: found (1, 2, 3), expected a word for each unknown"),
+        ({"names": 3}, "names: found 3, expected a list of names"),
+        ({"unknowns": np.zeros((0, 0))}, "unknowns: shape (0, 0), expected a start for each unknown; "),
+        ({"unknowns": np.zeros((3, 1, 3))}, "unknowns: shape (3, 1, 3), expected a start for each unknown; "),
+        ({"test": [True]}, "test: bool of shape (1,), expected True or False for each of 60"),
+        ({"kind": AnchorDistance}, "kind: found <class 'custom_kinds.AnchorDistance'>, expected an object of a class"),
     ],
 )
 def test_a_mistake_in_what_was_measured_is_named(change, said):
-    _, _, table = lengths_to_anchors(5)
-    with pytest.raises(InputError, match=f"^{said}"):
-        replace(table.own[0], **change)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"data": ["1.0"] * 60}, "own: data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite "
-         "numbers"),
-        ({"sigma": "1e-3"}, "own: sigma: found '1e-3', expected finite numbers"),
-        ({"sigma": 1e-200}, "own: sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances "
-         "no less than 1e-30"),
-        ({"data": np.ma.masked_array(np.ones(60))}, "own: data: found a masked array, expected finite numbers; nan "
-         "where something was not measured"),
-        ({"data": (x for x in range(60))}, "own: data: found a generator, expected finite numbers; list(...) makes a "
-         "list of it"),
-        ({"names": (1, 2, 3)}, "own: names: found (1, 2, 3), expected a word for each unknown"),
-        ({"names": 3}, "own: names: found 3, expected a list of names"),
-        ({"unknowns": np.zeros((3, 1, 3))}, "own: unknowns: shape (3, 1, 3), expected a start for each unknown; "
-         "AnchorDistance has 3 coordinates of them"),
-    ],
-)  # fmt: skip
-def test_text_and_other_things_are_no_figures(change, said):
     with pytest.raises(InputError) as found:
         replace(lengths_to_anchors(5)[2].own[0], **change)
-    assert str(found.value) == said
+    assert str(found.value).startswith(f"own: {said}")
 
 
 @pytest.mark.slow
