@@ -1,4 +1,4 @@
-"""Tables of very many rows: a start from some of them, what is remembered, the same bits on any number of threads."""
+"""Tables of very many rows: a start from some of them, and noise that is computed on demand."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
 
 def pairs_of(n, robot, rng, n_configurations=200):
-    """Pairs measured directly, some near a fold."""
+    """Pairs measured directly, some of lengths near 0."""
     true = true_robot(robot, rng)
     q = rng.uniform(-3.0, 3.0, (n_configurations, robot.n_joints))
     at = pose(true, q)
@@ -112,7 +112,7 @@ def test_noise_of_many_rows_is_computed_on_demand_and_is_the_same(problem, monke
     assert of_many.sigma == pytest.approx(of_few.sigma, rel=1e-9)
 
 
-@pytest.mark.parametrize("n_sigma", [0.0, 0.2, 3.0])
+@pytest.mark.parametrize("n_sigma", [0.2, 3.0])
 def test_rows_whitened_at_the_optimum_leave_nothing_to_go(problem, n_sigma):
     """Wherever the start is: convergence is judged by rows whitened at the estimate itself."""
     expected = solve(problem)

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot, write_job
 from touches import corners, touch
 
-from fg_calib import Measurements, read_job
+from fg_calib import read_job
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError, ProblemError
+from fg_calib.inputs import ProblemError
 from fg_calib.io import write_robot
 from fg_calib.io.columns import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
@@ -338,14 +338,6 @@ def test_a_distance_between_points_that_another_table_touched(tmp_path):
         of_points = [s for s in problem.data.series if s.kind.n_nuisances]
         found.append({s.kind.names[0]: len(s.train) for s in of_points})
     assert found == 3 * [{"point.x": 24, "distance": 1}]
-
-
-def test_points_of_another_table_are_named_where_arrays_are_given():
-    pairs = {"a": ["left"], "b": ["right"], "distance": [0.2], "sigma_distance": [1e-5]}
-    m = Measurements.from_arrays(np.zeros((3, 4)), pairs=pairs, points=["left", "right"])
-    assert (m.groups.names, m.groups.pairs.test.tolist()) == (("left", "right"), [False])
-    with pytest.raises(InputError, match="pairs: a: row 0: found 'left', expected an id"):
-        Measurements.from_arrays(np.zeros((3, 4)), pairs=pairs)
 
 
 @pytest.mark.parametrize("apart", [False, True])
