@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,8 @@ if TYPE_CHECKING:
 
     from fg_calib.importers import JointStream, PoseStream, Stops
 
+_OFFSET = "Stamp of a pose minus that of the joints at the same moment, in s; 0: as stamped."
+
 
 def bag(
     recording: Annotated[Path, argument("BAG", "A ROS bag: .bag, .db3, .mcap, or a folder of ROS 2.")],
@@ -20,16 +23,9 @@ def bag(
     pose: Annotated[str | None, option("--pose", "TOPIC", "Topic of the tool's measured poses.")] = None,
     out: Annotated[Path | None, option("--out", "CSV", "Write the table of poses there.")] = None,
     still: Annotated[float, option("--still", None, "How long the arm stands still at least, in s.")] = 1.0,
-    offset: Annotated[
-        float | None,
-        option("--offset", None, "Stamp of a pose minus that of the joints at the same moment, in s; 0: as stamped."),
-    ] = None,
-    most_offset: Annotated[
-        float | None, option("--most-offset", None, "Refuse the bag where the estimated offset is larger, in s.")
-    ] = None,
-    names: Annotated[
-        str, option("--names", "NAMES", "The bag's names of the robot's joints: shoulder,elbow,wrist.")
-    ] = "",
+    offset: Annotated[float | None, option("--offset", None, _OFFSET)] = None,
+    most_offset: Annotated[float | None, option("--most-offset", None, "Largest offset accepted, in s.")] = None,
+    names: Annotated[str, option("--names", "NAMES", "The bag's names of the joints: shoulder,elbow,wrist.")] = "",
     parent: Annotated[str | None, option("--parent", "FRAME", "Frame in which poses are measured.")] = None,
     child: Annotated[str | None, option("--child", "FRAME", "Frame on the tool that is measured.")] = None,
     base_link: BaseLink = None,
@@ -54,83 +50,54 @@ def bag(
     say(nothing if out is None else f"wrote {len(stops.ids)} poses to {out}")
 
 
+def _topic(stream: JointStream | PoseStream) -> dict[str, Any]:
+    from fg_calib.importers import period
+
+    return asdict(stream.source) | {"messages": len(stream.time), "period": period(stream.time)}
+
+
 def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> dict[str, Any]:
     """The content of the recording for programs: [m], [rad], [s]."""
-    from fg_calib.importers import period
     from fg_calib.report import plain
 
-    topics = {
-        what: {
-            "topic": stream.source.topic,
-            "type": stream.source.kind,
-            "messages": len(stream.time),
-            "period": period(stream.time),
-            "notes": stream.source.notes,
-        }
-        for what, stream in (("joints", joints), ("pose", poses))
-    }
-    scatter = {
-        what: {"single": s.single, "mean": s.mean, "correlation_samples": s.correlation, "slow": s.slow}
-        for what, s in stops.scatter.items()
-    }
-    document: dict[str, Any] = plain(
-        {
-            "schema": "fg-calib/bag/1",
-            "bag": name,
-            "topics": topics,
-            "offset": stops.offset,
-            "applied_offset": stops.applied,
-            "n_found": len(stops.ids) + len(stops.skipped),
-            "n_written": len(stops.ids),
-            "skipped": [{"id": s.id, "begin": s.begin, "reason": s.reason} for s in stops.skipped],
-            "scatter": scatter,
-        }
-    )
+    found = {"n_found": len(stops.ids) + len(stops.skipped), "n_written": len(stops.ids)}
+    offsets = {"offset": stops.offset, "applied_offset": stops.applied}
+    skipped, topics = [s._asdict() for s in stops.skipped], {"joints": _topic(joints), "pose": _topic(poses)}
+    more = {"topics": topics, **offsets, **found, "skipped": skipped, "scatter": stops.scatter}
+    document: dict[str, Any] = plain({"schema": "fg-calib/bag/1", "bag": name, **more})
     return document
 
 
 def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> RenderableType:
     """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
-    from fg_calib.importers import period
     from fg_calib.report import line, report, section, table_of
 
-    n, skipped = len(stops.ids), len(stops.skipped)
-    streams = [
-        (what, s.source.topic, s.source.kind, len(s.time), f"{1.0 / period(s.time):.4g}")
-        for what, s in (("joints", joints), ("poses", poses))
-    ]
+    topics, n = {"joints": _topic(joints), "poses": _topic(poses)}, len(stops.ids)
+    streams = [(what, t["topic"], t["type"], t["messages"], f"{1.0 / t['period']:.4g}") for what, t in topics.items()]
     units = {"position": "mm", "joint": "mrad or mm"}
-    scatter = [
-        (
-            what,
-            *(f"{v * 1e3:.3g} {units.get(what, 'mrad')}" for v in (s.single, s.mean)),
-            f"{s.correlation:.3g} samples",
-        )
-        for what, s in stops.scatter.items()
-    ]
-    slow = [what for what, s in stops.scatter.items() if s.slow and what != "joint"]
-    rough = [f"noise of {' and '.join(slow)} is slower than the stops are long: its sigmas are rough"] if slow else []
+    scatter, rough = [], []
+    for what, s in stops.scatter.items():
+        cells = (f"{v * 1e3:.3g} {units.get(what, 'mrad')}" for v in (s.single, s.mean))
+        scatter.append((what, *cells, f"{s.correlation_samples:.3g} samples"))
+        if s.slow and what != "joint":
+            rough.append(f"noise of {what} is slower than the stops are long: its sigmas are rough")
     return report(
-        line(f"{name}: {n + skipped} stops found, {n} used, {skipped} skipped", "bold"),
+        line(f"{name}: {n + len(stops.skipped)} stops found, {n} used, {len(stops.skipped)} skipped", "bold"),
         table_of(("", "topic", "type", "messages", "Hz"), streams, left="lll"),
-        *(f"{s.source.topic}: {note}" for s in (joints, poses) for note in s.source.notes),
+        *(f"{t['topic']}: {note}" for t in topics.values() for note in t["notes"]),
         *section("Clocks", *_clocks(stops)),
-        *section("Scatter during stops", table_of(("", "of one", "of the mean", "correlated over"), scatter)),
-        *rough,
+        *section("Scatter during stops", table_of(("", "of one", "of the mean", "correlated over"), scatter), *rough),
         *section("Skipped", *(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
     )
 
 
 def _clocks(stops: Stops) -> list[str]:
-    offset, applied = stops.offset, stops.applied
+    offset = stops.offset
     if offset is None:
-        return [f"offset {applied:.6g} s as specified; it could not be estimated"]
-    lines = [
-        f"poses are stamped {offset.seconds:+.6f} +- {offset.sigma:.6f} s against the joints",
+        return [f"offset {stops.applied:.6g} s as specified"]
+    others = ", ".join(f"{other:+.2f}" for other in offset.others[:3])
+    return [
+        f"poses are stamped {offset.seconds:+.6f} +- {offset.sigma:.6f} s against the joints, which is taken out",
         f"from {offset.n_moves} moves; speeds by joints and by poses correlate by {offset.correlation:.3f}",
-        "this offset is taken out" if applied == offset.seconds else f"specified and used: {applied:.6g} s",
+        *([f"motions repeat: offsets of {others} s fit nearly as well; --offset specifies it"] if others else []),
     ]
-    if offset.others:
-        listed = ", ".join(f"{other:+.2f}" for other in offset.others[:3])
-        lines.append(f"motions repeat: offsets of {listed} s fit nearly as well; --offset specifies it")
-    return lines

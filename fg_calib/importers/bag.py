@@ -10,10 +10,10 @@ Messages are read by the definitions of their types in the bag, or by the standa
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -46,12 +46,8 @@ def _transform(m: Any) -> _Pose:
     return m.header, m.child_frame_id, m.transform.translation, m.transform.rotation
 
 
-class _Sample(NamedTuple):
-    """Values of a message, with its stamp and the time of its receipt, [ns]."""
-
-    stamp: int
-    received: int
-    values: Sequence[float]
+Sample = tuple[int, int, Sequence[float]]
+"""Stamp and time of receipt of a message, [ns], and its values."""
 
 
 @checked
@@ -95,8 +91,8 @@ def read_bag(
     try:
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
-            of_joints = _choose_topic(reader, path.name, joints, (JOINT_TYPE,), "--joints")
-            of_pose = _choose_topic(reader, path.name, pose, tuple(POSE_TYPES), "--pose")
+            of_joints = _choose_topic(reader, path.name, joints, (JOINT_TYPE,), "joints")
+            of_pose = _choose_topic(reader, path.name, pose, tuple(POSE_TYPES), "pose")
             stamps, readings, source = _read_joints(reader, of_joints, wanted, path.name)
             poses = _read_poses(reader, of_pose, (parent, child), int(stamps[0]), path.name)
     except (CalibrationError, MemoryError):
@@ -107,29 +103,23 @@ def read_bag(
     return JointStream((stamps - stamps[0]) * 1e-9, readings, source), poses
 
 
-def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...], option: str) -> tuple[str, str]:
+def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...], what: str) -> tuple[str, str]:
     """The topic of a name, or the only one with messages of these types; and its type.
 
     Raises:
         InputError: There is none, or there are several.
     """
     every = sorted({(c.topic, c.msgtype) for c in reader.connections})
-    has = f"the bag has {', '.join(f'{topic} ({kind})' for topic, kind in every) or 'nothing'}"
-    fitting = [one for one in every if one[1] in kinds]
-    if name is not None:
-        chosen = [one for one in fitting if one[0] == name]
-        if not chosen:
-            others = [kind for topic, kind in every if topic == name]
-            what = f"topic {name} is of {others[0]}" if others else f"no topic {name}"
-            raise InputError(bag, what, " or ".join(kinds) if others else "", has)
-        return chosen[0]
-    fitting = [one for one in fitting if one[0].rpartition("/")[2] != "tf_static"]
-    fitting = [one for one in fitting if one[1] != "tf2_msgs/msg/TFMessage"] or fitting
-    if len(fitting) != 1:
-        fit = ", ".join(f"{topic} ({kind})" for topic, kind in fitting)
-        what = f"{len(fitting)} topics fit: {fit}" if fitting else f"no topic of type {' or '.join(kinds)}"
-        raise InputError(bag, what, f"one of them: {option} TOPIC" if fitting else "", "" if fitting else has)
-    return fitting[0]
+    fitting = [one for one in every if one[1] in kinds and name in (None, one[0])]
+    if name is None:
+        fitting = [one for one in fitting if one[0].rpartition("/")[2] != "tf_static"]
+        fitting = [one for one in fitting if one[1] != "tf2_msgs/msg/TFMessage"] or fitting
+    if len(fitting) == 1:
+        return fitting[0]
+    listed = ", ".join(f"{topic} ({kind})" for topic, kind in fitting or every)
+    if fitting:
+        raise InputError(bag, f"{len(fitting)} topics fit: {listed}", f"one of them: --{what} TOPIC")
+    raise InputError(bag, f"no topic {name or ''} for --{what}", hint=f"the bag has {listed or 'nothing'}")
 
 
 def _messages(reader: Any, topic: tuple[str, str]) -> Iterator[tuple[int, Any]]:
@@ -146,35 +136,30 @@ def _stamp(header: Any) -> int:
 
 def _read_joints(reader: Any, topic: tuple[str, str], wanted: tuple[str, ...], bag: str) -> tuple[Any, Floats, Source]:
     """Stamps, [ns], and readings of the joints wanted, shape (n, n_joints), in order of time."""
-    place, n_without = f"{bag}: topic {topic[0]}", 0
-    samples, names = [], dict.fromkeys(wanted, False)
+    samples, present, n = list[Sample](), dict[str, None](), 0
     for received, m in _messages(reader, topic):
         values = dict(zip(m.name, m.position, strict=False))
-        names.update(dict.fromkeys(m.name, True))
+        present.update(dict.fromkeys(m.name))
+        n += 1
         if set(wanted) <= values.keys():
-            samples.append(_Sample(_stamp(m.header), received, [values[name] for name in wanted]))
-        else:
-            n_without += 1
+            samples.append((_stamp(m.header), received, [values[name] for name in wanted]))
     if not samples:
-        present = [name for name, is_there in names.items() if is_there]
-        missing = next((name for name in wanted if not names[name]), None)
-        if missing is None:
-            raise InputError(place, "no message has positions of all joints", f"one with {', '.join(wanted)}")
+        missing = next((f"joint {name}" for name in wanted if name not in present), "message with all joints")
         hint = "name the bag's joints in chain order: --names, or `name` in the robot file"
-        raise InputError(place, f"no joint {missing}", f"the robot's joints among {', '.join(present)}", hint)
-    notes = (f"{_count(n_without)} without the robot's joints left out",) if n_without else ()
-    return _sort(samples, topic, notes, place)
+        expected = f"the robot's joints among {', '.join(present)}"
+        raise InputError(f"{bag}: topic {topic[0]}", f"no {missing}", expected, hint)
+    return _sort(samples, topic, {"without the robot's joints left out": n - len(samples)}, bag)
 
 
 def _read_poses(
     reader: Any, topic: tuple[str, str], frames: tuple[str | None, str | None], origin: int, bag: str
 ) -> PoseStream:
     """The poses of one frame in another; without rotations where all are the same."""
-    place, samples = f"{bag}: topic {topic[0]}", dict[tuple[str, str], list[_Sample]]()
+    place, samples = f"{bag}: topic {topic[0]}", dict[tuple[str, str], list[Sample]]()
     for received, message in _messages(reader, topic):
         for header, child, p, q in POSE_TYPES[topic[1]](message):
             pair = header.frame_id.removeprefix("/"), child.removeprefix("/")  # ROS 1 had a slash before names
-            sample = _Sample(_stamp(header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+            sample = (_stamp(header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
             samples.setdefault(pair, []).append(sample)
     wanted = [None if frame is None else frame.removeprefix("/") for frame in frames]
     fitting = [pair for pair in samples if all(f in (None, g) for f, g in zip(wanted, pair, strict=True))]
@@ -182,13 +167,12 @@ def _read_poses(
         listed = ", ".join(f"{a or '(no name)'} -> {b}" if b else a or "(no name)" for a, b in samples)
         what = f"poses of {len(fitting)} frames" if fitting else "no poses of these frames"
         raise InputError(place, what, "one: --parent FRAME --child FRAME", f"it has {listed}")
-    stamps, values, source = _sort(samples[fitting[0]], topic, (), place)
+    stamps, values, source = _sort(samples[fitting[0]], topic, {}, bag)
     quaternions, rotation = values[:, 3:], None
     norm = np.linalg.norm(quaternions, axis=1)
     wrong = np.abs(norm - 1.0) > NORM_TOLERANCE
     if not np.any(quaternions - quaternions[0]):
-        note = "all orientations are the same: taken as not measured"
-        source = Source(source.topic, source.kind, source.lag, (*source.notes, note))
+        source = replace(source, notes=(*source.notes, "all orientations are the same: taken as not measured"))
     elif wrong.any():
         found = f"quaternion of norm {norm[np.argmax(wrong)]:.6g}"
         raise InputError(place, found, f"1 within {NORM_TOLERANCE:g}", f"{wrong.sum()} of {len(norm)} poses")
@@ -198,35 +182,33 @@ def _read_poses(
 
 
 def _sort(
-    samples: Iterable[_Sample], topic: tuple[str, str], notes: tuple[str, ...], place: str
+    samples: Sequence[Sample], topic: tuple[str, str], counts: Mapping[str, int], bag: str
 ) -> tuple[Any, Floats, Source]:
     """Stamps, ascending, [ns], with what belongs to them, shape (n, k), and where they are from.
 
     Raises:
         InputError: Stamps go back, or there are not two.
     """
-    columns = zip(*samples, strict=True)
-    stamps, received = np.array(next(columns), dtype=np.int64), np.array(next(columns), dtype=np.int64)
-    values = np.array(next(columns), dtype=np.float64)
-    found: Counter[str] = Counter()
+    place, notes = f"{bag}: topic {topic[0]}", list[str]()
+    stamps, received = np.array([sample[:2] for sample in samples], dtype=np.int64).T
+    values = np.array([sample[2] for sample in samples], dtype=np.float64)
     if not stamps.all():
-        notes, stamps = (*notes, "no stamps in the headers: times of receipt are used"), received
+        notes, stamps = ["no stamps in the headers: times of receipt are used"], received
     lag = float(np.median((received - stamps) * 1e-9))
     finite = np.isfinite(values).all(axis=1)
-    found["with nan left out"] = int(np.sum(~finite))
     stamps, values = stamps[finite], values[finite]
     back = (np.maximum.accumulate(stamps) - stamps) * 1e-9
     if back.max(initial=0.0) > MAX_BACK_S:
         what = f"stamps go back by {back.max():.3g} s at message {int(np.argmax(back > MAX_BACK_S)) + 1}"
         raise InputError(place, what, "a clock that runs on")
-    found["out of order put in order"] = int(np.sum(back > 0.0))
     stamps, first = np.unique(stamps, return_index=True)
-    found["with the stamp of another left out"] = len(values) - len(first)
     if len(stamps) < 2:
         raise InputError(place, f"{len(stamps)} different stamps with finite values", "a recording")
-    listed = (f"{_count(n)} {what}" for what, n in found.items() if n)
-    return stamps, values[first], Source(*topic, lag, (*notes, *listed))
-
-
-def _count(n: int) -> str:
-    return f"{n} message{'s' * (n != 1)}"
+    found = {
+        **counts,
+        "with nan left out": np.sum(~finite),
+        "out of order put in order": np.sum(back > 0.0),
+        "with the stamp of another left out": len(values) - len(first),
+    }
+    notes += [f"{n} message{'s' * int(n != 1)} {what}" for what, n in found.items() if n]
+    return stamps, values[first], Source(*topic, lag, tuple(notes))

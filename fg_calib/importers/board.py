@@ -26,7 +26,7 @@ from fg_calib.importers.opencv import (
     find_corners,
 )
 from fg_calib.importers.views import Corners
-from fg_calib.inputs import Floats, InputError, did_you_mean
+from fg_calib.inputs import Floats, InputError, check
 from fg_calib.io import Count, Positive, Schema, Units, UnitsOfFile, read_bytes, read_yaml, shown, validate
 from fg_calib.parallel import tell
 
@@ -64,43 +64,25 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
     """
     place = path.name
     file = validate(_Board, read_yaml(path), place)
-    length = file.units.factor("m")
-    if file.square * length > MAX_SQUARE_M:
+    scaled = {key: (getattr(file, key) or 0.0) * file.units.factor("m") for key in ("square", "marker")}
+    board = CalibrationBoard(**file.model_dump(exclude={"units"}) | scaled)
+    if board.square > MAX_SQUARE_M:
         found = f"found {shown(file.square)} {file.units.length}"
         raise InputError(f"{place}: square", found, f"at most {MAX_SQUARE_M:g} m", "is it in mm? units: {length: mm}")
-    board = CalibrationBoard(
-        *(file.type, file.columns, file.rows, file.square * length, (file.marker or 0.0) * length),
-        dictionary=file.dictionary or "",
-        legacy=file.legacy,
-        upright=file.upright,
-        name=file.name,
-    )
     if file.type == "charuco":
-        _check_charuco(file, board, place)
+        for key in ("marker", "dictionary"):
+            if getattr(file, key) is None:
+                raise InputError(place, f"missing key {key!r}")
+        if board.marker >= board.square:
+            expected = f"a side shorter than a square's, {shown(file.square)}"
+            raise InputError(f"{place}: marker", f"found {shown(file.marker)}", expected)
+        check(f"{place}: dictionary", board.dictionary, dictionaries())
+        charuco_board(board, place)
     elif board.ambiguous and (not file.upright or file.columns == file.rows):
         found = f"{file.columns} x {file.rows} inner corners look the same after half a turn"
         hint = "where the camera never turns more than a quarter about its axis, say upright: true"
         raise InputError(place, found, "columns + rows odd, or a charuco board", hint)
     return board
-
-
-def _check_charuco(file: _Board, board: CalibrationBoard, place: str) -> None:
-    """Check the markers of a ChArUco board.
-
-    Raises:
-        InputError: They are missing, too large or of an unknown dictionary.
-    """
-    for key in ("marker", "dictionary"):
-        if getattr(file, key) is None:
-            raise InputError(place, f"missing key {key!r}")
-    if board.marker >= board.square:
-        expected = f"a side shorter than a square's, {shown(file.square)}"
-        raise InputError(f"{place}: marker", f"found {shown(file.marker)}", expected)
-    known = dictionaries()
-    if board.dictionary not in known:
-        found, hint = f"found {shown(board.dictionary)}", did_you_mean(board.dictionary, known)
-        raise InputError(f"{place}: dictionary", found, "one of OpenCV's, such as DICT_5X5_100", hint)
-    charuco_board(board, place)
 
 
 # --- images -----------------------------------------------------------------------------------------------------------
@@ -129,25 +111,19 @@ def image_files(given: Sequence[Path]) -> list[Path]:
     """
     files: list[Path] = []
     for path in given:
+        found = [path]
         if path.is_dir():
             found = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith("."))
         elif not path.exists() and any(c in path.name for c in "*?["):
             found = sorted(f for f in path.parent.glob(path.name) if f.is_file())
-        else:
-            found = [path]
         if not found:
             raise InputError(str(path), "no images", f"files that end in {', '.join(_ENDINGS)}")
         files += found
     names: dict[str, Path] = {}
     for file in files:
-        name = _name(file)
-        if names.setdefault(name, file) != file:
-            raise InputError(str(file), f"a second image called {name!r}", f"one, as {names[name].name} is called so")
-    return list(dict.fromkeys(files))
-
-
-def _name(file: Path) -> str:
-    return file.stem.strip()
+        if (other := names.setdefault(file.stem, file)) != file:
+            raise InputError(str(file), f"a second image called {file.stem!r}", f"one, as {other.name} is called so")
+    return list(names.values())
 
 
 def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners:
@@ -162,9 +138,8 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
     for k, file in enumerate(files):
         tell("looking for corners", k, len(files))
         image = decode(read_bytes(file), file.name)
-        height, width = image.shape
-        if size is None:
-            size = (width, height)
+        width, height = image.shape[::-1]
+        size = size or (width, height)
         if size != (width, height):
             expected = f"{size[0]} x {size[1]} px as {files[0].name}"
             raise InputError(file.name, f"an image of {width} x {height} px", expected, "one camera at a time")
@@ -172,7 +147,7 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
         if isinstance(seen, str):
             without[file.name] = seen
         else:
-            found.append(Corners(_name(file), *seen))
+            found.append(Corners(file.stem, *seen))
     if size is None or not found:
         reasons = "; ".join(dict.fromkeys(without.values()))
         hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from fg_calib import __version__
-from fg_calib.importers.views import INTRINSICS, BoardFit, View
+from fg_calib.importers.views import BoardFit, View
 from fg_calib.inputs import InputError
 from fg_calib.io import KNOWN, Table, Units, fill_folder, require_own, write_csv, write_text
 from fg_calib.measurements import COVARIANCE
@@ -26,17 +26,8 @@ BOARD_FILES = {
 """What is written and how it begins."""
 
 
-@dataclass(frozen=True)
-class Readings:
-    """Joint readings of images, as a table has them.
-
-    Attributes:
-        ids: Names of images, in the order of the table.
-        columns: The columns of readings, and `split`, as they are written.
-    """
-
-    ids: tuple[str, ...]
-    columns: Mapping[str, tuple[str, ...]]
+Readings = Mapping[str, Mapping[str, str]]
+"""By the name of an image, the cells of its row by column: joint readings, and `split`, as they are written."""
 
 
 def read_readings(path: Path) -> Readings:
@@ -48,19 +39,18 @@ def read_readings(path: Path) -> Readings:
         InputError: The table cannot be used.
     """
     table = Table.read(path, "configurations")
-    columns = {name.lower() if name.lower() in KNOWN else name: name for name in reversed(table.columns)}
+    columns = {name.lower() if name.lower() in KNOWN else name: name for name in table.columns}
     if "id" not in columns:
         raise InputError(table.name, "no column id", "the name of each row's image without its ending")
-    kept = [name for name in reversed(columns) if name not in KNOWN]
+    kept = [name for name in columns if name not in KNOWN]
     if not kept:
         raise InputError(table.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
-    kept += ["split"] if "split" in columns else []
     ids = table.texts(columns["id"], "the name of an image without its ending")
     table.require(ids.is_first_distinct().to_numpy(), columns["id"], "one row an image")
     comma = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$" if table.separator != "," else r"$^"  # of decimals: we write points
-    return Readings(
-        tuple(ids), {name: tuple(table.texts(columns[name]).fill_null("").str.replace(comma, "$1.$2")) for name in kept}
-    )
+    kept += ["split"] if "split" in columns else []
+    cells = (table.texts(columns[name]).fill_null("").str.replace(comma, "$1.$2") for name in kept)
+    return {name: dict(zip(kept, row, strict=True)) for name, *row in zip(ids, *cells, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -82,15 +72,14 @@ class BoardTables:
     camera_file: bytes | None
 
     def __post_init__(self) -> None:
-        if self.readings is not None and not self.used:
+        if not self.used:
             rows, images = (", ".join(names[:3]) for names in (self.without_image, self.without_row))
             raise InputError("configurations", f"no id is the name of an image: {rows}", f"ids such as {images}")
 
     @property
     def used(self) -> tuple[View, ...]:
         """Images that stand in the tables: those with a row of readings, where there are readings."""
-        ids = None if self.readings is None else set(self.readings.ids)
-        return tuple(view for view in self.fit.views if ids is None or view.name in ids)
+        return tuple(view for view in self.fit.views if self.readings is None or view.name in self.readings)
 
     @property
     def posed(self) -> tuple[View, ...]:
@@ -100,14 +89,13 @@ class BoardTables:
     @property
     def without_row(self) -> tuple[str, ...]:
         """Images with a board that have no row of readings."""
-        used = {view.name for view in self.used}
-        return tuple(view.name for view in self.fit.views if view.name not in used)
+        return tuple(v.name for v in self.fit.views if self.readings is not None and v.name not in self.readings)
 
     @property
     def without_image(self) -> tuple[str, ...]:
         """Rows of readings that have no image with a board."""
         seen = {view.name for view in self.fit.views}
-        return () if self.readings is None else tuple(name for name in self.readings.ids if name not in seen)
+        return tuple(name for name in self.readings or () if name not in seen)
 
     def document(self) -> dict[str, Any]:
         """What `board.json` holds: SI, full precision.
@@ -194,16 +182,11 @@ def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
 
 def _row_columns(tables: BoardTables, views: Sequence[View], each: Sequence[int]) -> dict[str, Any]:
     """What rows begin with: id, readings, the board's name; those of an image stand as often as `each` says."""
-    rows = np.repeat(np.arange(len(views)), each)
-    columns: dict[str, Any] = {"id": np.array([view.name for view in views])[rows]}
-    if tables.readings is not None:
-        place = {name: i for i, name in enumerate(tables.readings.ids)}
-        of_view = [place[view.name] for view in views]
-        for name, cells in tables.readings.columns.items():
-            columns[name] = np.array([cells[i] for i in of_view])[rows]
+    cells = [dict((tables.readings or {}).get(view.name, {})) for view in views]
     if name := tables.fit.board.name:
-        columns["board"] = np.full(len(rows), name)
-    return columns
+        cells = [of | {"board": name} for of in cells]
+    rows = [{"id": view.name} | of for view, of in zip(views, cells, strict=True)]
+    return {key: np.repeat([row[key] for row in rows], each) for key in rows[0]}
 
 
 def _pixel_columns(tables: BoardTables) -> dict[str, Any]:
@@ -229,8 +212,6 @@ def _pose_columns(tables: BoardTables) -> dict[str, Any]:
 
 def _camera_text(fit: BoardFit) -> str:
     """The file of a camera that was estimated."""
-    width, height = fit.size
-    values: dict[str, Any] = {name: getattr(fit.camera, name) for name in INTRINSICS}
-    values |= {"width": width, "height": height, "sigma": fit.camera_sigma}
+    values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
     words = f"# fg-calib board: estimated from {len(fit.views)} images, in px; sigma: 1 sigma of each value\n"
     return words + yaml.safe_dump(values, sort_keys=False)

@@ -12,9 +12,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.signal import correlate, correlation_lags, find_peaks
 from scipy.special import ndtr, stdtrit
 
@@ -79,9 +80,8 @@ def estimate_offset(tool: PoseStream, poses: PoseStream, stops: Sequence[tuple[f
         offsets, weights = offsets[good], weights[good]
     n = len(offsets)
     if n < MIN_MOVES:
-        raise InputError(
-            place, f"{n} moves between stops that show the offset", f"at least {MIN_MOVES}", "see --offset"
-        )
+        found = f"{n} moves between stops that show the offset"
+        raise InputError(place, found, f"at least {MIN_MOVES}", "see --offset")
     mean = float(np.average(offsets, weights=weights))
     variance = n / (n - 1) * np.sum((weights * (offsets - mean)) ** 2) / np.sum(weights) ** 2  # for any weights
     student = stdtrit(n - 1, ndtr(1.0))  # half the interval of 68 %: of few moves the scatter is hardly known
@@ -96,7 +96,6 @@ def _align_speeds(tool: PoseStream, poses: PoseStream) -> tuple[float, float, tu
 
     Of several that fit, the one nearest to the offset by times of receipt is taken.
     """
-    expected = tool.source.lag - poses.source.lag
     span = max(np.ptp(tool.time), np.ptp(poses.time))
     step = max(period(tool.time), period(poses.time), 0.01, float(span) / MAX_GRID)
     found = [_correlate(*(_speed(stream, values, step) for stream, values in zip((tool, poses), pair, strict=True)))
@@ -106,7 +105,7 @@ def _align_speeds(tool: PoseStream, poses: PoseStream) -> tuple[float, float, tu
     top = float(correlation.max())
     peaks, _ = find_peaks(np.concatenate([[-2.0], correlation, [-2.0]]), height=top - 0.5 * (1.0 - top) - 0.01)
     peaks -= 1
-    chosen = peaks[np.argmin(np.abs(lags[peaks] - expected))]
+    chosen = peaks[np.argmin(np.abs(lags[peaks] - (tool.source.lag - poses.source.lag)))]
     same = np.abs(lags[peaks] - lags[chosen]) < 0.5  # ripples of one peak
     chosen = peaks[same][np.argmax(correlation[peaks[same]])]
     return float(lags[chosen]), float(correlation[chosen]), tuple(lags[peaks[~same]].tolist())
@@ -143,65 +142,58 @@ def _correlate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
 # --- moves ------------------------------------------------------------------------------------------------------------
 
 
-class _Fit(NamedTuple):
-    """The offset that a quantity gives on one move, [s], and its weight: information over the mean square residual."""
-
-    offset: float
-    weight: float
-
-
 def _fit_move(
     tool: PoseStream, poses: PoseStream, before: tuple[float, float], after: tuple[float, float], coarse: float
-) -> _Fit | None:
-    """Weighted mean of the offsets by positions and by orientations; None where neither shows the move."""
-    measured_time = poses.time - coarse
-    found = [_fit(tool.time, a, measured_time, b, before, after) for a, b in _quantities(tool, poses)]
+) -> tuple[float, float] | None:
+    """Offset by positions and by orientations on one move, and its weight; None where neither shows the move."""
+    time = poses.time - coarse
+    found = [_fit(tool.time, a, time, b, before, after) for a, b in _quantities(tool, poses)]
     fits = [fit for fit in found if fit is not None]
     if not fits:
         return None
     offsets, weights = np.transpose(fits)
-    return _Fit(coarse + float(np.average(offsets, weights=weights)), float(weights.sum()))
+    return coarse + float(np.average(offsets, weights=weights)), float(weights.sum())
 
 
 def _fit(
     tool_time: Floats, tool: Floats, time: Floats, values: Floats, before: tuple[float, float],
     after: tuple[float, float],
-) -> _Fit | None:  # fmt: skip
-    """Least squares of the offset on one move by one quantity; None where it moves too little or was not seen."""
-    begin, end = before[1] - MARGIN_S, after[0] + MARGIN_S
-    wide = _progress(tool_time, tool, before, after, (begin - 1.0, end + 1.0))
-    seen = _progress(time, values, before, after, (begin, end))
-    if wide is None or seen is None or len(seen[0]) < 10 or np.diff(seen[0]).max() > 0.25 * (end - begin):
-        return None
-    slope, offset = np.gradient(wide[1], wide[0], axis=0), 0.0
-    for _ in range(20):
-        g = _interpolate(seen[0] - offset, wide[0], slope)
-        residual = seen[1] - _interpolate(seen[0] - offset, *wide)
-        information = float(np.sum(g * g))
-        change = -float(np.sum(g * residual)) / max(information, 1e-12)
-        offset += change
-        if abs(offset) > 0.5 * (end - begin):
-            return None
-        if abs(change) < 1e-7:
-            return _Fit(offset, information / max(float(np.mean(residual**2)), 1e-18))
-    return None
+) -> tuple[float, float] | None:  # fmt: skip
+    """Least squares of the offset on one move by one quantity, and its weight: information over the mean square.
 
-
-def _progress(
-    time: Floats, values: Floats, before: tuple[float, float], after: tuple[float, float], within: tuple[float, float]
-) -> tuple[Floats, Floats] | None:
-    """Times, shape (n,), and distances from where a move began and from where it ends, shape (n, 2), over its length.
-
-    None where the stops were not seen, or are one place.
+    Compared are the distances from where the move began and from where it ends, over its length. None where the tool
+    moves too little or was not seen.
     """
-    (a, b), (c, d), (e, f) = (np.searchsorted(time, span) for span in (before, after, within))
-    if min(b - a, d - c, f - e) < 3:
+    begin, end = before[1] - MARGIN_S, after[0] + MARGIN_S
+    inside = slice(*np.searchsorted(time, (begin, end)))
+    seen, measured = time[inside], values[inside]
+    tool_ends, ends = _ends(tool_time, tool, before, after), _ends(time, values, before, after)
+    if tool_ends is None or ends is None or len(seen) < 10 or np.diff(seen).max() > 0.25 * (end - begin):
         return None
-    ends = np.stack([values[a:b].mean(axis=0), values[c:d].mean(axis=0)])
-    length = float(np.linalg.norm(ends[1] - ends[0]))
-    if length < MIN_MOVE:
+
+    def residual(offset: Floats) -> Floats:
+        predicted = _interpolate(seen - offset, tool_time, tool)
+        return (_progress(predicted, tool_ends) - _progress(measured, ends)).ravel()
+
+    found: Any = least_squares(residual, 0.0, method="lm", x_scale=1e-3)
+    if not found.success or abs(found.x[0]) > 0.5 * (end - begin):
         return None
-    return time[e:f], np.linalg.norm(values[e:f, None, :] - ends, axis=2) / length
+    return float(found.x[0]), float(np.sum(found.jac**2)) / max(float(np.mean(found.fun**2)), 1e-18)
+
+
+def _ends(time: Floats, values: Floats, before: tuple[float, float], after: tuple[float, float]) -> Floats | None:
+    """Means at the stops before and after a move, shape (2, k); None where they were not seen, or are one place."""
+    stops = [values[slice(*np.searchsorted(time, stop))] for stop in (before, after)]
+    if min(map(len, stops)) < 3:
+        return None
+    ends = np.stack([stop.mean(axis=0) for stop in stops])
+    return ends if np.linalg.norm(ends[1] - ends[0]) >= MIN_MOVE else None
+
+
+def _progress(values: Floats, ends: Floats) -> Floats:
+    """Distances from both ends of a move over its length, shape (n, 2)."""
+    far: Floats = np.linalg.norm(values[:, None] - ends, axis=2) / np.linalg.norm(ends[1] - ends[0])
+    return far
 
 
 def _interpolate(at: Floats, time: Floats, values: Floats) -> Floats:

@@ -20,19 +20,26 @@ from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_CONFIGURATIONS, OF_PAIRS, Tab
 from fg_calib.measurements import COVARIANCE, INSTRUMENTS
 from fg_calib.robot import Robot
 
-_TABLES = (".csv", ".parquet", ".pq")
+_ENDINGS = {
+    **dict.fromkeys((".csv", ".parquet", ".pq"), "table"),
+    **dict.fromkeys((".urdf", ".xacro"), "robot"),
+    **dict.fromkeys((".yaml", ".yml"), "yaml"),
+}
+"""What files hold, by their ending."""
 
 _UNIT = r"um|mm|cm|m|inch|in|mrad|rad|radians|degrees|deg|°|px"
 _HEADER = re.compile(rf"^(?P<name>.*?\S)(?:\s*[\[(]\s*(?P<bracket>{_UNIT})\s*[\])]|[_\s](?P<suffix>{_UNIT}))$", re.I)
 _SPELLINGS = {"inch": "in", "radians": "rad", "degrees": "deg", "°": "deg"}
-_JOINT = re.compile(r"^(?:actual[ _])?(?:q|j|a|axis|joint|theta|th)[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)$")
-_SYNONYMS = {
-    **{f"{stem}{axis}": axis for axis in "xyz" for stem in ("pos_", "position_", "p", "tcp_", "t")},
-    **{f"{stem}{axis}": f"q{axis}" for axis in "xyzw" for stem in ("q_", "quat_", "orientation_")},
-    **dict.fromkeys(("reflector", "smr", "marker"), "target"),
-    **{"configuration": "id", "config": "id", "dist": "distance", "length": "distance"},
-}
-"""Known columns by other names that tables have for them."""
+
+_OTHER_NAMES = (
+    (r"(?:actual[ _])?(?:q|j|a|axis|joint|theta|th)[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)", r"q\1"),
+    (r"(?:pos_|position_|p|tcp_|t)([xyz])", r"\1"),
+    (r"(?:q_|quat_|orientation_)([xyzw])", r"q\1"),
+    ("reflector|smr|marker", "target"),
+    ("configuration|config", "id"),
+    ("dist|length", "distance"),
+)
+"""Patterns of other names that tables have for columns, and the known name; joints may count from 0."""
 
 _MODELS: dict[str, Model] = {
     **{"u": "pixels", "board": "board", COVARIANCE[0]: "board", "anchor": "anchor", "plane": "plane"},
@@ -46,8 +53,11 @@ _OTHER_MODELS = {
     "orientation": "or rotation, which needs no frame",
 }
 
-_BIG_ANGLE, _BIG_LENGTH = 13.0, 30.0
-"""Joint readings beyond two turns in rad are in deg; places farther than this in m are in mm."""
+_UNITS = {"length": (LENGTHS, "m", "mm", 30.0), "angle": (ANGLES, "rad", "deg", 13.0)}
+"""Units of each kind, the one that is guessed, and the one that is guessed where a value is larger than that."""
+
+_GUESSES = {"orientation": ("angle", 2e-4), "angle": ("angle", 2e-4), "pixel": ("", 0.2)}
+"""Noise to start from by kind, [rad] or [px]; 1e-4 m of others."""
 
 _TEMPLATE = """\
 # A calibration job, written by fg-calib init. Lines with DECIDE are yours to look at; `fg-calib inspect` says what this
@@ -62,12 +72,9 @@ noise: {noise}
 
 # The rest as it is by default:
 # pairing: star        # of models of pairs: star | chain | all | {{random: 3000, seed: 0}}
-# targets: {{smr1: {{x: 0.0, y: 0.0, z: {target}}}}}   # where targets are on the tool, if known
-# anchors: {{bolt: {{x: {anchor}, y: 0.0, z: 0.0}}}}   # where anchors are from the base, if known
+# targets: {{smr1: {{x: 0.0, y: 0.0, z: {target}}}}}   # where targets are on the tool, if known; anchors: from the base
 # loss: none           # huber | cauchy | geman-mcclure | gnc where there are gross errors
 # gauge: prior         # what data do not determine: priors fix it; keep: it stays at nominal; none
-# encoder: propagated  # estimated: the true joint values too
-# pair_errors: shared  # independent: pairs of one configuration share no errors
 # A column split with `test` in some rows keeps them out of the fit, to check the prediction.
 """
 
@@ -129,8 +136,8 @@ class _Recognised:
 # --- a table ----------------------------------------------------------------------------------------------------------
 
 
-def _recognise(path: Path, robot: Robot) -> tuple[_Recognised, bool]:
-    """What a table holds, and whether it is one of pairs.
+def _recognise(path: Path, robot: Robot) -> _Recognised:
+    """What a table holds.
 
     Raises:
         InputError: It cannot be read, is neither of configurations nor of pairs, or mixes units.
@@ -140,38 +147,46 @@ def _recognise(path: Path, robot: Robot) -> tuple[_Recognised, bool]:
     bare = [match["name"].lower() if match else c.lower() for match, c in zip(headers, table.columns, strict=True)]
     stated = [(match["bracket"] or match["suffix"]).lower() if match else "" for match in headers]
     joints = _find_joints(bare, robot)
-    is_pairs = not joints and {"a", "b"} <= {column.lower() for column in table.columns}
+    is_pairs = not joints and {"a", "b"} <= set(bare)
     if not joints and not is_pairs:
         numbered = "q1" if robot.n_joints == 1 else f"q1 to q{robot.n_joints}"
         names = ", ".join(joint.name for joint in robot.joints)
         expected = f"columns {numbered}, or the joints' names {names}; or a and b of pairs"
         hint = f"the columns are {', '.join(table.columns)}"
         raise InputError(table.name, "neither joint readings nor pairs", expected, hint)
-    known, found = names_of(OF_PAIRS.values()) if is_pairs else KNOWN, dict[str, int]()
-    for k in sorted(set(range(len(bare))) - set(joints.values()), key=lambda k: table.columns[k] not in known):
-        name = table.columns[k].lower() if is_pairs else bare[k] if bare[k] in known else _SYNONYMS.get(bare[k], "")
-        if name in known:
-            found.setdefault(name, k)
-    kinds = {name: of.unit for of in (*OF_CONFIGURATIONS.values(), *OF_PAIRS.values()) for name in of.names}
+    sets = (OF_PAIRS if is_pairs else OF_CONFIGURATIONS).values()
+    known, every = names_of(sets), dict(joints)
+    for k in sorted(range(len(bare)), key=lambda k: table.columns[k] not in known):
+        name = bare[k] if bare[k] in known else _known_name(bare[k])
+        if name in known and k not in joints.values():
+            every.setdefault(name, k)
+    kinds = {name: of.unit for of in sets for name in of.names}
     kinds |= {n: "length" if joint.prismatic else "angle" for n, joint in zip(joints, robot.joints, strict=False)}
-    every, units, guessed = joints | found, dict[str, str](), list[str]()
-    for kind, known_units in (("length", LENGTHS), ("angle", ANGLES)):
-        of_kind = [(n, k) for n, k in every.items() if kinds.get(n) == kind]
-        there = {_SPELLINGS.get(stated[k], stated[k]) for _, k in of_kind if stated[k]}
-        if len(there) > 1 or not there <= known_units.keys():
-            raise InputError(table.name, f"{kind}s in {', '.join(sorted(there))}", f"one of {', '.join(known_units)}")
+    units, guessed = dict[str, str](), list[str]()
+    for kind, (possible, *_) in _UNITS.items():
+        of_kind = {name: k for name, k in every.items() if kinds.get(name) == kind}
+        there = {_SPELLINGS.get(stated[k], stated[k]) for k in of_kind.values() if stated[k]}
+        if len(there) > 1 or not there <= possible.keys():
+            raise InputError(table.name, f"{kind}s in {', '.join(sorted(there))}", f"one of {', '.join(possible)}")
         if of_kind:
-            units[kind] = there.pop() if there else _guess_unit(table, kind, dict(of_kind))
-            guessed += [kind] if not any(stated[k] for _, k in of_kind) else []
+            units[kind] = there.pop() if there else _guess_unit(table, kind, of_kind)
+            guessed += [kind] if not any(stated[k] for k in of_kind.values()) else []
+    present = tuple(name for name in every if name not in joints)
     return _Recognised(
         path=path,
-        model=None if is_pairs else _find_model(set(found)),
-        present=tuple(found),
+        model=None if is_pairs else _find_model(set(present)),
+        present=present,
         columns={name: table.columns[k] for name, k in every.items() if name != table.columns[k]},
         units=units,
         guessed=tuple(guessed),
         unused=tuple(c for k, c in enumerate(table.columns) if k not in every.values()),
-    ), is_pairs
+    )
+
+
+def _known_name(header: str) -> str:
+    """The known name of a column by another one; empty if there is none."""
+    matches = ((re.fullmatch(pattern, header), name) for pattern, name in _OTHER_NAMES)
+    return next((match.expand(name) for match, name in matches if match), "")
 
 
 def _find_joints(bare: Sequence[str], robot: Robot) -> dict[str, int]:
@@ -180,29 +195,27 @@ def _find_joints(bare: Sequence[str], robot: Robot) -> dict[str, int]:
     names = [joint.name for joint in robot.joints]
     if not KNOWN & set(names) and all(name.lower() in place for name in names):
         return {name: place[name.lower()] for name in names}
-    numbered = {int(match[1]): k for name, k in place.items() if (match := _JOINT.match(name))}
-    first = 0 if 0 in numbered else 1
-    wanted = range(first, first + robot.n_joints)
-    return {f"q{i - first + 1}": numbered[i] for i in wanted} if set(numbered) == set(wanted) else {}
+    numbered = {name: k for header, k in place.items() if re.fullmatch(r"q\d+", name := _known_name(header))}
+    first = 0 if "q0" in numbered else 1
+    wanted = [f"q{first + i}" for i in range(robot.n_joints)]
+    return {f"q{i + 1}": numbered[n] for i, n in enumerate(wanted)} if set(numbered) == set(wanted) else {}
 
 
 def _guess_unit(table: Table, kind: str, columns: Mapping[str, int]) -> str:
     """The unit of columns whose headers state none, by their largest value."""
     given = [table.columns[k] for name, k in columns.items() if not name.startswith("sigma_")]
-    largest = np.nanmax(np.abs(table.numbers(given, optional=True)), initial=0.0) if given else 0.0
-    if kind == "length":
-        return "mm" if largest > _BIG_LENGTH else "m"
-    return "deg" if largest > _BIG_ANGLE else "rad"
+    _, usual, other, limit = _UNITS[kind]
+    large = given and np.nanmax(np.abs(table.numbers(given, optional=True)), initial=0.0) > limit
+    return other if large else usual
 
 
 def _find_model(present: set[str]) -> Model | None:
     """The model whose columns a table of configurations has."""
-    for column, model in _MODELS.items():
-        if column in present:
-            return model
-    own = [model for model, i in INSTRUMENTS.items() if set(i.generic_columns) & present]
+    models = [model for column, model in _MODELS.items() if column in present]
+    models += [model for model, i in INSTRUMENTS.items() if set(i.generic_columns) & present]
     position, orientation = {"x", "y", "z"} <= present, bool({"qw", "roll", "rx"} & present)
-    return own[0] if own else {of: model for model, of in POSE_MODELS.items()}.get((orientation, position))
+    models += [model for model, of in POSE_MODELS.items() if of == (orientation, position)]
+    return next(iter(models), None)
 
 
 # --- the job ----------------------------------------------------------------------------------------------------------
@@ -218,74 +231,67 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     Raises:
         InputError: There is no robot or no table among them, several of what there may be one, or one cannot be used.
     """
-    robots, paths, cameras = _sort(files)
-    robot = read_robot(robots[0])
-    tables = _with_pairs([_recognise(path, robot) for path in paths])
+    found = _sort(files)
+    robot = read_robot(found["robot"][0])
+    tables = _with_pairs([_recognise(path, robot) for path in found["table"]])
     for table in tables:
         if table.model is None:
             hint = f"its other columns are {', '.join(table.unused)}" if table.unused else ""
             raise InputError(table.path.name, "joint readings alone", "what was measured at them, or pairs", hint)
-        if "camera" in INSTRUMENTS[table.model].options and not cameras:
+        if "camera" in INSTRUMENTS[table.model].options and not found["camera"]:
             raise InputError(table.path.name, "images of a camera that is not among the files", "camera.yaml too")
     every, units = [one for table in tables for one in table.tables], {"length": "m", "angle": "rad"}
     for one in reversed(every):  # those of the first table
         units |= one.units
     guessed = sorted({kind for one in every for kind in one.guessed})
+    factors = {"": 1.0, "length": LENGTHS[units["length"]], "angle": ANGLES[units["angle"]]}
+    sigmas = {kind: _GUESSES.get(kind, ("length", 1e-4)) for table in tables for kind in table.noise}
+    noise = {kind: float(f"{sigma / factors[of]:.2g}") for kind, (of, sigma) in sigmas.items()}
     arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
     tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
-    length, angle = LENGTHS[units["length"]], ANGLES[units["angle"]]
-    size = {"orientation": 2e-4 / angle, "angle": 2e-4 / angle, "pixel": 0.2}
-    noise = {kind: float(f"{size.get(kind, 1e-4 / length):.2g}") for table in tables for kind in table.noise}
     return _TEMPLATE.format(
-        robot=_path(robots[0], out.parent),
+        robot=_path(found["robot"][0], out.parent),
         notes=_NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool)),
-        entries="\n".join(line for table in tables for line in _entry(table, cameras, units, out.parent)),
+        entries="\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent)),
         units=_flow(units),
         why=f"DECIDE: {' and '.join(guessed)} guessed from the values' sizes" if guessed else "as the headers say",
         noise=_flow({**noise, "joint": 0.0, "estimate": True}),
-        target=float(f"{0.1 / length:.3g}"),
-        anchor=float(f"{1.0 / length:.3g}"),
+        target=float(f"{0.1 / factors['length']:.3g}"),
     )
 
 
-def _sort(files: Sequence[Path]) -> tuple[list[Path], list[Path], list[Path]]:
+def _sort(files: Sequence[Path]) -> dict[str, list[Path]]:
     """Files of the robot, of tables and of the camera.
 
     Raises:
         InputError: See `draft_job`.
     """
-    robots, tables, cameras = list[Path](), list[Path](), list[Path]()
+    found: dict[str, list[Path]] = {"robot": [], "table": [], "camera": []}
     for file in files:
-        ending = file.suffix.lower()
-        if ending in _TABLES:
-            tables.append(file)
-        elif ending in (".urdf", ".xacro"):
-            robots.append(file)
-        elif ending in (".yaml", ".yml"):
+        kind = _ENDINGS.get(file.suffix.lower(), "")
+        if kind == "yaml":
             keys = read_yaml(file).keys()
-            if not {"joints", "urdf", "fx"} & keys:
-                what = "a job" if "measurements" in keys else f"keys {', '.join(map(str, keys))}"
-                raise InputError(file.name, what, "a robot (joints, or urdf) or a camera (fx, fy, cx, cy)")
-            (cameras if "fx" in keys else robots).append(file)
-        else:
-            expected = f"robot.yaml, a .urdf, camera.yaml, or a table: {', '.join(_TABLES)}"
-            raise InputError(str(file), f"ending {ending!r}", expected)
-    for found, what in ((robots, "robot file"), (cameras, "camera")):
-        if len(found) > 1:
-            raise InputError("init", f"several {what}s: {', '.join(f.name for f in found)}", "one")
-    if not robots or not tables:
-        missing, expected = ("table", "poses.csv") if robots else ("robot", "robot.yaml or a URDF")
-        raise InputError("init", f"no {missing} among the files", f"one, such as {expected}")
-    return robots, tables, cameras
+            kind = "camera" if "fx" in keys else "robot" if {"joints", "urdf"} & keys else ""
+        if not kind:
+            expected = "robot.yaml (joints, or urdf), a .urdf, camera.yaml (fx), or a table: .csv, .parquet"
+            raise InputError(file.name, "neither robot, camera nor table", expected)
+        found[kind].append(file)
+    for kind, example in (("robot", "robot.yaml or a URDF"), ("table", "poses.csv")):
+        if not found[kind]:
+            raise InputError("init", f"no {kind} among the files", f"one, such as {example}")
+    for kind in ("robot", "camera"):
+        if len(found[kind]) > 1:
+            raise InputError("init", f"several {kind}s: {', '.join(f.name for f in found[kind])}", "one")
+    return found
 
 
-def _with_pairs(recognised: Sequence[tuple[_Recognised, bool]]) -> list[_Recognised]:
+def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
     """Tables of configurations, that first which the pairs are of: at which nothing else was measured, if any.
 
     Raises:
         InputError: There are several tables of pairs, or one alone.
     """
-    pairs, tables = ([one for one, is_pairs in recognised if is_pairs == which] for which in (True, False))
+    pairs, tables = ([one for one in recognised if ("a" in one.present) == which] for which in (True, False))
     if len(pairs) > 1:
         raise InputError("init", f"several tables of pairs: {', '.join(t.path.name for t in pairs)}", "one")
     if not pairs:

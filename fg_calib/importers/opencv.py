@@ -24,6 +24,12 @@ _SEARCHED = 1600
 board the search takes seconds, or minutes where there is much texture."""
 
 
+UNDETERMINED = ("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
+
+MIN_IMAGES = 3
+"""From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
+the lens."""
+
 MIN_CORNERS = 6
 """Of a ChArUco board: four determine its pose, and more its accuracy."""
 
@@ -81,7 +87,7 @@ class CalibrationBoard:
 
 
 @cache
-def opencv() -> Any:
+def load_opencv() -> Any:
     """The module `cv2`.
 
     Raises:
@@ -106,7 +112,7 @@ def decode(content: bytes, name: str) -> Image:
     Raises:
         InputError: OpenCV cannot read it.
     """
-    cv2 = opencv()
+    cv2 = load_opencv()
     try:
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         image: Image | None = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
@@ -119,7 +125,7 @@ def decode(content: bytes, name: str) -> Image:
 
 def dictionaries() -> list[str]:
     """Names of the dictionaries of markers."""
-    return sorted(name for name in dir(opencv().aruco) if name.startswith("DICT_"))
+    return sorted(name for name in dir(load_opencv().aruco) if name.startswith("DICT_"))
 
 
 def charuco_board(board: CalibrationBoard, place: str) -> Any:
@@ -132,7 +138,7 @@ def charuco_board(board: CalibrationBoard, place: str) -> Any:
     Raises:
         InputError: Its dictionary has fewer markers than it has white squares.
     """
-    cv2 = opencv()
+    cv2 = load_opencv()
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     needed, there = board.columns * board.rows // 2, len(dictionary.bytesList)
     if needed > there:
@@ -156,7 +162,7 @@ def find_corners(image: Image, board: CalibrationBoard) -> tuple[Integers, Float
     Returns:
         Which corners, numbered row by row, shape (n,), and where they are, (n, 2), [px]; or why there are none.
     """
-    cv2 = opencv()
+    cv2 = load_opencv()
     try:
         found = _charuco(cv2, image, board) if board.type == "charuco" else _checkerboard(cv2, image, board)
     except cv2.error:
@@ -236,7 +242,7 @@ def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats,
     Returns:
         Axes of the plane in the camera's frame, (3, 3), and its origin, (3,), [m]; one or two poses, or none.
     """
-    cv2 = opencv()
+    cv2 = load_opencv()
     K, lens = _matrices(camera)
     places = np.column_stack([points, np.zeros(len(points))])
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
@@ -252,7 +258,7 @@ def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats,
     return found
 
 
-def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera | None:
+def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
     """The camera that explains views of a plane best (Zhang 2000, *A flexible new technique for camera calibration*).
 
     Args:
@@ -260,19 +266,21 @@ def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int
         uv: Where they are seen, [px].
         size: Width and height of the images, [px].
 
-    Returns:
-        The camera, or None where OpenCV finds none.
+    Raises:
+        InputError: There are too few views, or they do not determine it.
     """
-    cv2 = opencv()
+    if len(points) < MIN_IMAGES:
+        expected = f"at least {MIN_IMAGES} to estimate a camera from"
+        raise InputError("images", f"{len(points)} with a board", expected)
+    cv2 = load_opencv()
     places = [np.column_stack([p, np.zeros(len(p))]).astype(np.float32) for p in points]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     try:
         seen = [image.astype(np.float32) for image in uv]
         _, K, lens, _, _ = cv2.calibrateCamera(places, seen, size, None, None, criteria=criteria)
-    except cv2.error:
-        return None
-    values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]
-    return Camera(*map(float, values)) if np.isfinite(values).all() else None
+        return Camera(*map(float, [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]))
+    except (cv2.error, InputError):
+        raise InputError(*UNDETERMINED) from None
 
 
 def _matrices(camera: Camera) -> tuple[Floats, Floats]:
@@ -289,5 +297,5 @@ def camera_derivatives(camera: Camera, points: Floats) -> Floats:
         points: Points in its frame, in front of it, shape (n, 3), [m].
     """
     K, lens = _matrices(camera)
-    J = opencv().projectPoints(points, np.zeros(3), np.zeros(3), K, lens)[1]
+    J = load_opencv().projectPoints(points, np.zeros(3), np.zeros(3), K, lens)[1]
     return np.asarray(J[:, 6:15].reshape(len(points), 2, 9), dtype=np.float64)

@@ -2,7 +2,14 @@
 
 A stop is where all joints stay within a few scatters for long enough; its beginning and end, in which the arm may still
 swing, are left out. The sigma is that of the mean, from the scatter within the stop, with the autocorrelation of all
-stops (`recording`).
+stops.
+
+Of n samples with autocorrelation rho_k the mean of samples of variance s^2 has the variance
+
+    s^2 tau / n,    tau = 1 + 2 sum_k (1 - k / n) rho_k
+
+(integrated autocorrelation time, in samples; Sokal 1997, *Monte Carlo Methods in Statistical Mechanics*, Sec. 3). tau
+is estimated from all standstills together, as one is too short. As s is estimated too, the variance is Student's.
 
 Note:
     Errors that are constant during a stop do not scatter: those of the instrument in one place, and noise that is
@@ -14,21 +21,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import toeplitz
+from scipy.optimize import brute
 from scipy.spatial.transform import Rotation
 
 from fg_calib.importers.clock import ClockOffset, estimate_offset
-from fg_calib.importers.recording import (
-    MIN_SIGMA,
-    JointStream,
-    PoseStream,
-    correlation_time,
-    is_slow,
-    period,
-    sigmas_of_means,
-)
+from fg_calib.importers.recording import JointStream, PoseStream, period
 from fg_calib.inputs import Floats, FrozenArrays, InputError, check_number, checked
 from fg_calib.io import joint_columns, require_own_csv, write_csv
 from fg_calib.robot import Robot
@@ -46,8 +47,20 @@ MAX_SCATTER_RATIO = 10.0
 """Stops whose poses scatter by more than so many times the median are left out: they drift, swing or are hidden."""
 
 
-@dataclass(frozen=True)
-class Skipped:
+MIN_SIGMA = 1e-6
+"""1 sigma of a mean, at least, [m] or [rad]: poses without any scatter are not exact either."""
+
+MAX_BLOCKS = 64
+"""Blocks at most in which the samples of a stop are averaged before their correlation is estimated."""
+
+MIN_GAIN = 12.0
+"""Gain in twice the log-likelihood from which noise counts as correlated: white noise reaches it once in 400 times."""
+
+MAX_TIME_SHARE = 1.0 / 6.0
+"""Share of a stop that the correlation time may have: averaging slower noise reduces it too little to be relied on."""
+
+
+class Skipped(NamedTuple):
     """A standstill that gave no row: its name, when it began, [s] from the first joint reading, and why not."""
 
     id: str
@@ -62,13 +75,13 @@ class Scatter:
     Attributes:
         single: Of single measurements, the median over stops of the largest component, [m] or [rad].
         mean: Sigma of a stop's mean, likewise.
-        correlation: Integrated autocorrelation time in samples, 1 for white noise.
+        correlation_samples: Integrated autocorrelation time in samples, 1 for white noise.
         slow: Whether that is so much of a stop that averaging says little.
     """
 
     single: float
     mean: float
-    correlation: float
+    correlation_samples: float
     slow: bool
 
 
@@ -80,13 +93,12 @@ class Stops(FrozenArrays):
         ids: Names, by the order of all stops that were found.
         interval: Beginning and end of what was averaged, by the joints' clock, shape (n, 2), [s].
         samples: Poses averaged, shape (n,).
-        readings: Mean joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
-        position: Mean world_p_tool, shape (n, 3), [m].
-        sigma_position: Sigma of it along the world's axes, shape (n, 3), [m].
-        rotation: Mean world_R_tool, shape (n, 3, 3); None where orientations are not measured.
-        sigma_orientation: Sigma of it about the tool's axes, shape (n, 3), [rad]; None likewise.
+        means: Of joint readings (`joint`), shape (n, n_joints), [rad] (prismatic: [m]), of world_p_tool (`position`),
+            shape (n, 3), [m], and where orientations are measured of world_R_tool (`orientation`), shape (n, 3, 3).
+        sigmas: Sigma of each mean: of positions along the world's axes, shape (n, 3), [m]; of orientations about the
+            tool's axes, shape (n, 3), [rad].
         skipped: Stops that gave no row.
-        offset: The offset of the clocks as estimated; None where it could not be.
+        offset: The offset of the clocks as estimated; None where one was specified.
         applied: The offset that was used, [s].
         scatter: Of `position`, `orientation` and `joint`.
     """
@@ -94,15 +106,26 @@ class Stops(FrozenArrays):
     ids: tuple[str, ...]
     interval: Floats
     samples: Floats
-    readings: Floats
-    position: Floats
-    sigma_position: Floats
-    rotation: Floats | None
-    sigma_orientation: Floats | None
+    means: dict[str, Floats]
+    sigmas: dict[str, Floats]
     skipped: tuple[Skipped, ...]
     offset: ClockOffset | None
     applied: float
     scatter: dict[str, Scatter]
+
+
+class _Stop(NamedTuple):
+    """What was measured during one stop: means, and measurements minus these, by quantity, [m] and [rad].
+
+    Rotations are relative to their mean, about its axes.
+    """
+
+    id: str
+    span: tuple[float, float]
+    n_readings: int
+    n_poses: int
+    means: dict[str, Floats]
+    residuals: dict[str, Floats]
 
 
 def average_stops(
@@ -128,57 +151,42 @@ def average_stops(
         InputError: The arm never stands still, the offset cannot be estimated or is too large, or no stop has poses.
     """
     check_number("still", still, above=True)
-    found = find_standstills(joints, robot, still)
-    long = [(a, b) for a, b in found if b - a >= still]
-    if not long:
-        hint = f"the longest pause is {max(b - a for a, b in found):.2g} s" if found else ""
+    pauses = find_standstills(joints, robot, still)
+    spans = [_inner(span) for span in pauses if span[1] - span[0] >= still]
+    if not spans:
+        hint = f"the longest pause is {max(b - a for a, b in pauses):.2g} s" if pauses else ""
         expected = "the arm at rest for a while, several times"
         raise InputError(f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
-    estimate, applied = _offset(joints, poses, robot, [_inner(stop) for stop in long], offset, most_offset)
-    stops = [_Samples.of(f"stop{k + 1}", joints, poses, _inner(stop), applied) for k, stop in enumerate(found)]
-    reasons = {}
-    for sample, (begin, end) in zip(stops, found, strict=True):
-        few = min((len(sample.readings), "joint readings"), (len(sample.position), "poses"))
-        if end - begin < still:
-            reasons[sample.id] = f"{end - begin:.2g} s, shorter than {still:g} s"
-        elif few[0] < MIN_SAMPLES:
-            reasons[sample.id] = f"{few[0]} {few[1]}, fewer than {MIN_SAMPLES}"
-    residuals = {sample.id: sample.residuals() for sample in stops if sample.id not in reasons}
-    for kind in ("position", "orientation"):
-        rms = {name: float(np.sqrt(np.mean(of[kind] ** 2))) for name, of in residuals.items() if kind in of}
-        usual = max(float(np.median(list(rms.values()))), MIN_SIGMA) if rms else 0.0
-        for name, size in rms.items():
-            if size > MAX_SCATTER_RATIO * usual:
-                reasons.setdefault(name, f"the {kind} scatters {size / usual:.0f} times as much as usual")
-    good = [sample for sample in stops if sample.id not in reasons]
-    skipped = [Skipped(s.id, s.begin - float(joints.time[0]), reasons[s.id]) for s in stops if s.id in reasons]
+    estimate = None if offset is not None else estimate_offset(joints.tool_path(robot), poses, spans)
+    if estimate is not None and most_offset is not None and abs(estimate.seconds) > most_offset:
+        found = f"an offset of {estimate.seconds:.4g} +- {estimate.sigma:.2g} s against the joints' clock"
+        raise InputError(f"topic {poses.source.topic}", found, f"at most {most_offset:g} s")
+    applied = offset if estimate is None else estimate.seconds
+    assert applied is not None
+    stops = [_average(f"stop{k + 1}", joints, poses, span, applied) for k, span in enumerate(spans)]
+    reasons = _reasons_to_skip(stops)
+    good = [stop for stop in stops if stop.id not in reasons]
+    origin = float(joints.time[0])
+    skipped = tuple(Skipped(s.id, s.span[0] - origin, reasons[s.id]) for s in stops if s.id in reasons)
     if not good:
         hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
-        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(found)} can be used", hint=hint)
-    return _average(good, [residuals[s.id] for s in good], skipped, estimate, applied)
-
-
-def _offset(
-    joints: JointStream, poses: PoseStream, robot: Robot, stops: Sequence[tuple[float, float]],
-    specified: float | None, most: float | None,
-) -> tuple[ClockOffset | None, float]:  # fmt: skip
-    """The offset of the clocks as estimated, and the one that is used: the specified one, where there is one."""
-    if most is not None:
-        check_number("most offset", most)
-    try:
-        estimate = estimate_offset(joints.tool_path(robot), poses, stops)
-    except InputError:
-        if specified is None:
-            raise
-        return None, specified
-    if most is not None and abs(estimate.seconds) > most:
-        found = f"an offset of {estimate.seconds:.4g} +- {estimate.sigma:.2g} s against the joints' clock"
-        raise InputError(f"topic {poses.source.topic}", found, f"at most {most:g} s")
-    return estimate, estimate.seconds if specified is None else specified
+        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(stops)} can be used", hint=hint)
+    scatter, sigmas = _scatter(good)
+    return Stops(
+        ids=tuple(stop.id for stop in good),
+        interval=np.array([stop.span for stop in good]),
+        samples=np.array([float(stop.n_poses) for stop in good]),
+        means={kind: np.array([stop.means[kind] for stop in good]) for kind in good[0].means},
+        sigmas=sigmas,
+        skipped=skipped,
+        offset=estimate,
+        applied=applied,
+        scatter=scatter,
+    )
 
 
 def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tuple[float, float]]:
-    """Beginning and end of each time in which no joint moves, [s]; those of half of `still` and more.
+    """Beginning and end of each pause in which no joint moves, [s]; those of half of `still` and more.
 
     In windows of that length the standard deviation of every joint is within a few times its scatter: that of the
     calmest windows, or what encoders may hide.
@@ -210,68 +218,120 @@ def _inner(stop: tuple[float, float]) -> tuple[float, float]:
     return stop[0] + trim, stop[1] - trim
 
 
-@dataclass(frozen=True)
-class _Samples:
-    """What was measured during one stop; rotations are relative to their mean, about its axes."""
-
-    id: str
-    begin: float
-    end: float
-    readings: Floats
-    position: Floats
-    rotation_vectors: Floats | None
-    rotation: Floats | None
-
-    @classmethod
-    def of(
-        cls, name: str, joints: JointStream, poses: PoseStream, stop: tuple[float, float], offset: float
-    ) -> _Samples:
-        a, b = np.searchsorted(joints.time, stop)
-        c, d = np.searchsorted(poses.time, np.asarray(stop) + offset)
-        vectors = rotation = None
-        if poses.rotation is not None and d > c:
-            single = Rotation.from_matrix(poses.rotation[c:d].copy())
-            mean = single.mean()
-            vectors, rotation = (mean.inv() * single).as_rotvec(), mean.as_matrix()
-        return cls(name, *stop, joints.readings[a:b], poses.position[c:d], vectors, rotation)
-
-    def residuals(self) -> dict[str, Floats]:
-        """Measurements minus their mean by quantity, each of shape (n, k), [m] or [rad]."""
-        values = {"position": self.position, "orientation": self.rotation_vectors, "joint": self.readings}
-        return {kind: v - v.mean(axis=0) for kind, v in values.items() if v is not None}
+def _average(name: str, joints: JointStream, poses: PoseStream, span: tuple[float, float], offset: float) -> _Stop:
+    """Means of what was measured during a stop."""
+    a, b = np.searchsorted(joints.time, span)
+    c, d = np.searchsorted(poses.time, np.asarray(span) + offset)
+    if min(b - a, d - c) < MIN_SAMPLES:
+        return _Stop(name, span, int(b - a), int(d - c), {}, {})
+    values, means = {"position": poses.position[c:d]}, dict[str, Floats]()
+    if poses.rotation is not None:
+        single = Rotation.from_matrix(poses.rotation[c:d].copy())
+        means["orientation"] = single.mean().as_matrix()
+        values["orientation"] = (single.mean().inv() * single).as_rotvec()
+    values["joint"] = joints.readings[a:b]
+    residuals = {kind: v - v.mean(axis=0) for kind, v in values.items()}
+    means = {kind: v.mean(axis=0) for kind, v in values.items()} | means
+    return _Stop(name, span, int(b - a), int(d - c), means, residuals)
 
 
-def _average(
-    stops: Sequence[_Samples],
-    residuals: Sequence[dict[str, Floats]],
-    skipped: Sequence[Skipped],
-    estimate: ClockOffset | None,
-    applied: float,
-) -> Stops:
-    """Means of the stops, with their sigmas."""
+def _reasons_to_skip(stops: Sequence[_Stop]) -> dict[str, str]:
+    """Why stops give no row, by name: too few measurements, or poses that scatter far more than those of others."""
+    reasons = {}
+    for stop in stops:
+        if not stop.means:
+            n, what = min((stop.n_readings, "joint readings"), (stop.n_poses, "poses"))
+            reasons[stop.id] = f"{n} {what}, fewer than {MIN_SAMPLES}"
+    for kind in ("position", "orientation"):
+        rms = {stop.id: np.sqrt(np.mean(stop.residuals[kind] ** 2)) for stop in stops if kind in stop.residuals}
+        usual = max(np.median(list(rms.values())), MIN_SIGMA) if rms else 0.0
+        for name, size in rms.items():
+            if size > MAX_SCATTER_RATIO * usual:
+                reasons.setdefault(name, f"the {kind} scatters {size / usual:.0f} times as much as usual")
+    return reasons
+
+
+def _scatter(stops: Sequence[_Stop]) -> tuple[dict[str, Scatter], dict[str, Floats]]:
+    """Scatter, and the sigma of each stop's mean, by quantity."""
     scatter, sigma = dict[str, Scatter](), dict[str, Floats]()
-    for kind in residuals[0]:
-        of = [r[kind] for r in residuals]
+    for kind in stops[0].residuals:
+        of = [stop.residuals[kind] for stop in stops]
         tau = correlation_time(of)
         sigma[kind] = sigmas_of_means(of, tau)
         single, mean = np.median([r.std(axis=0) for r in of], axis=0), np.median(sigma[kind], axis=0)
-        slow = is_slow(tau, float(np.median([len(r) for r in of])))
+        slow = bool(tau > MAX_TIME_SHARE * np.median([len(r) for r in of]))
         scatter[kind] = Scatter(float(single.max()), float(mean.max()), tau, slow)
-    rotation = [stop.rotation for stop in stops if stop.rotation is not None]
-    return Stops(
-        ids=tuple(stop.id for stop in stops),
-        interval=np.array([(stop.begin, stop.end) for stop in stops]),
-        samples=np.array([float(len(stop.position)) for stop in stops]),
-        readings=np.array([stop.readings.mean(axis=0) for stop in stops]),
-        position=np.array([stop.position.mean(axis=0) for stop in stops]),
-        sigma_position=sigma["position"],
-        rotation=np.array(rotation) if rotation else None,
-        sigma_orientation=sigma.get("orientation"),
-        skipped=tuple(skipped),
-        offset=estimate,
-        applied=applied,
-        scatter=scatter,
-    )
+    return scatter, sigma
+
+
+# --- means of correlated samples --------------------------------------------------------------------------------------
+
+
+def correlation_time(residuals: Sequence[Floats]) -> float:
+    """Integrated autocorrelation time of noise over a stop, in samples, at least 1.
+
+    Noise is white and AR(1) together, by maximum likelihood of the steps from sample to sample, which do not depend on
+    a stop's mean. It is white where correlation gains too little likelihood (`MIN_GAIN`).
+
+    Args:
+        residuals: Of each stop, minus its mean, shape (n, k).
+    """
+    scales = [np.sqrt(np.mean(np.diff(r, axis=0) ** 2, axis=0)) for r in residuals]
+    scaled = [r / np.where(s > 0.0, s, 1.0) for r, s in zip(residuals, scales, strict=True)]  # stops count alike
+    n = int(np.median([len(r) for r in scaled]))
+    size = -(-n // MAX_BLOCKS)
+    n_blocks = n // size
+    whole = [r[: n_blocks * size].reshape(n_blocks, size, -1).mean(axis=1) for r in scaled if len(r) >= n_blocks * size]
+    steps = np.diff(np.concatenate(whole, axis=1), axis=0)  # (n_blocks - 1, n_series)
+    if n_blocks < 3 or not steps.any():
+        return 1.0
+    within = np.arange(1 - size, size)
+    lags = np.abs(size * np.arange(n_blocks)[:, None] + within)  # between samples of two blocks, (n_blocks, 2 size - 1)
+
+    most = float(np.log(20.0 * n))  # slower noise is indistinguishable from a walk
+
+    def fit(log_time: float, logit: float) -> tuple[float, float]:
+        """Twice the negative log-likelihood, and the variance of a stop's mean."""
+        white, time = 1.0 / (1.0 + np.exp(-logit)), 1.0 + np.exp(min(log_time, most))
+        rho = np.where(lags == 0, 1.0, (1.0 - white) * ((time - 1.0) / (time + 1.0)) ** lags)
+        V = toeplitz(rho @ (size - np.abs(within)) / size**2)
+        L = np.linalg.cholesky(np.diff(np.diff(V, axis=0), axis=1))
+        misfit = float(np.sum(np.linalg.solve(L, steps) ** 2))
+        cost = 2.0 * steps.shape[1] * np.log(np.diag(L)).sum() + steps.size * np.log(misfit)
+        return cost, float(V.mean()) * misfit / steps.size
+
+    def cost(x: Floats) -> float:
+        return fit(*x)[0]
+
+    (least, of_mean), white = fit(*brute(cost, ((-2.0, most), (-6.0, 4.0)), Ns=8)), fit(0.0, 50.0)
+    if white[0] - least < MIN_GAIN:
+        of_mean = white[1]
+    square = float(np.mean(np.concatenate(scaled) ** 2))  # of residuals: the variance of the mean is missing in it
+    return max(1.0, n * of_mean / (square + of_mean))
+
+
+def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
+    """Sigma of each stop's mean of correlated samples, shape (n_stops, k).
+
+    The variance of Student's t, for the scatter is estimated from the same samples: with 2 n tau / (tau^2 + 1) - 1
+    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise. The scatter of slow
+    noise is that of all stops together, as one stop hardly shows it.
+
+    Args:
+        residuals: Of each stop, minus its mean, shape (n, k).
+        tau: Integrated autocorrelation time, in samples.
+    """
+    each = np.array([len(r) for r in residuals], dtype=np.float64)[:, None]
+    square = np.array([np.mean(r**2, axis=0) for r in residuals])
+    middle = float(np.median(each))
+    if tau > MAX_TIME_SHARE * middle:
+        variance = square.mean(axis=0) * np.minimum(tau / each, 1.0) / (1.0 - min(tau / middle, 0.99))
+    else:
+        part = np.minimum(tau / each, 0.5)
+        freedom = np.maximum(2.0 * each * tau / (tau**2 + 1.0) - 1.0, 3.0)
+        variance = square * part / (1.0 - part) * (freedom / (freedom - 2.0))
+    sigma: Floats = np.maximum(np.sqrt(variance), MIN_SIGMA)
+    return sigma
 
 
 # --- the table of stops -----------------------------------------------------------------------------------------------
@@ -304,13 +364,13 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
         "begin": np.round(stops.interval[:, 0], 3),
         "seconds": np.round(np.diff(stops.interval, axis=1)[:, 0], 3),
         "samples": stops.samples.astype(np.int64),
-        **dict(zip(joint_columns(robot), stops.readings.T, strict=True)),
-        **dict(zip("xyz", stops.position.T, strict=True)),
+        **dict(zip(joint_columns(robot), stops.means["joint"].T, strict=True)),
+        **dict(zip("xyz", stops.means["position"].T, strict=True)),
     }
-    if stops.rotation is not None:
-        quaternion = Rotation.from_matrix(stops.rotation.copy()).as_quat(canonical=True)
-        columns |= {f"q{axis}": quaternion[:, k] for k, axis in enumerate("xyzw")}
-    columns |= {f"sigma_{axis}": stops.sigma_position[:, k] for k, axis in enumerate("xyz")}
-    if stops.sigma_orientation is not None:
-        columns |= {f"sigma_r{axis}": stops.sigma_orientation[:, k] for k, axis in enumerate("xyz")}
+    if "orientation" in stops.means:
+        quaternion = Rotation.from_matrix(stops.means["orientation"]).as_quat(canonical=True)
+        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    for kind, prefix in (("position", "sigma_"), ("orientation", "sigma_r")):
+        if kind in stops.sigmas:
+            columns |= {f"{prefix}{axis}": stops.sigmas[kind][:, k] for k, axis in enumerate("xyz")}
     write_csv(path, columns)

@@ -9,25 +9,19 @@ seen. A turn w of the board about its origin and a shift dt, both along the came
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.importers.opencv import CalibrationBoard, both_poses, camera_derivatives, first_camera
+from fg_calib.importers.opencv import UNDETERMINED, CalibrationBoard, both_poses, camera_derivatives, first_camera
 from fg_calib.inputs import Floats, InputError, Integers
 from fg_calib.measurements import Frames, RoomPixel
 from fg_calib.measurements.kinds import Camera
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """A camera's parameters, in the order of its covariance."""
-
-UNDETERMINED = ("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
-
-MIN_IMAGES = 3
-"""From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
-the lens."""
 
 PRIOR_RESIDUALS = 10
 """How many residuals of its own weigh as much in an image's sigma as those of all images."""
@@ -127,16 +121,20 @@ class BoardFit:
         return None if C is None else dict(zip(INTRINSICS, np.sqrt(np.diag(C)).tolist(), strict=True))
 
     @property
+    def moved_by_camera(self) -> float:
+        """Largest 1 sigma by which the error of the camera moves boards, [m]."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(view.by_camera[3:, 3:])[-1] for view in self.views)))
+
+    @property
     def findings(self) -> tuple[str, ...]:
         """Why the result is not to be trusted."""
-        found = []
-        for name in ("fx", "fy") if self.camera_sigma else ():
-            value, sigma = getattr(self.camera, name), (self.camera_sigma or {})[name]
+        found, (width, height) = [], self.size
+        for name in ("fx", "fy"):
+            value, sigma = getattr(self.camera, name), (self.camera_sigma or {}).get(name, 0.0)
             if sigma > MAX_FOCAL_SIGMA * value:
                 hint = "tilt the board by 30 degrees or so, in several directions, and fill the image with it"
                 found.append(f"the images do not determine the camera: {name} = {value:.0f} ± {sigma:.0f} px; {hint}")
-        if self.rms > MAX_RMS_SHARE * float(np.hypot(*self.size)):
-            width, height = self.size
+        if self.rms > MAX_RMS_SHARE * np.hypot(width, height):
             hint = f"is the camera that of these images of {width} x {height} px, is the board as its file says?"
             found.append(f"no poses explain the corners: residuals of {self.rms:.3g} px RMS; {hint}")
         return tuple(found)
@@ -190,7 +188,7 @@ def fit_board(
     given = camera is not None
     points = {one.name: board.corners[one.corners] for one in found}
     if camera is None:
-        camera = _camera_of(found, points, size)
+        camera = first_camera(list(points.values()), [one.uv for one in found], size)
     fits = {one.name: fit for one in found if (fit := _fit(camera, points[one.name], one.uv)) is not None}
     if not fits:
         raise InputError("images", "corners that no pose of the board explains", "images of this board by this camera")
@@ -232,14 +230,13 @@ def _view(one: Corners, fit: _Fit, variance: float, C: Floats, typical: float) -
 
 def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:
     """The better of the poses that explain some corners, and how well the other one does; None if there is none."""
-    poses = both_poses(points, uv, camera)
-    fits = sorted((_rows(camera, points, uv, R, t) for R, t in poses), key=lambda fit: fit.squares)
+    fits = [_rows(camera, points, uv, R, t) for R, t in both_poses(points, uv, camera)]
     fits = [fit for fit in fits if np.isfinite(fit.squares) and np.linalg.matrix_rank(fit.J) == 6]
     if not fits:
         return None
-    best, *others = fits
-    apart = [fit for fit in others if not np.allclose(fit.pose[0], best.pose[0], rtol=0.0, atol=1e-4)]
-    return _Fit(best.pose, best.squares, best.J, best.K, *(fit.squares for fit in apart[:1]))
+    best, *others = sorted(fits, key=lambda fit: fit.squares)
+    apart = (fit for fit in others if not np.allclose(fit.pose[0], best.pose[0], rtol=0.0, atol=1e-4))
+    return replace(best, second=min((fit.squares for fit in apart), default=np.inf))
 
 
 def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _Fit:
@@ -249,21 +246,6 @@ def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _
     rows = RoomPixel(camera).rows(at, np.column_stack([uv, points]), np.empty((n, 0)))
     K = camera_derivatives(camera, t + points @ R[:, :2].T)
     return _Fit((R, t), float(np.sum(rows.residual**2)), rows.wrenches.reshape(2 * n, 6), K.reshape(2 * n, 9))
-
-
-def _camera_of(found: Sequence[Corners], points: dict[str, Floats], size: tuple[int, int]) -> Camera:
-    """The camera that explains all images best.
-
-    Raises:
-        InputError: There are too few of them, or they do not say what it is.
-    """
-    if len(found) < MIN_IMAGES:
-        n = len(found)
-        raise InputError("images", f"{n} with a board", f"at least {MIN_IMAGES} to estimate a camera from")
-    camera = first_camera([points[one.name] for one in found], [one.uv for one in found], size)
-    if camera is None or camera.fx <= 0.0 or camera.fy <= 0.0:
-        raise InputError(*UNDETERMINED)
-    return camera
 
 
 def _scaled_inverse(A: Floats) -> Floats:

@@ -8,8 +8,8 @@ from recordings import arm, correlated, record
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError
-from fg_calib.importers.recording import JointStream, PoseStream, Source, correlation_time, is_slow
-from fg_calib.importers.standstill import average_stops
+from fg_calib.importers.recording import JointStream, PoseStream, Source
+from fg_calib.importers.standstill import average_stops, correlation_time
 
 
 def averaged(motion, **more):
@@ -19,9 +19,11 @@ def averaged(motion, **more):
 def nees(stops, motion):
     """Mean squared error over its variance, of positions and orientations."""
     k = [int(name[4:]) - 1 for name in stops.ids]
-    off = (stops.position - motion.true_position[k]) / stops.sigma_position
-    turned = Rotation.from_matrix(stops.rotation.copy()).inv() * Rotation.from_matrix(motion.true_rotation[k])
-    return np.mean(off**2), np.mean((turned.as_rotvec() / stops.sigma_orientation) ** 2)
+    off = (stops.means["position"] - motion.true_position[k]) / stops.sigmas["position"]
+    turned = Rotation.from_matrix(stops.means["orientation"].copy()).inv() * Rotation.from_matrix(
+        motion.true_rotation[k]
+    )
+    return np.mean(off**2), np.mean((turned.as_rotvec() / stops.sigmas["orientation"]) ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -34,35 +36,26 @@ def test_every_stop_gives_a_row_of_its_configuration(motion):
     assert stops.ids == tuple(f"stop{k + 1}" for k in range(12))
     assert stops.skipped == ()
     scatter = 2e-5 / np.sqrt(100.0)  # some 110 readings a stop
-    assert np.abs(stops.readings - motion.true_readings).max() < 5.0 * scatter
+    assert np.abs(stops.means["joint"] - motion.true_readings).max() < 5.0 * scatter
     assert stops.scatter["position"].single == pytest.approx(1e-4, rel=0.2)
     assert nees(stops, motion) == pytest.approx([1.0, 1.0], abs=5.0 * np.sqrt(2.0 / 36.0))
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("offset", [0.137, -2.5, 1.6e9])
-def test_the_offset_of_the_clocks_is_found_within_its_sigma(offset):
-    """Also of a clock that counts from another day: 1e9 s are known to 2e-7 s."""
-    motion = record(2, offset=offset)
-    found = averaged(motion).offset
+@pytest.mark.parametrize(("offset", "tool"), [(0.137, (0.15, -0.1, 0.05)), (-2.5, (0, 0, 0)), (1.6e9, (0, 0, 0))])
+def test_the_offset_of_the_clocks_is_found_within_its_sigma(offset, tool):
+    """Wherever the target is on the tool. Also of a clock of another day: 1e9 s are known to 2e-7 s."""
+    found = averaged(record(2, offset=offset, tool=tool)).offset
     assert abs(found.seconds - offset) < 5.0 * np.hypot(found.sigma, 3e-7)
-    assert found.sigma < 2e-4
+    assert found.sigma < 1e-3
     assert found.n_moves >= 10  # of 11; one may be left out
     assert found.others == ()
     assert found.correlation > 0.98
 
 
-@pytest.mark.slow
-def test_the_offset_needs_no_place_of_the_target_on_the_tool():
-    motion = record(3, tool=(0.15, -0.1, 0.05))
-    found = averaged(motion).offset
-    assert abs(found.seconds - 0.137) < 5.0 * found.sigma < 5e-3
-
-
 def test_a_specified_offset_is_used_and_a_large_one_refused(motion):
     stops = averaged(motion, offset=0.13)
-    assert stops.applied == 0.13
-    assert abs(stops.offset.seconds - 0.137) < 5.0 * stops.offset.sigma
+    assert (stops.applied, stops.offset) == (0.13, None)
     with pytest.raises(InputError, match=r"topic /pose: an offset of 0\.137 \+- .* s .*, expected at most 0\.1 s"):
         averaged(motion, most_offset=0.1)
 
@@ -119,20 +112,14 @@ def test_correlation_time_is_that_of_the_noise(phi, n):
     k = np.arange(1, n)
     expected = 1.0 + 2.0 * np.sum((1.0 - k / n) * phi**k)
     assert correlation_time(stops) == pytest.approx(expected, rel=0.1)
-    assert is_slow(expected, n) == (phi == 0.95)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("settings", "least"),
-    [({}, 0.85), ({"pose_rate": 20.0}, 0.8), ({"phi": 0.8}, 0.7), ({"phi": 0.9}, 0.5), ({"phi": 0.97}, 0.45)],
-    ids=str,
-)
-def test_sigmas_are_those_of_the_errors(settings, least):
+@pytest.mark.parametrize(("phi", "least"), [(0.0, 0.85), (0.8, 0.7), (0.97, 0.45)])
+def test_sigmas_are_those_of_the_errors(phi, least):
     """Monte Carlo: 20 recordings of 12 stops; of noise as slow as a stop sigmas may be larger, not smaller."""
-    found = [nees(averaged(motion), motion) for motion in (record(100 + s, **settings) for s in range(20))]
-    mean = np.mean(found, axis=0)
-    error = np.std(found, axis=0) / np.sqrt(20)
+    found = [nees(averaged(motion), motion) for motion in (record(100 + s, phi=phi) for s in range(20))]
+    mean, error = np.mean(found, axis=0), np.std(found, axis=0) / np.sqrt(20)
     assert np.all(mean < 1.05 + 3.0 * error)
     assert np.all(mean > least - 3.0 * error)
 
@@ -145,9 +132,9 @@ def test_sigmas_of_orientations_are_about_the_tools_axes_and_of_positions_along_
     stops = average_stops(
         joints, PoseStream(poses.time, poses.position + off, rotation.as_matrix(), poses.source), arm()
     )
-    assert np.median(stops.sigma_position / stops.sigma_position[:, :1], axis=0) == pytest.approx([1, 10, 1], rel=0.2)
-    ratio = stops.sigma_orientation / stops.sigma_orientation[:, 1:2]
-    assert np.median(ratio, axis=0) == pytest.approx([10, 1, 1], rel=0.2)
+    position, orientation = (np.median(stops.sigmas[kind], axis=0) for kind in ("position", "orientation"))
+    assert position / position[0] == pytest.approx([1, 10, 1], rel=0.2)
+    assert orientation / orientation[1] == pytest.approx([10, 1, 1], rel=0.2)
 
 
 @pytest.mark.slow
