@@ -1,7 +1,7 @@
 from .assessment import Assessment, assess
 from .baseline.comparison import compare
 from .batch import calibrate_jobs
-from .calibration import Calibration, calibrate, calibrate_job
+from .calibration import Calibration, calibrate, calibrate_job, correct, predict
 from .designs.design import Design, design
 from .exports.export import export
 from .graph.build import build_problem
@@ -17,7 +17,6 @@ from .job import Job
 from .measurements.dataset import Measurements, Noise
 from .measurements.table import CustomMeasurements, KnownPoint, Table
 from .observability.identifiability import observe_configurations, observe_structure
-from .predictions import correct, predict
 from .robot.model import Robot
 from .simulation.scenario import Scenario
 from .simulation.simulator import simulate

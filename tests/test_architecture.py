@@ -36,7 +36,6 @@ FOLDERS = (
     "importers",
     "report",
     "calibration",
-    "predictions",
     "batch",
     "exports",
     "cli",

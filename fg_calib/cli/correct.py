@@ -22,8 +22,8 @@ def correct(
 ) -> None:
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
     from fg_calib.calibration import Calibration
+    from fg_calib.calibration import correct as correct_targets
     from fg_calib.io import Units, read_targets
-    from fg_calib.predictions import correct as correct_targets
     from fg_calib.report import build_correction_report, correction_document, require_commands, write_commands
 
     if out is not None:

@@ -21,9 +21,8 @@ def predict(
 ) -> None:
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
     from fg_calib.calibration import Calibration
+    from fg_calib.calibration import predict as predict_tool
     from fg_calib.io import Units, read_joint_table, require_writable
-    from fg_calib.predictions import measured_of
-    from fg_calib.predictions import predict as predict_tool
     from fg_calib.report import build_prediction_report, prediction_document, write_prediction
 
     most, units = read_quantity(limit, "m", "--limit"), Units(length, angle)
@@ -31,7 +30,7 @@ def predict(
         require_writable(out)
     arm = Calibration.load(result)
     ids, readings = ((), None) if at is None else read_joint_table(at, arm.robot, units)
-    found = predict_tool(arm, readings, limit=most, measured=measured_of(arm, result))
+    found = predict_tool(arm, readings, limit=most)
     if out is not None:
         write_prediction(out, found, arm.result, arm.robot, ids, units)
     show_result(

@@ -9,7 +9,6 @@ from fg_calib import Calibration, InputError, Measurements, assess, build_proble
 from fg_calib.prediction import workspace
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
 from fg_calib.prediction.workspace import predict_errors, summed_up
-from fg_calib.predictions import joint_noise_of
 from fg_calib.robot import pose
 from fg_calib.robot.model import Joint, RobotBuilder
 from fg_calib.statistics.covariance import spread_of
@@ -81,14 +80,14 @@ def test_joint_noise_moves_the_tool_as_differences_say(calibrated):
 
 
 def test_joint_noise_is_that_of_the_measurements(calibrated):
-    assert joint_noise_of(calibrated[0]) is None
+    assert calibrated[0].joint_noise is None
     rng = np.random.default_rng(10)
     robot = small_arm(tolerance=LARGE)
     q = rng.uniform(-2.0, 2.0, (20, 4))
     m = Measurements.from_arrays(q, position=pose(robot, q).position, sigma_position=1e-4, sigma_joint=JOINTS)
     problem = build_problem(robot, m, model="position")
     found = Calibration.of(solution := solve(problem), assess(solution))
-    assert joint_noise_of(found) == pytest.approx(JOINTS, rel=1e-15)
+    assert found.joint_noise == pytest.approx(JOINTS, rel=1e-15)
 
 
 def test_drawn_configurations_are_within_the_limits_and_the_worst_is_one_of_them(calibrated, monkeypatch):
