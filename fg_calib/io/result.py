@@ -35,8 +35,7 @@ from fg_calib.inputs import NORM_TOLERANCE, Figure, Floats, FrameKnowledge, Inpu
 from fg_calib.io.atomic import exists, is_folder, read_text
 from fg_calib.io.yaml import first_misfit
 from fg_calib.measurements import Table
-from fg_calib.monitoring import knowledge_of
-from fg_calib.monitoring.fingerprints import fingerprints
+from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
 from fg_calib.prediction import ExpectedError
 from fg_calib.statistics import (

@@ -1,7 +1,6 @@
 from .check import Check, Explanation, check_rows
-from .fingerprints import counted_before
 from .new_data import Rows
-from .prior_information import Calibrated, at_nominal, knowledge_of
+from .prior_information import Calibrated, at_nominal, counted_before, fingerprints, knowledge_of
 from .update import predicted_before, updated
 
 __all__ = [
@@ -12,6 +11,7 @@ __all__ = [
     "at_nominal",
     "check_rows",
     "counted_before",
+    "fingerprints",
     "knowledge_of",
     "predicted_before",
     "updated",

@@ -20,25 +20,11 @@ from scipy import special
 
 from fg_calib.diagnostics import check_tables, reporting
 from fg_calib.inputs import LIMITED, Limits
-from fg_calib.monitoring.discriminating_design import Advice, advise_configurations
-from fg_calib.monitoring.hypotheses import (
-    CERTAIN,
-    WRONG,
-    HypothesisTest,
-    excludes,
-    fit_changes,
-    is_part_of,
-    likely_changes,
-    merge_alike,
-    motion,
-    quantile,
-    refine_best,
-    rms_motion,
-    zero_names,
-)
+from fg_calib.monitoring import hypotheses
+from fg_calib.monitoring.hypotheses import HypothesisTest
 from fg_calib.monitoring.new_data import Linear, Rows, linearise_new_data, place_new_data
 from fg_calib.monitoring.prior_information import Calibrated
-from fg_calib.statistics import FACTOR, LEAST, HeldOut
+from fg_calib.statistics import FACTOR, LEAST, HeldOut, upper_probability
 from fg_calib.statistics.residual_table import pooled
 
 Verdict = Literal["pass", "fail", "not_evaluated"]
@@ -125,7 +111,7 @@ class Check:
     gross_rows: tuple[str, ...]
     deploy: bool
     detectable: dict[str, float | None]
-    advice: Advice | None = None
+    advice: hypotheses.Advice | None = None
 
     @property
     def passed(self) -> bool:
@@ -149,17 +135,17 @@ def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
     while True:
         at = linearise_new_data(place_new_data(calibrated, kept, calibrated.values))
         data, few = at.placed.problem.data, _too_few(at)
-        found = [] if few else fit_changes(at)
-        likely = likely_changes(found)
+        found = [] if few else hypotheses.fit_changes(at)
+        likely = hypotheses.likely_changes(found)
         most_gross = max(1, int(MOST_GROSS * (at.placed.problem.n_configurations + len(gross))))
         if len(likely) != 1 or likely[0].hypothesis.kind != "row" or len(gross) >= most_gross:
             break
         gross += likely[0].hypothesis.names
         kept = rows.without([np.isin(np.array(data.names)[places], gross) for places in data.places])
     if any(f.hypothesis.kind != "row" for f in likely) and not gross:
-        found = refine_best(calibrated, rows, found, likely)
-        likely = likely_changes(found) or likely
-    return _judge(calibrated, at, limits, found, likely, gross, few)
+        found = hypotheses.refine_best(calibrated, rows, found)
+        likely = hypotheses.likely_changes(found) or likely
+    return _judge(at, limits, found, likely, gross, few)
 
 
 def _too_few(rows: Linear) -> str:
@@ -172,7 +158,6 @@ def _too_few(rows: Linear) -> str:
 
 
 def _judge(
-    calibrated: Calibrated,
     at: Linear,
     limits: Limits,
     found: list[HypothesisTest],
@@ -180,16 +165,18 @@ def _judge(
     gross: list[str],
     few: str,
 ) -> Check:
+    calibrated = at.placed.calibrated
     held = at.placed.errors()
     rms = {kind: pooled([one for one in held if one.kind == kind]) for kind in dict.fromkeys(one.kind for one in held)}
     noise = {kind: one.noise for kind, one in rms.items()}
     names = {f.hypothesis.names for f in likely}
-    likely = merge_alike(calibrated, likely, noise)
+    likely = hypotheses.merge_alike(at, likely, noise)
     alike = names - {f.hypothesis.names for f in likely}
     found = [f for f in found if f.hypothesis.names not in alike]
     limit = {kind: value for kind in LIMITED if (value := getattr(limits, kind)) is not None}
-    p_value = _p_value(calibrated, at) if at.dof > 0 else None
-    reasons, cautions = ([few], []) if few else _reasons(calibrated, at, p_value, found, likely, rms, limit)
+    of_noise = calibrated.noise_degrees or np.inf  # noise that was estimated may itself be off
+    p_value = upper_probability(at.chi2 / at.dof, at.dof, of_noise) if at.dof > 0 else None
+    reasons, cautions = ([few], []) if few else _reasons(at, p_value, likely, rms, limit)
     if gross:
         cautions.insert(0, f"gross errors at {', '.join(gross)}: left out here; measure again")
     unjudged = [kind for kind in limit if kind not in rms or rms[kind].n < LEAST]
@@ -198,7 +185,7 @@ def _judge(
         verdict, reasons = "not_evaluated", [f"a limit of {unjudged[0]}, and fewer than {LEAST} rows to judge it by"]
     explained = bool(likely) and likely[0].explains
     alone = len(likely) == 1 and likely[0].hypothesis.kind != "row"
-    several = len(likely) > 1
+    wrong = hypotheses.WRONG / max(len(found), 1)
     made = Check(
         verdict=verdict,
         reasons=tuple(reasons),
@@ -214,16 +201,9 @@ def _judge(
         gross_rows=tuple(gross),
         deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
         detectable=_detectable(calibrated, found),
-        advice=advise_configurations(calibrated, at, likely, WRONG / max(len(found), 1)) if several else None,
+        advice=hypotheses.advise_configurations(at, likely, wrong),
     )
     return made if explained or verdict != "fail" else _unless_misread(made, at)
-
-
-def _p_value(calibrated: Calibrated, at: Linear) -> float:
-    """Probability of chi-square as large; of noise that was estimated by F, as that may itself be off."""
-    if calibrated.noise_degrees is None:
-        return float(special.chdtrc(at.dof, at.chi2))
-    return float(special.fdtrc(at.dof, calibrated.noise_degrees, at.chi2 / at.dof))
 
 
 def _unless_misread(found: Check, at: Linear) -> Check:
@@ -239,17 +219,15 @@ def _unless_misread(found: Check, at: Linear) -> Check:
 
 def _detectable(calibrated: Calibrated, found: Sequence[HypothesisTest]) -> dict[str, float | None]:
     """The slip of each joint's zero that is found with a probability of `POWER`."""
-    sigma = {f.hypothesis.names[0]: float(f.sigma[0]) for f in found if f.hypothesis.kind == "zero"}
-    least = np.sqrt(quantile(CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
-    sizes = {name: float(least * sigma.get(name, np.nan)) for name in zero_names(calibrated.robot)}
-    return {name: size if np.isfinite(size) else None for name, size in sizes.items()}
+    least = np.sqrt(hypotheses.quantile(hypotheses.CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
+    sizes = {f.hypothesis.names[0]: float(least * f.sigma[0]) for f in found if f.hypothesis.kind == "zero"}
+    names = hypotheses.zero_names(calibrated.robot)
+    return {name: sizes[name] if np.isfinite(sizes.get(name, np.nan)) else None for name in names}
 
 
 def _reasons(
-    calibrated: Calibrated,
     at: Linear,
     p_value: float | None,
-    found: Sequence[HypothesisTest],
     likely: Sequence[HypothesisTest],
     rms: dict[str, HeldOut],
     limits: dict[str, float],
@@ -266,29 +244,26 @@ def _reasons(
     change = next((f for f in likely if f.hypothesis.kind != "row"), None)
     excess = float(np.sqrt(at.chi2 / at.dof))
     if change is not None:
-        sizes = dict(zip(("orientation", "position"), rms_motion(motion(calibrated, change)).tolist(), strict=True))
+        sizes = dict(
+            zip(
+                ("orientation", "position"),
+                hypotheses.rms_motion(hypotheses.motion(at, change)).tolist(),
+                strict=True,
+            )
+        )
         far = [kind for kind, size in sizes.items() if size > limits.get(kind, np.inf)]
         where = f"; over the whole workspace {_shown(sizes[far[0]], far[0])} RMS" if far else ""
         if far or not limits or change.hypothesis.kind == "frame":
             reasons.append(f"the rows show a change: chi-square falls by {change.drop:.4g} with it{where}")
         else:
             cautions.append("the rows show a change, within the limits everywhere")
-    elif p_value is not None and p_value < CERTAIN:
+    elif p_value is not None and p_value < hypotheses.CERTAIN:
         what = f"residuals are {excess:.3g} times as large as noise and calibration allow"
         if excess**2 > FACTOR and not limits:
-            reasons.append(f"{what}{_without_change(found)}")
+            reasons.append(f"{what}: their noise is specified too small, or a change that they are too few to name")
         else:
             cautions.append(f"{what}, like noise")
     return reasons, cautions
-
-
-def _without_change(found: Sequence[HypothesisTest]) -> str:
-    """What residuals mean that are too large where no change is certain whatever the noise."""
-    able = [f for f in found if f.hypothesis.kind != "row" and f.explains and f.p_value < CERTAIN]
-    if not able:
-        return ", and no change of the arm explains that: is the noise of these rows specified too small?"
-    change = " and ".join(min(able, key=lambda f: (f.k, f.left)).hypothesis.names)
-    return f": their noise is specified too small, or a change such as of {change}; they are too few to say which"
 
 
 def _shown(value: float, kind: str) -> str:
@@ -300,11 +275,13 @@ def _explanations(found: Sequence[HypothesisTest], likely: Sequence[HypothesisTe
     if not likely:
         return ()
     names, scale = {f.hypothesis.names for f in likely}, likely[0].scale
-    others = [f for f in found if f.hypothesis.names not in names and not any(is_part_of(g, f) for g in likely)]
+    others = [
+        f for f in found if f.hypothesis.names not in names and not any(hypotheses.is_part_of(g, f) for g in likely)
+    ]
     shown = [*likely, *sorted(others, key=lambda f: f.left)[:ALSO_SHOWN]]
 
     def explanation(f: HypothesisTest) -> Explanation:
-        excluded = {g.hypothesis.names: excludes(f, g, scale) for g in shown if g is not f}
+        excluded = {g.hypothesis.names: hypotheses.excludes(f, g, scale) for g in shown if g is not f}
         sized = f.hypothesis.kind != "row"
         return Explanation(
             parameters=f.hypothesis.names,

@@ -1,10 +1,16 @@
-"""What a calibration has learned, for the next one: what its rows say, without the rows."""
+"""What a calibration has learned, for the next one: what its rows say, and fingerprints of these, without the rows.
+
+A fingerprint is a hash of one measurement's values, joint readings included, to 1e-12 m or rad, so that units and the
+file's format make no difference: integers multiplied and added modulo 2^64, of which the upper bits count.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +32,19 @@ from fg_calib.graph import (
     unknown_prior_rows,
 )
 from fg_calib.inputs import Floats, Options
+from fg_calib.measurements import LANDMARKS, Measurements, Table
 from fg_calib.observability import ObservedQuantities
 from fg_calib.robot import Robot
+
+Words = NDArray[np.uint64]
+
+MAX_FINGERPRINTS = 1000
+"""Fingerprints of a table that are kept: of more rows those with the smallest, in any two tables the same ones."""
+
+SAME_SHARE = 0.5
+"""Share of a table's rows from which it was counted before: coarse values repeat now and then."""
+
+_RESOLUTION, _NOT_MEASURED, _FACTOR = 1e-12, 9e6, np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True)
@@ -180,3 +197,45 @@ def with_tolerances(known: Knowledge, nominal: Floats, tolerances: dict[str, flo
     variables = replace(known.variables, robot=robot, priors=True)
     r, J = prior_rows(variables, np.append(known.robot.nominal, np.zeros(6)))
     return known.with_rows(np.hstack([J, np.zeros((len(J), len(known.at)))]), r)
+
+
+def fingerprints(tables: Sequence[Table]) -> tuple[str, ...]:
+    """Fingerprints of the train rows of tables, 12 hexadecimal digits each, sorted; at most 1000 a table."""
+    smallest = [np.unique(_of_rows(table.measurements) >> np.uint64(16))[:MAX_FINGERPRINTS] for table in tables]
+    return tuple(sorted({f"{one:012x}" for some in smallest for one in some.tolist()}))
+
+
+def counted_before(table: Table, known: Collection[str]) -> bool:
+    """Whether half of a table's rows are among fingerprints."""
+    own = fingerprints([table])
+    return bool(own) and sum(one in known for one in own) >= SAME_SHARE * len(own)
+
+
+def _of_rows(m: Measurements) -> Words:
+    """Hashes of what was measured at, and between, configurations."""
+    given = [v for v in (m.position, m.rotation, m.length, m.image, *m.columns.values()) if v is not None]
+    values = [v.reshape(len(m.readings), -1) for v in given]
+    labels = [m.labels[kind.name] for kind in LANDMARKS.values() if kind.name in m.labels]
+    named = [(label.names, label.index) for label in labels] + (
+        [] if m.groups is None else [(m.groups.names, m.groups.index)]
+    )
+    measured = np.any([np.isfinite(v).all(axis=1) for v in values], axis=0) | (
+        m.groups is not None and m.groups.index >= 0
+    )
+    codes = [np.array([*(zlib.crc32(name.encode()) for name in names), 0], dtype=np.uint64)[i] for names, i in named]
+    found = [_hash(m.readings, *values, *codes)[np.broadcast_to(measured & ~m.test, len(m.readings))]]
+    if m.pairs is not None:
+        ends, pairs = _hash(m.readings), m.pairs
+        found.append(_hash(ends[pairs.a], ends[pairs.b], pairs.distance, pairs.angle)[~pairs.test])
+    return np.concatenate(found)
+
+
+def _hash(*values: NDArray[Any]) -> Words:
+    """One hash a row of values, in units of the resolution, or of hashes."""
+    total: Words = np.zeros(len(values[0]), dtype=np.uint64)
+    for column in (column for v in values for column in np.reshape(v, (len(total), -1)).T):
+        whole = np.round(np.nan_to_num(column.astype(np.float64), nan=_NOT_MEASURED) / _RESOLUTION)
+        words = column if column.dtype == np.uint64 else whole.astype(np.int64).view(np.uint64)
+        total = (total ^ words) * _FACTOR
+        total ^= total >> np.uint64(32)
+    return total

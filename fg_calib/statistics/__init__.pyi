@@ -16,6 +16,7 @@ from .goodness_of_fit import (
     PredictedFit,
     chi_square,
     judge_fit,
+    upper_probability,
 )
 from .outliers import judge_without_outliers
 from .priors import PriorFit, estimate_tolerances, judge_priors
@@ -62,5 +63,6 @@ __all__ = [
     "judge_priors",
     "judge_without_outliers",
     "spread_of",
+    "upper_probability",
     "with_left_out",
 ]

@@ -8,7 +8,7 @@ from simulated import measure, small_arm
 from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import form_pairs
 from fg_calib.measurements.table import Table
-from fg_calib.monitoring.fingerprints import MAX_FINGERPRINTS, counted_before, fingerprints
+from fg_calib.monitoring.prior_information import MAX_FINGERPRINTS, counted_before, fingerprints
 
 ARM = small_arm()
 

@@ -10,29 +10,29 @@ from fg_calib import calibrate
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.scenario import Errors
 
+FEW = ("anchors", "stations", "offset")
+"""Instruments of which months are drawn quickly."""
+
 
 def likely(check):
     return [e for e in check.explanations if e.likely]
 
 
 @pytest.mark.slow
-@pytest.mark.long
-@pytest.mark.parametrize("kind", OF_INSTRUMENTS)
+@pytest.mark.parametrize("kind", FEW)
 def test_p_values_of_healthy_arms_are_uniform(kind):
-    """25 draws: a Kolmogorov-Smirnov test is below 1e-3 once in 1000 test runs; nor may more than 1 be said to have
-    changed, which is 1 of 1000 draws by `CERTAIN`."""
-    p, changed = [], 0
-    for seed in range(25):
+    """12 draws: a Kolmogorov-Smirnov test is below 1e-3 once in 1000 test runs; nor is any said to have changed."""
+    p = []
+    for seed in range(12):
         robot, _, old, new = months_of(kind, seed)
         found = calibrate(robot, old).check(new)
         p.append(found.p_value)
-        changed += bool(likely(found))
+        assert not likely(found)
     assert stats.kstest(p, "uniform").pvalue > 1e-3
-    assert changed <= 1
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", OF_INSTRUMENTS)
+@pytest.mark.parametrize("kind", FEW)
 def test_a_slip_is_found_and_the_joint_is_among_what_may_have_changed(kind):
     robot, _, old, new = months_of(kind, 1, slip={"theta2": 5e-3})
     found = calibrate(robot, old).check(new)
