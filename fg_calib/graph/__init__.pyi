@@ -14,7 +14,15 @@ from .error_states import ErrorStates, State, WhitenedBlock, WhitenedSeries, blo
 from .factors import DistanceFactor, RotationAngleFactor
 from .knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
 from .noise_models import JOINT_NOISE, PRIVATE_SHARE, NoiseName, NoiseState, RowNoise, whitening_of
-from .normal_system import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined, eliminate, first_independent
+from .normal_system import (
+    RANK_TOLERANCE,
+    SIGNAL_FLOOR,
+    SUPPORT_TOLERANCE,
+    NormalSystem,
+    determined,
+    eliminate,
+    first_independent,
+)
 from .problem import (
     Problem,
     at_parameters,
@@ -74,6 +82,7 @@ __all__ = [
     "Name",
     "NoiseName",
     "NoiseState",
+    "NormalSystem",
     "Places",
     "Problem",
     "RotationAngleFactor",

@@ -1,6 +1,5 @@
-from .acceptance import LEAST, Acceptance, Judgement, accept
 from .covariance import Spread, TangentCovariance, covariance_of_rows, spread_of, with_left_out
-from .cross_validation import CrossValidation, cross_validate
+from .cross_validation import LEAST, Acceptance, CrossValidation, Judgement, accept, cross_validate
 from .estimates import Estimates, FrameEstimate, JointErrors, LandmarkEstimate, ParameterEstimate, estimates_at
 from .goodness_of_fit import (
     CONFIDENCE,

@@ -27,6 +27,7 @@ from fg_calib.graph import (
     RANK_TOLERANCE,
     SIGNAL_FLOOR,
     SUPPORT_TOLERANCE,
+    NormalSystem,
     Problem,
     Solution,
     Variables,
@@ -143,19 +144,15 @@ def spread_of(solution: Solution) -> Spread:
     `robust.Effect`.
     """
     problem, variables = solution.problem, solution.problem.variables
-    scales = variables.prior_scales
-
-    def decomposed(parameters: Floats) -> tuple[Floats, Floats, int]:
-        return _decomposed(variables, parameters, linear_system(problem, parameters, with_loss=True).left.A)
-
-    found = s, directions, rank = decomposed(solution.parameters)
-    _, directions_nominal, rank_nominal = (
-        found if solution.before is solution.parameters else decomposed(solution.before)
-    )
-    held = held_frames(directions[rank:], directions_nominal[rank_nominal:], scales, variables.n_robot_columns)
-    half = directions[:rank].T / s[:rank]
-    added = correlation(problem, solution.parameters)
+    system = linear_system(problem, solution.parameters, with_loss=True)
+    nominal = system
+    if solution.before is not solution.parameters:
+        nominal = linear_system(problem, solution.before, with_loss=True)
+    rank, half, scales = system.rank, system.root, variables.prior_scales
+    loose, loose_at_nominal = system.directions[rank:], nominal.directions[nominal.rank :]
+    held = held_frames(loose, loose_at_nominal, scales, variables.n_robot_columns)
     root = np.hstack([half, held])
+    added = correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
     return Spread(
         variables=variables,
@@ -163,32 +160,11 @@ def spread_of(solution: Solution) -> Spread:
         root=root,
         tangent=root @ root.T,
         actual=half @ (np.eye(rank) + middle) @ half.T + held @ held.T,
-        loose=_orthonormal(directions[rank:], variables.scales),
-        loose_at_nominal=_orthonormal(directions_nominal[rank_nominal:], variables.scales),
+        loose=_orthonormal(loose, variables.scales),
+        loose_at_nominal=_orthonormal(loose_at_nominal, variables.scales),
         rank=rank,
         excess=float(np.trace(middle)),
     )
-
-
-def covariance_of_rows(variables: Variables, parameters: Floats, rows: Floats) -> TangentCovariance:
-    """The covariance that whitened rows and the robot's tolerances make, both at one parameter vector.
-
-    Args:
-        variables: The variables.
-        parameters: The parameter vector.
-        rows: Derivatives in the core, nuisances eliminated, shape (m, n_columns).
-    """
-    s, directions, rank = _decomposed(variables, parameters, rows)
-    half, loose = directions[:rank].T / s[:rank], _orthonormal(directions[rank:], variables.scales)
-    return TangentCovariance(variables, parameters, half @ half.T, loose, loose)
-
-
-def _decomposed(variables: Variables, parameters: Floats, rows: Floats) -> tuple[Floats, Floats, int]:
-    """Singular values of rows and priors by how far columns may be off, their directions, how many are determined."""
-    n, scales = variables.n_columns, variables.prior_scales
-    stacked = np.vstack([rows, prior_rows(variables, parameters)[1], np.zeros((n, n))]) * scales
-    _, s, Vt = np.linalg.svd(stacked, full_matrices=False)
-    return s, Vt * scales, determined(s)
 
 
 def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
@@ -209,6 +185,21 @@ def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot
     of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= SUPPORT_TOLERANCE].T @ at_nominal
     turned: Floats = of_frames @ here.T @ here
     return (turned * scales).T / SIGNAL_FLOOR
+
+
+def covariance_of_rows(variables: Variables, parameters: Floats, rows: Floats) -> TangentCovariance:
+    """The covariance that whitened rows and the robot's tolerances make, both at one parameter vector.
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        rows: Derivatives in the core, nuisances eliminated, shape (m, n_columns).
+    """
+    r, J = prior_rows(variables, parameters)
+    priors, square_root = np.column_stack([J, r]), np.pad(rows, ((0, 0), (0, 1)))
+    system = NormalSystem(square_root, variables.n_columns, variables.prior_scales, priors)
+    loose = _orthonormal(system.directions[system.rank :], variables.scales)
+    return TangentCovariance(variables, parameters, system.covariance, loose, loose)
 
 
 def with_left_out(solution: Solution, spread: Spread) -> Spread:

@@ -13,6 +13,10 @@ which is its sigma where measurements determine it and the noise is as specified
 1 / sqrt(2 (g - 1)). It is less where priors determine it, and more where unmodelled effects do not average out. Of
 pairs it is 1.4 to 1.7 times as large: measured ones leave with either end, formed ones are formed anew.
 
+A limit is judged by the RMS error of the calibrated arm at test rows, which the estimate never saw, or else at those
+held out. It contains the noise of the measurements themselves: an error within the limit is within it all the more
+without that noise; an error beyond the limit that would be within it without the specified noise says nothing.
+
 References:
     Shao & Tu (1995), The Jackknife and Bootstrap, section 2.3: the jackknife that deletes groups.
 """
@@ -21,20 +25,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
+from typing import Literal
 
 import numpy as np
+from pydantic import computed_field
 from scipy import special
 
 from fg_calib.graph import Solution, problem_of
 from fg_calib.inputs import (
-    Booleans,
     Figure,
     Floats,
     FrozenArrays,
     InputError,
     Integers,
+    Limits,
     ProblemError,
     check_number,
     checked,
@@ -43,6 +49,11 @@ from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Table
 from fg_calib.parallel import Failure, map_jobs
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
+
+Verdict = Literal["pass", "fail", "not evaluated"]
+
+LEAST = 5
+"""Measurements that must have been held out for a limit to be judged by them."""
 
 CHANCE = 1e-3
 """Probability with which noise as specified alone makes the spread of any parameter worth naming."""
@@ -163,23 +174,15 @@ def _calibrated(job: Job, solve: Callable[[Job], Solution]) -> tuple[Floats, tup
 
 def _train_tables(tables: Sequence[Table]) -> tuple[Table, ...]:
     """Tables without their test rows; those that have no others are left out."""
-    touched = set[str]()
-    for groups, test in ((table.measurements.groups, table.measurements.test) for table in tables):
-        if groups is not None:
-            touched |= {groups.names[g] for g in np.unique(groups.index[~test]) if g >= 0}
     found = []
     for table in tables:
-        m = table.measurements
-        rows, train = np.flatnonzero(~m.test), np.append(~m.test, False)
-        place = np.cumsum(train) - 1
-        pairs, groups = m.pairs, m.groups
+        m, pairs, groups = table.measurements, table.measurements.pairs, table.measurements.groups
+        rows, place = np.flatnonzero(~m.test), np.cumsum(~m.test) - 1
         if pairs is not None:
-            pairs = pairs.select(~pairs.test & train[pairs.a] & train[pairs.b])
+            pairs = pairs.select(~(pairs.test | m.test[pairs.a] | m.test[pairs.b]))
             pairs = replace(pairs, a=place[pairs.a], b=place[pairs.b])
         if groups is not None:
-            known = np.array([name in touched for name in groups.names], dtype=np.bool_)
-            between = groups.pairs.select(~groups.pairs.test & known[groups.pairs.a] & known[groups.pairs.b])
-            groups = replace(groups, index=groups.index[rows], pairs=between)
+            groups = replace(groups, index=groups.index[rows], pairs=groups.pairs.select(~groups.pairs.test))
         if len(rows):
             found.append(replace(table, measurements=replace(m.select(rows), pairs=pairs, groups=groups)))
     return tuple(found)
@@ -214,9 +217,8 @@ def _divided(data: Dataset, n: int, rng: np.random.Generator) -> Integers:
     for label, (configurations, _) in enumerate(observers):
         for k in np.unique(place[configurations]).tolist():
             landmarks[k].append(label)
-    dealt = rng.permutation(np.setdiff1d(np.arange(n_sets), place[_reference_poses(data)])).tolist()
-    fold = np.full(n_sets, -1)
-    fold[sorted(dealt, key=lambda k: landmarks[k])] = np.arange(len(dealt)) % n
+    fold = np.empty(n_sets, dtype=np.int64)
+    fold[sorted(rng.permutation(n_sets).tolist(), key=lambda k: landmarks[k])] = np.arange(n_sets) % n
     found = fold[place]
     for configurations, needed in observers:
         left = len(configurations) - np.bincount(found[configurations] + 1, minlength=n + 1)[1:].max()
@@ -226,12 +228,19 @@ def _divided(data: Dataset, n: int, rng: np.random.Generator) -> Integers:
 
 
 def _observers(data: Dataset) -> Iterator[tuple[list[int], int]]:
-    """The configurations that see each landmark or station, and how many of them are needed."""
+    """The configurations that see each landmark or station, and how many of them are needed.
+
+    The reference pose of measured pairs is one that is needed itself.
+    """
     by_name: dict[tuple[str, str], list[int]] = {}
     for number, (table, place) in enumerate(zip(data.tables, data.places, strict=True)):
         m = table.measurements
         if table.unknown_frame:
             by_name["station", str(number)] = place.tolist()
+        if m.pairs is not None and m.pairs.n_pairs > 1:
+            n = np.bincount(place[np.concatenate([m.pairs.a, m.pairs.b])])
+            reference = np.flatnonzero(n > REFERENCE_SHARE * m.pairs.n_pairs).tolist()
+            by_name |= {("reference", str(k)): [k] for k in reference}
         named = [(kind, labels.names, labels.index) for kind, labels in m.labels.items()]
         named += [] if m.groups is None else [("group", m.groups.names, m.groups.index)]
         for kind, names, index in named:
@@ -241,12 +250,94 @@ def _observers(data: Dataset) -> Iterator[tuple[list[int], int]]:
         yield sorted(set(configurations)), NEEDED.get(kind, 1)
 
 
-def _reference_poses(data: Dataset) -> Booleans:
-    """Which configurations are an end of most measured pairs of a table, shape (n_configurations,)."""
-    found = np.zeros(data.n_configurations, dtype=np.bool_)
-    for table, place in zip(data.tables, data.places, strict=True):
-        pairs = table.measurements.pairs
-        if pairs is not None and pairs.n_pairs > 1:
-            n = np.bincount(np.concatenate([place[pairs.a], place[pairs.b]]), minlength=len(found))
-            found |= n > REFERENCE_SHARE * pairs.n_pairs
-    return found
+@dataclass(frozen=True)
+class Judgement:
+    """One limit, and what the held-out rows say of it.
+
+    Attributes:
+        kind: What it limits: `position`, `orientation`, `distance` or `angle`.
+        limit: Its value, [m] or [rad].
+        error: RMS error of the calibrated arm at the held-out rows; None without any.
+        noise: RMS of the specified noise of these rows.
+        n: Number of measurements held out.
+        verdict: Whether the arm keeps to it.
+        reason: Why that was not evaluated, or which arm it was that passed, where it was not the calibrated one.
+        table: Name of the table; empty where there is one alone.
+    """
+
+    kind: str
+    limit: float
+    error: float | None
+    noise: float | None
+    n: int
+    verdict: Verdict
+    reason: str = ""
+    table: str = ""
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """What became of all limits.
+
+    Attributes:
+        judgements: Limit by limit.
+    """
+
+    judgements: tuple[Judgement, ...]
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def verdict(self) -> Verdict:
+        """`pass` where all limits are kept, `fail` where one is not."""
+        found = [one.verdict for one in self.judgements]
+        return "fail" if "fail" in found else "not evaluated" if "not evaluated" in found else "pass"
+
+
+def accept(limits: Limits, held_out: Sequence[HeldOut], findings: Sequence[str]) -> Acceptance | None:
+    """Judge the limits of a job by what was held out; None without limits.
+
+    Tables are judged one by one: many rows of one do not make up for those of another.
+
+    Args:
+        limits: The limits.
+        held_out: Measurements held out, by table and kind: test rows, or those of cross-validation.
+        findings: Why the result is not to be trusted: it then passes nothing.
+    """
+    judged = []
+    for kind in (f.name for f in fields(limits)):
+        limit = getattr(limits, kind)
+        if limit is not None:
+            parts = _judged_alone([held for held in held_out if held.kind == kind])
+            judged += [_judge(kind, limit, held, findings) for held in parts or (None,)]
+    return Acceptance(tuple(judged)) if judged else None
+
+
+def _judged_alone(held_out: Sequence[HeldOut]) -> list[HeldOut]:
+    """What is judged by itself: each table with rows enough, the others together where these are enough."""
+    alone = [held for held in held_out if held.n >= LEAST]
+    others = [held for held in held_out if held.n < LEAST]
+    if others and (not alone or sum(held.n for held in others) >= LEAST):
+        alone.append(pooled(others, "other tables" if alone else ""))
+    return alone
+
+
+def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str]) -> Judgement:
+    if held is None:
+        return Judgement(kind, limit, None, None, 0, "not evaluated", f"no measurement of any {kind} was held out")
+
+    exceeds = held.after > limit
+    reasons = {
+        f"fewer than {LEAST} were held out": held.n < LEAST,
+        "frame, base or tool were fitted to these rows, which are too few for that": held.few,
+        "the noise of the measurements hides it": exceeds and held.after**2 - held.noise**2 <= limit**2,
+        f"{held.by} misses it: mark some rows as test": exceeds and bool(held.by),
+        "within the limit, but the result is not to be trusted": not exceeds and bool(findings),
+        "the error is not known": not np.isfinite(held.after),
+    }
+    verdict: Verdict = "fail" if exceeds else "pass"
+    reason = f"new rows, by {held.by}" * (bool(held.by) and not exceeds)
+    for doubt, applies in reasons.items():
+        if applies:
+            verdict, reason = "not evaluated", doubt
+            break
+    return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason, held.table)

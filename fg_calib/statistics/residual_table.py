@@ -215,6 +215,7 @@ class ResidualTable(FrozenArrays):
         first = np.ones(self.n, dtype=np.bool_)
         number, family = self.measurement_number, self.family
         first[1:] = (number[1:] != number[:-1]) | (family[1:] != family[:-1])
+        first.flags.writeable = False
         return first
 
     def row_ends(self, rows: Integers) -> tuple[Integers, Integers]:

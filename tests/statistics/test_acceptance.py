@@ -119,7 +119,7 @@ def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
         ({"position": -1}, "accept: position: found -1, expected a number above 0"),
         ({"orientation": "5 mm"}, "accept: orientation: found '5 mm', expected a number with one of rad, deg, mrad"),
         ({"posiion": 1}, "accept: unknown limit 'posiion', expected one of position, orientation, distance, angle"),
-        ([1], "accept: found [1], expected a mapping"),
+        ([1], "accept: found [1], expected limits by name"),
     ],
 )
 def test_limits_of_a_job_that_cannot_be_are_one_line(tmp_path, fg_calib, accept, message):

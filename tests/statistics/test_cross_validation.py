@@ -47,7 +47,7 @@ def test_every_configuration_is_predicted_once_by_the_others():
     for k in range(4):
         held = m.select(np.arange(40))
         alone = calibrate(robot, replace(held, test=found.fold == k), model="pose")
-        squares += 10 * alone.residuals.rms()["test"]["position"]["after"] ** 2
+        squares += 10 * alone.assessment.fit.residuals.rms()["test"]["position"]["after"] ** 2
         arms.append([p.estimate for p in alone.parameters.values()])
     assert found.kinds["position"].n == 40
     assert found.kinds["position"].after == pytest.approx(np.sqrt(squares / 40), rel=1e-6)  # both converged: 1e-6 sigma
