@@ -265,7 +265,7 @@ def build_pool(
         reason = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
         raise InputError("candidates", reason, "more configurations")
     names = [_split_name(name) for name in data.names[: data.n_configurations]]
-    references = _find_references(problem)
+    references = find_references(problem, scenario.source)
     kept = np.setdiff1d(np.arange(len(names)), references)
     pose_of = np.full(len(names), REFERENCE)
     pose_of[kept] = np.arange(len(kept))
@@ -306,14 +306,16 @@ def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Flo
     return simulate(_nominal(scenario, readings), exact=True).tables
 
 
-def _find_references(problem: Problem) -> Integers:
-    """Configurations that all pairs of a table have in common."""
-    found = []
-    for s in problem.pair_series:
-        ends = problem.data.places[s.table][s.ends[s.train]]
-        if len(ends) and np.all(ends[:, 0] == ends[0, 0]):
-            found.append(ends[0, 0])
-    return np.unique(np.array(found, dtype=np.int64))
+def find_references(problem: Problem, source: str) -> Integers:
+    """Configurations that all pairs of a table have in common.
+
+    Raises:
+        InputError: Pairs without one reference pose: what other pairs share is not one pose's.
+    """
+    ends = [problem.data.places[s.table][s.ends[s.train, 0]] for s in problem.pair_series]
+    if any(len(np.unique(first)) > 1 for first in ends):
+        raise InputError(source, "pairs that are no star", "pairing star, or candidates that are no rows")
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *ends]))
 
 
 def _with_instruments(scenario: Scenario) -> Scenario:

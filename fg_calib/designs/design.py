@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
-from fg_calib.designs.from_job import pool_for_more_rows, pool_of_rows, solve_for_design
-from fg_calib.designs.information import N_TASK, Posterior, Task, build_system, needs_fit
+from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
+from fg_calib.designs.information import N_TASK, Posterior, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.inputs import (
     Floats,
@@ -37,7 +37,7 @@ from fg_calib.inputs import (
 )
 from fg_calib.job import Job
 from fg_calib.measurements import Table
-from fg_calib.observability import Observability
+from fg_calib.observability import Observability, ObservedQuantities
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import PoseRms
 from fg_calib.robot import Robot, random_readings
@@ -168,11 +168,16 @@ def design(
     tell("looking for candidates")
     pool = _build_pool(of, candidates, given, n_candidates, draw["candidates"])
     readings = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
-    wanted = Task(readings, needs_fit(pool.problem) if fitted is None else fitted, lever)
+    wanted = Task(readings, _needs_fit(pool) if fitted is None else fitted, lever)
     if wanted.fitted and len(readings) < MIN_FITTED:
         found = f"{len(readings)} configuration{'s' * (len(readings) > 1)}, of which a rigid fit leaves next to nothing"
         raise InputError("task", found, f"{MIN_FITTED} or more, or errors in the base frame")
     return design_from_pool(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
+
+
+def _needs_fit(pool: Pool) -> bool:
+    """Whether nothing that is measured says where the base is, so that errors count after the best rigid fit."""
+    return ObservedQuantities.of_tables(pool.problem.data.tables).blind_to_base
 
 
 def _build_pool(
@@ -189,7 +194,8 @@ def _build_pool(
         source, problem = "job" if of.path is None else of.path.name, solve_for_design(of)
         if isinstance(candidates, str):
             return pool_of_rows(problem, source)
-        return pool_for_more_rows(problem, n, generator, candidates, source)
+        scenario = scenario_of(problem, candidates, source)
+        return build_pool(scenario, draw_groups(scenario, n, generator), before=problem)
     if candidates == "rows":
         raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")
     scenario = of if candidates is None else replace(of, configurations=candidates)

@@ -22,7 +22,7 @@ import numpy as np
 
 from fg_calib.graph import SIGNAL_FLOOR, Problem, WhitenedBlock, eliminate, prior_rows, unknown_prior_rows
 from fg_calib.inputs import Brief, Floats, FrozenArrays, InputError, Integers
-from fg_calib.observability import Observability, ObservedQuantities, observability_of_rows
+from fg_calib.observability import Observability, observability_of_rows
 from fg_calib.prediction import PoseRms, errors_at
 from fg_calib.robot import forward, without_rigid_motion
 from fg_calib.statistics import TangentCovariance, covariance_of_rows
@@ -310,8 +310,3 @@ class Posterior(Brief):
 def count_measurements(problem: Problem) -> int:
     """Number of measurements of a problem's rows."""
     return sum(len(s.train) for s in problem.data.series)
-
-
-def needs_fit(problem: Problem) -> bool:
-    """Whether nothing that is measured says where the base is, so that errors count after the best rigid fit."""
-    return ObservedQuantities.of_tables(problem.data.tables).blind_to_base

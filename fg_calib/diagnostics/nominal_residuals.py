@@ -19,7 +19,6 @@ from typing import Any, Literal
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from fg_calib.graph import (
     Problem,
@@ -32,9 +31,9 @@ from fg_calib.graph import (
     tables_of,
 )
 from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
-from fg_calib.measurements import INSTRUMENTS, Measurements, Table, residuals
+from fg_calib.measurements import INSTRUMENTS, Table, residuals
 from fg_calib.measurements.kinds import Instrument
-from fg_calib.robot import Poses, Robot, forward
+from fg_calib.robot import Robot
 
 USUAL_LENGTH, USUAL_ANGLE = 2e-3, 5e-3
 """1 sigma of true minus nominal where a parameter has no prior: 2 mm and 5 mrad (0.3 degrees)."""
@@ -57,7 +56,6 @@ class TypicalResidual:
         unit: `m`, `rad` or `px`.
         size: Median of their lengths, [m], [rad] or [px].
         expected: Median expected from noise and prior sigmas.
-        motion: How far the arm moves between these rows: readings that hardly move it show nothing.
         n: Number of measurements.
     """
 
@@ -65,7 +63,6 @@ class TypicalResidual:
     unit: Literal["m", "rad", "px"]
     size: float
     expected: float
-    motion: float
     n: int
 
     @property
@@ -133,21 +130,21 @@ def setup_of(robot: Robot, table: Table) -> Setup | None:
     may be of one target or anchor.
     """
     m, rng = table.measurements, np.random.default_rng(0)
-    rows, pairs = np.flatnonzero(~m.test), None
+    rows, pairs = np.flatnonzero(~m.test), m.pairs if table.uses_pairs else None
     if table.model is None or not len(rows):
         return None
-    if table.uses_pairs and m.pairs is not None:
-        train = np.flatnonzero(~m.pairs.test)
-        pairs = m.pairs.select(train[evenly(len(train), 3 * MAX_ROWS)])
-    if m.image is not None:
+    if pairs is not None:
+        train = np.flatnonzero(~pairs.test)
+        pairs = pairs.select(train[evenly(len(train), 3 * MAX_ROWS)])
+        touched = rows[:MAX_ROWS] if m.groups is not None else rows[:0]
+        rows = np.unique(np.concatenate([touched, pairs.a, pairs.b]))
+        pairs = replace(pairs, a=np.searchsorted(rows, pairs.a), b=np.searchsorted(rows, pairs.b))
+    elif m.image is not None:
         images = rng.permutation(np.unique(m.ids[rows]))[:MAX_IMAGES]
         rows = np.concatenate([rows[m.ids[rows] == image][:MAX_CORNERS] for image in images])
     else:
-        rows = rng.permutation(rows)[: MAX_ROWS if pairs is None or m.groups is not None else 0]
-    rows = np.unique(rows if pairs is None else np.concatenate([rows, pairs.a, pairs.b]))
-    groups = None if m.groups is None else replace(m.groups, index=m.groups.index[rows])
-    if pairs is not None:
-        pairs = replace(pairs, a=np.searchsorted(rows, pairs.a), b=np.searchsorted(rows, pairs.b))
+        rows = np.sort(rng.permutation(rows)[:MAX_ROWS])
+    groups = m.groups and replace(m.groups, index=m.groups.index[rows])
     some = replace(m.select(rows), pairs=pairs, groups=groups)
     some_rows = replace(table, measurements=some, pairing=Pairing("chain"), own=())
     base = {robot.parameters[i].name for i in robot.owned_by(0) if robot.parameters[i].estimated}
@@ -248,21 +245,9 @@ def _by_kind(noise: RowNoise, squares: Floats, variance: Floats) -> Iterator[Typ
         variance: Variance of each row by noise and the arm's errors, shape (n, residual_dim).
     """
     kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
-    poses = forward(noise.place.chain.without_columns(), noise.place.trig, np.unique(noise.series.ends))
     for kind in dict.fromkeys(kinds.tolist()):
-        of = (kinds == kind) & used.any(axis=0)
-        rows = used[:, of].any(axis=1)
+        of = used & (kinds == kind)
+        rows = of.any(axis=1)
         if rows.any():
-            size, expected = (
-                float(np.median(np.sqrt(np.where(used, v, 0.0)[:, of].sum(axis=1)[rows]))) for v in (squares, variance)
-            )
-            motion = _motion(noise.place.measurements, kind, poses)
-            yield TypicalResidual(kind, _UNITS.get(kind, "m"), size, max(expected, 1e-9), motion, int(rows.sum()))
-
-
-def _motion(m: Measurements, kind: str, poses: Poses) -> float:
-    """How far the arm, or a point's image, typically moves between the rows of a series, [m], [rad] or [px]."""
-    if _UNITS.get(kind) == "rad":
-        return float(np.median(Rotation.from_matrix(poses.rotation[0].T @ poses.rotation).magnitude()))
-    points = m.image[:, :2] if _UNITS.get(kind) == "px" and m.image is not None else poses.position
-    return float(np.median(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+            size, expected = (float(np.median(np.sqrt(np.sum(v, axis=1, where=of)[rows]))) for v in (squares, variance))
+            yield TypicalResidual(kind, _UNITS.get(kind, "m"), size, max(expected, 1e-9), int(rows.sum()))

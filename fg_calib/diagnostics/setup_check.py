@@ -287,11 +287,7 @@ def _doubles(single: Sequence[_Trial], given: float) -> list[_Trial]:
 
 def _accepted(trials: Sequence[_Trial], most: float) -> tuple[Explanation, ...]:
     """Trials that leave a small enough excess, at most twice that of the best; the simplest first."""
-    good = [
-        one
-        for one in trials
-        if one[1].excess <= min(most, EXPLAINED) and all(REDUCTION * r.size <= r.motion for r in one[1].residuals)
-    ]
+    good = [one for one in trials if one[1].excess <= min(most, EXPLAINED)]
     best = max(min((trial.excess for _, trial in good), default=0.0), 0.5)
     chosen = [one for one in good if one[1].excess <= 2.0 * best]
     return tuple(trial for _, trial in sorted(chosen, key=lambda one: sum(mistake.about for mistake in one[0])))

@@ -9,14 +9,14 @@ know. Within `FACTOR` of its mean chi-square is no error, whatever its distribut
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+from scipy import special
 
 from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
-from fg_calib.diagnostics.nominal_residuals import residuals_at
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.graph import JOINT_NOISE, Problem, Solution
 from fg_calib.measurements import missing_values
@@ -41,6 +41,9 @@ LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6
 """P-value below which residuals are systematic, and below which true errors are several times those that sigmas claim;
 between the two they may be twice as large (`tests/diagnostics/test_unmodelled_effects.py`)."""
 
+SIGNIFICANT = (1.0 - CONFIDENCE) / 2.0
+"""P-value below which chi-square, and the outliers of test rows, are significant."""
+
 NOTABLE_RATIO = 1.1
 """Estimated over specified noise, or the inverse, below which a significant difference is not reported."""
 
@@ -51,7 +54,7 @@ AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
 """Part of the information that may rest on lengths and angles of ambiguous sign: with a warning, and no more at all."""
 
 LARGE_NOISE = 0.2
-"""Estimated noise over the motions measured, beyond which it is no noise."""
+"""Estimated noise over the arm's reach, or over a radian, beyond which it is no noise."""
 
 MAX_OUTLIER_SHARE = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
@@ -62,14 +65,8 @@ MOST_ESTIMATED = 2.0
 MAX_PRIOR_SCALE = 10.0
 """Estimated over specified prior sigma above which one asks why."""
 
-LEAST_SEEN = 0.5
-"""Corrections of a group that the data determine, below which they do not determine its scale."""
-
 NAMED = 3
 """Configurations, rows or parameters that a statement names."""
-
-_WITH_MOTION = ("distance", "angle", "orientation", "position")
-"""Kinds of noise whose motions follow from what the arm predicts."""
 
 _TOO_LARGE = frozenset(("too small", "both", "many"))
 """Verdicts on a kind of noise specified too small."""
@@ -118,22 +115,44 @@ class Case:
         solution: The solution.
         spread: The covariance of what was estimated.
         fit: How well it fits.
+        missing: What the robot's convention has no parameter for.
         change: What moved while a table was measured.
-        gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
-        too_large: Whether chi-square is too large without the corrections, which are judged by themselves.
+        noise_like: See `Verdict`.
+        setup: The set-up, which is checked after all else.
     """
 
     solution: Solution
     spread: Spread
     fit: Fit
-    change: effects.Change | None
-    gross: GrossErrors | None
-    too_large: bool
+    missing: Sequence[MissingMotion] = ()
+    change: effects.Change | None = None
+    noise_like: float | None = None
+    setup: SetupCheck = field(default_factory=SetupCheck)
 
     @property
     def problem(self) -> Problem:
         """The problem solved."""
         return self.solution.problem
+
+    @property
+    def gross(self) -> GrossErrors | None:
+        """The gross errors that are all that is wrong; None if there are none, or more than these is."""
+        return self.fit.goodness.gross if self.fit.goodness.spoilt and self.change is None else None
+
+    @property
+    def too_large(self) -> bool:
+        """Whether chi-square is too large without the corrections, which are judged by themselves."""
+        chi2, priors = self.fit.chi_square, self.fit.priors
+        if priors is None:
+            return chi2.too_large
+        rest, dof = chi2.value - priors.chi2, chi2.dof - len(priors.names)
+        return rest > max(chi2.bounds[1] * dof, 0.0) or any(k.verdict in _TOO_LARGE for k in self.fit.goodness.kinds)
+
+    @property
+    def high(self) -> bool:
+        """Whether residuals are larger than the noise, or systematic, and not by gross errors alone."""
+        systematic = self.noise_like is not None and self.noise_like < LIKE_NOISE
+        return self.gross is None and (self.fit.chi_square.too_large or systematic)
 
 
 def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
@@ -145,37 +164,23 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         fit: How well it fits.
         missing: What the robot's convention has no parameter for.
     """
-    problem, kinds, chi2, goodness = solution.problem, fit.goodness.kinds, fit.chi_square, fit.goodness
-    verdicts = {kind.verdict for kind in kinds}
+    problem, verdicts = solution.problem, {kind.verdict for kind in fit.goodness.kinds}
     tested = not problem.evaluated and bool(verdicts & _TOO_LARGE or solution.estimated_noise is not None)
     change = effects.find_change(solution) if tested or ("outliers" in verdicts and not problem.evaluated) else None
     noise_like = effects.probability_of_noise(solution) if tested and change is None else None
-    too_large, gross = chi2.too_large, goodness.gross if goodness.spoilt and change is None else None
-    if fit.priors is not None:
-        rest, dof = chi2.value - fit.priors.chi2, chi2.dof - len(fit.priors.names)
-        too_large = rest > max(chi2.bounds[1] * dof, 0.0) or bool(verdicts & _TOO_LARGE)
-    case = Case(solution, spread, fit, change, gross, too_large)
+    case = Case(solution, spread, fit, missing, change, noise_like)
     statements = [statement for check in CHECKS for statement in check(case)]
-    systematic = check_systematic(noise_like)
     doubts = any(s.severity == "error" for s in statements)
-    statements[:0] = check_optima(solution)  # which fit as well
-    setup, high = SetupCheck(), gross is None and (chi2.too_large or bool(systematic))
     if not problem.evaluated:
-        factor = max((kind.factor for kind in kinds), default=1.0)
-        setup = check_problem(problem, solution.before, doubtful=doubts or factor > MOST_ESTIMATED)
-    if not setup.explanations:
-        statements += systematic  # a wrong set-up has them as its consequence
-        offsets = () if gross is not None else effects.forgotten_offsets(solution)
-        statements += [check_offset(found, problem.data.labels, chi2.too_large) for found in offsets]
-    statements[:0] = check_model(setup, fits=not (doubts or solution.estimated_noise is not None), high=high)
-    asked = high and not setup.explanations and problem.knowledge is None  # else the convention did before
-    for motion in missing:
-        certain = asked and effects.explains_misfit(solution, motion)
-        statements.append(Statement("error" if certain else "note", str(motion)))
+        much = any(kind.factor > MOST_ESTIMATED for kind in fit.goodness.kinds)
+        case = replace(case, setup=check_problem(problem, solution.before, doubtful=doubts or much))
+    fits = not (doubts or solution.estimated_noise is not None)
+    statements = [*check_setup(case, fits=fits), *check_optima(case), *statements]
+    statements += [*check_systematic(case), *check_offsets(case), *check_missing(case)]
     errors, warnings, notes = (
         tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
     )
-    return Verdict(errors, warnings, notes, setup, noise_like, change)
+    return Verdict(errors, warnings, notes, case.setup, noise_like, change)
 
 
 def check_solver(case: Case) -> Iterator[Statement]:
@@ -226,24 +231,23 @@ def check_chi_square(
     if chi2.dof <= 0:
         text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
         return [Statement("error", text)]
-    reduced, (low, high) = chi2.value / chi2.dof, chi2.bounds
+    reduced, ratio, (low, high) = chi2.value / chi2.dof, float(np.sqrt(chi2.ratio)), chi2.bounds
     outside = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]"
     if reduced > high:
         cause = "noise specified too small, unmodelled effects, or outliers"
-        if gross is not None:
+        if evaluated:
+            cause = "the arm does not predict these test rows, noise specified too small, or outliers"
+        elif gross is not None:
             cause = (
                 f"outliers: {gross.n} ({listed(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
             )
             cause += " loss do so (loss: gnc)"
         elif updated:
             cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
-        if evaluated:
-            cause = "the arm does not predict these test rows, noise specified too small, or outliers"
         return [Statement("error", f"{outside}: {cause}")]
     if reduced < low:
         return [Statement("note", f"{outside}: noise specified too large; sigmas are larger than they need be")]
-    ratio = float(np.sqrt(chi2.ratio))
-    if chi2.p_value is not None and chi2.p_value < (1.0 - CONFIDENCE) / 2.0 and ratio > NOTABLE_RATIO:
+    if chi2.p_value is not None and chi2.p_value < SIGNIFICANT and ratio > NOTABLE_RATIO:
         text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
         return [Statement("note", f"{text} ({ratio:.2f} times); sigmas may be too small by as much or more")]
     return []
@@ -264,36 +268,34 @@ def check_kept_noise(case: Case) -> Iterator[Statement]:
         yield Statement("note" if estimated else "error", text)
 
 
-def check_test_rows(case: Case) -> list[Statement]:
+def check_test_rows(case: Case) -> Iterator[Statement]:
     """Check test rows: predicted worse than they should be, and worse than others were fitted."""
     fit, of_fitted = case.fit.goodness.test, case.fit.chi_square.ratio
     if fit is None:
-        return []
-    if fit.n_outliers > MAX_OUTLIER_SHARE * fit.n_measurements:
-        text = f"test rows: {fit.n_outliers} of {fit.n_measurements} measurements are outliers"
-        return [Statement("error", f"{text}: more than a robust loss can tell from noise")]
-    if not fit.n or fit.p_value >= (1.0 - CONFIDENCE) / 2.0:
-        return []
-    ratio = fit.chi2 / fit.expected
-    if ratio < NOTABLE_RATIO**2 or FACTOR < of_fitted > ratio / FACTOR:  # noise specified too small is reported once
-        return []
-    worst = [case.problem.end_names[c.configuration + 1] for c in fit.configurations]
-    text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
-    text += f"; suspicious: {listed(worst)}" if worst else ""
-    return [Statement("error" if ratio > FACTOR else "warning", text)]
+        return
+    count, ratio = fit.outliers, fit.chi2 / fit.expected if fit.n else 0.0
+    most = min(1.0, (count.fitted + 1.0 + 3.0 * np.sqrt(count.fitted + 1.0)) / max(count.n_fitted, 1))
+    if count.test and special.bdtrc(count.test - 1, count.n_test, most) < SIGNIFICANT:
+        text = f"test rows: the loss takes {count.test} of {count.n_test} measurements for outliers"
+        yield Statement("error", f"{text}, of those fitted {count.fitted} of {count.n_fitted}")
+    elif ratio >= NOTABLE_RATIO**2 and fit.p_value < SIGNIFICANT and not FACTOR < of_fitted > ratio / FACTOR:
+        # noise specified too small is reported once
+        worst = [case.problem.end_names[c.configuration + 1] for c in fit.configurations]
+        text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
+        text += f"; suspicious: {listed(worst)}" if worst else ""
+        yield Statement("error" if ratio > FACTOR else "warning", text)
 
 
 def check_priors(fit: PriorFit | None) -> list[Statement]:
     """Check corrections against their prior sigmas; nothing without priors."""
     if fit is None:
         return []
-    found = [
-        f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified" for one in fit.beyond if one.is_place
-    ]
+    places = [one for one in fit.beyond if one.is_place]
+    found = [f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified" for one in places]
     if worst := [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]:
         found.append(f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)})")
     certain = bool(found)
-    if not found and fit.p_value is not None and fit.p_value < (1.0 - CONFIDENCE) / 2.0:
+    if not found and fit.p_value is not None and fit.p_value < SIGNIFICANT:
         largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
         text = f"corrections are too large for their prior sigmas (in sigma of these: {listed(largest)}; sum of"
         found.append(f"{text} squares {fit.chi2:.3g} where {fit.expected:.3g} is expected)")
@@ -310,9 +312,6 @@ def check_prior_scales(case: Case) -> Iterator[Statement]:
         text = f"corrections are far larger than the prior sigmas specified ({', '.join(far)} times)"
         text += ": residuals are too large as well, so corrections may hide unmodelled effects" * case.too_large
         yield Statement("note", text)
-    if unseen := [one.group for one in scales if one.seen < LEAST_SEEN]:
-        text = f"the data determine next to nothing of the corrections of {', '.join(unseen)}"
-        yield Statement("note", f"{text}: the scale of their prior sigmas follows the others")
 
 
 def check_signs(case: Case) -> list[Statement]:
@@ -336,11 +335,12 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
     curved = nonlinear.directions >= NONLINEAR
     if rows.names and (high or curved or rows.share >= AMBIGUOUS_SHARE):
         text = f"the sign of {len(rows.names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
+        share = f"{100.0 * rows.share:.0f} % of the information rests on them"
+        text += f" ({listed(rows.names)} near 0 or 180 deg; {share}): there may be a better optimum far away,"
         text += (
-            f" ({listed(rows.names)} near 0 or 180 deg; {100.0 * rows.share:.0f} % of the information rests on them)"
+            " and sigmas may be too small; leave these out, or measure longer and wider motions, in which more joints"
         )
-        text += ": there may be a better optimum far away, and sigmas may be too small; leave these out, or measure"
-        text += " longer and wider motions, in which more joints move"
+        text += " move"
         return [Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text)]
     if not curved:
         return []
@@ -352,24 +352,92 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
-    """Check whether estimated noise is small compared with the motions it was estimated from."""
-    robot = case.problem.robot
+    """Check whether estimated noise is small compared with what the arm can do."""
+    sizes, estimated = {"m": case.problem.robot.reach, "rad": 1.0}, case.solution.estimated_noise or ()
     for fit in case.fit.goodness.kinds:
-        if (fit.table, fit.kind) not in (case.solution.estimated_noise or ()) or fit.kind not in _WITH_MOTION:
-            continue
-        typical = residuals_at(case.problem, case.solution.parameters, robot, fit.table)
-        motion = max((r.motion for r in typical if r.kind == fit.kind), default=0.0)
-        still = 1e-3 * robot.reach if fit.unit == "m" else 0.0  # about a single anchor the tool point stays
-        motion = motion if motion > still else robot.reach
-        ratio = fit.factor * fit.stated_sigma_rms / motion
-        if ratio >= LARGE_NOISE:
-            text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as the motions measured"
+        ratio = fit.factor * fit.stated_sigma_rms / sizes.get(fit.unit, np.inf)
+        if (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE:
+            text = (
+                f"the noise estimated of {fit.kind} is {ratio:.2g} times {'the reach' if fit.unit == 'm' else '1 rad'}"
+            )
             yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
 
 
 def check_tables(case: Case) -> list[Statement]:
     """Check whether tables lack values that their model needs."""
     return [Statement("note", text) for table in case.problem.data.tables for text in missing_values(table)]
+
+
+def check_systematic(case: Case) -> Iterator[Statement]:
+    """Check whether residuals are systematic; a wrong set-up has them as its consequence."""
+    if case.noise_like is not None and case.noise_like < LIKE_NOISE and not case.setup.explanations:
+        several = "several times those claimed: rely on the test rows"
+        claim = several if case.noise_like < NOT_NOISE else "twice those claimed"
+        text = (
+            f"the residuals are systematic (p = {case.noise_like:.1g}): unmodelled effects; true errors may be {claim}"
+        )
+        yield Statement("warning", text)
+
+
+def check_offsets(case: Case) -> Iterator[Statement]:
+    """Check lengths to anchors that are all off by the same.
+
+    Where residuals are too large for the noise the linearised fit knows less of the offset than its sigma says.
+    """
+    labels, high = case.problem.data.labels, case.fit.chi_square.too_large
+    skipped = case.gross is not None or case.setup.explanations
+    for found in () if skipped else effects.forgotten_offsets(case.solution):
+        of = f" of {labels[found.table]}" if len(labels) > 1 else ""
+        adds = f"{1e3 * found.size:+.3g} mm"
+        adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
+        text = (
+            f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: use offset: estimate,"
+        )
+        yield Statement("error" if high else "warning", f"{text} or calibrate the instrument")
+
+
+def check_missing(case: Case) -> Iterator[Statement]:
+    """Check whether what the convention has no parameter for explains the misfit; an update's convention did before."""
+    asked = case.high and not case.setup.explanations and case.problem.knowledge is None
+    for motion in case.missing:
+        certain = asked and effects.explains_misfit(case.solution, motion)
+        yield Statement("error" if certain else "note", str(motion))
+
+
+def check_setup(case: Case, *, fits: bool) -> Iterator[Statement]:
+    """Check the set-up, before all else: where it is wrong no value can be right.
+
+    Args:
+        case: The solution.
+        fits: Whether nothing speaks against the calibration although the noise was as specified.
+    """
+    for check in (case.setup, *case.setup.others):
+        if check.explanations:
+            yield Statement("note" if fits else "error", str(check))
+        elif check.far and case.high:
+            yield Statement("error", str(check))
+    if case.high and case.setup.unchecked:
+        text = f"the set-up of {', '.join(case.setup.unchecked)} was not checked for common mistakes (units, signs,"
+        yield Statement(
+            "note", f"{text} columns): too few rows to locate its landmarks, or custom kinds of measurement"
+        )
+
+
+def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
+    """Check for other optima: parameters that differ most, in their prior sigmas, with both corrections."""
+    robot = case.problem.robot
+    advice = "; measure positions, or pairs between which more joints move" if case.problem.pair_series else ""
+    for other in case.solution.others:
+        here, there = (
+            at[case.problem.variables.robot_span] - robot.nominal for at in (case.solution.parameters, other)
+        )
+        apart = np.abs(there - here) / [p.scale for p in robot.parameters]
+        words = []
+        for i in [i for i in np.argsort(-apart, kind="stable")[:most].tolist() if apart[i] > 0.3 * apart.max()]:
+            factor, unit = (1e3, "mm") if robot.parameters[i].unit == "m" else (180.0 / np.pi, "deg")
+            words.append(f"{robot.parameters[i].name} {factor * here[i]:+.3g} or {factor * there[i]:+.3g} {unit}")
+        text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
+        yield Statement("error", text + advice)
 
 
 CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
@@ -385,70 +453,6 @@ CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
     check_tables,
 )
 """The checks of every solution, in the order of their statements."""
-
-
-def check_systematic(noise_like: float | None) -> list[Statement]:
-    """Check whether residuals are systematic.
-
-    Args:
-        noise_like: See `Verdict`.
-    """
-    if noise_like is None or noise_like >= LIKE_NOISE:
-        return []
-    certain = noise_like < NOT_NOISE
-    claim = "several times those claimed: rely on the test rows" if certain else "twice those claimed"
-    text = f"the residuals are systematic (p = {noise_like:.1g}): unmodelled effects; true errors may be {claim}"
-    return [Statement("warning", text)]
-
-
-def check_offset(found: effects.Offset, labels: Sequence[str], high: bool) -> Statement:
-    """Check lengths to anchors that are all off by the same.
-
-    Args:
-        found: The offset.
-        labels: Names of the tables.
-        high: Whether residuals are too large for the noise: then the linearised fit knows less of the offset than its
-            sigma says.
-    """
-    of = f" of {labels[found.table]}" if len(labels) > 1 else ""
-    adds = f"{1e3 * found.size:+.3g} mm"
-    adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
-    text = f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: use offset: estimate,"
-    return Statement("error" if high else "warning", f"{text} or calibrate the instrument")
-
-
-def check_model(setup: SetupCheck, *, fits: bool, high: bool) -> Iterator[Statement]:
-    """Check the set-up, before all else: where it is wrong no value can be right.
-
-    Args:
-        setup: The set-up, by residuals before the calibration.
-        fits: Whether nothing speaks against the calibration although the noise was as specified.
-        high: Whether the residuals are larger than the noise, or systematic.
-    """
-    for check in (setup, *setup.others):
-        if check.explanations:
-            yield Statement("note" if fits else "error", str(check))
-        elif check.far and high:
-            yield Statement("error", str(check))
-    if high and setup.unchecked:
-        text = f"the set-up of {', '.join(setup.unchecked)} was not checked for common mistakes (units, signs, columns)"
-        yield Statement("note", f"{text}: too few rows to locate its landmarks, or custom kinds of measurement")
-
-
-def check_optima(solution: Solution, most: int = 4) -> list[Statement]:
-    """Check for other optima: parameters that differ most, in their prior sigmas, with both corrections."""
-    robot, found = solution.problem.robot, []
-    advice = "; measure positions, or pairs between which more joints move" if solution.problem.pair_series else ""
-    for other in solution.others:
-        here, there = (at[solution.problem.variables.robot_span] - robot.nominal for at in (solution.parameters, other))
-        apart = np.abs(there - here) / [p.scale for p in robot.parameters]
-        words = []
-        for i in [i for i in np.argsort(-apart, kind="stable")[:most].tolist() if apart[i] > 0.3 * apart.max()]:
-            factor, unit = (1e3, "mm") if robot.parameters[i].unit == "m" else (180.0 / np.pi, "deg")
-            words.append(f"{robot.parameters[i].name} {factor * here[i]:+.3g} or {factor * there[i]:+.3g} {unit}")
-        text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
-        found.append(Statement("error", text + advice))
-    return found
 
 
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:

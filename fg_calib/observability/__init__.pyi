@@ -1,8 +1,7 @@
 from .identifiability import Identifiability, identifiability_of, observe_configurations, observe_structure
 from .indices import CORRELATED, IdentifiabilityClass, Observability, observability_of_rows
-from .observed_quantities import ObservedQuantities
 from .parallel_axes import MissingMotion, end_of_link, missing_motions
-from .reasons import NOT_EXCITED, LostDirection
+from .reasons import NOT_EXCITED, LostDirection, ObservedQuantities
 
 __all__ = [
     "CORRELATED",

@@ -45,7 +45,6 @@ from fg_calib.inputs import (
     check_flag,
     check_names,
     checked,
-    shown,
 )
 from fg_calib.measurements import Measurements, Table
 from fg_calib.parallel import single_threaded
@@ -140,9 +139,8 @@ def cramer_rao(
         chosen = check("model", model, Model)
         problem = predicted_problem(robot, measurements, chosen, frame=frame, pairing=pairing, pair_errors=pair_errors)
     else:
-        for key, given, default in (("model", model, None), ("pairing", pairing, None), ("frame", frame, "known")):
-            if given != default:
-                raise InputError(key, f"found {shown(given)} with tables", "none: each table has its own")
+        if (model, pairing, frame) != (None, None, "known"):
+            raise InputError("model, pairing, frame", "one of them with tables", "none: each table has its own")
         problem = true_problem(robot, measurements, Options("pose", gauge="none", pair_errors=pair_errors))
     J = named_triangle(problem, problem.start)  # (m, n_names)
     sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])

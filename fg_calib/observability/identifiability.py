@@ -116,17 +116,12 @@ def observe_structure(
     everything = [p for p in robot.parameters if p.estimated or 1 <= p.owner <= robot.n_joints]
 
     def look(names: Sequence[str]) -> Identifiability:
-        problem = random_problem(
-            robot.with_estimated(names), model, frame, n_configurations=n_configurations, seed=seed
-        )
+        arm = robot.with_estimated(names)
+        problem = random_problem(arm, model, frame, n_configurations=n_configurations, seed=seed)
         return replace(identifiability_of(problem, problem.start, "structural", prefer), model=model)
 
-    whole = look(names_of(everything))
-    fixed = tuple(p.name for p in everything if not p.estimated)
-    if not fixed or not estimated:
-        return whole
-    known = look(names_of(estimated))
-    return replace(whole, with_fixed_known=known, fixed=fixed)
+    whole, fixed = look(names_of(everything)), tuple(p.name for p in everything if not p.estimated)
+    return replace(whole, with_fixed_known=look(names_of(estimated)), fixed=fixed) if fixed and estimated else whole
 
 
 @checked

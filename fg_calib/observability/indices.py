@@ -165,9 +165,7 @@ def observability_of_rows(
     null = Vt[rank:]
     dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s.max(initial=0.0), floor)
     relative = (np.linalg.norm(null, axis=0) > SUPPORT_TOLERANCE) & ~dead
-    classes: list[IdentifiabilityClass] = [
-        "ineffective" if d else "relative" if r else "independent" for d, r in zip(dead, relative, strict=True)
-    ]
+    classes = np.select([dead, relative], ["ineffective", "relative"], "independent").tolist()
     groups = _groups(null, dead, scales, parameters, prefer)
     dropped = {name for g in groups for name in g.parameters if name not in g.keep}
     kept = [i for i in range(n) if not dead[i] and names[i] not in dropped]
@@ -192,11 +190,6 @@ def observability_of_rows(
         correlations=correlations,
         weak=weak,
     )
-
-
-def singular_values(matrix: Floats) -> Floats:
-    """Singular values, descending."""
-    return np.linalg.svd(matrix, compute_uv=False).astype(np.float64)
 
 
 def observability_indices(singular_values: Floats, n_measurements: int) -> dict[str, float]:

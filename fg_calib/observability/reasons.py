@@ -1,26 +1,258 @@
 """Why directions are lost: each is moved at random configurations, and what it does to the tool tells the cause.
 
 A cause is stated only if it is checked: that the tool does not move, that everything moves as one body, that the tool
-only turns about its own point, that unknowns of the measurements take the direction up (see `absorbed`), and so on.
-Where no check succeeds the reason is `NO_CAUSE`, never a guess.
+only turns about its own point, that landmarks take the direction up (`find_confounding`), and so on. Where no check
+succeeds the reason is `NO_CAUSE`, never a guess.
+
+A landmark is confounded with a direction where the direction is lost with the columns of its kind projected out, and
+seen with the landmarks held where they are: both are computed from the whitened rows, leaving one kind out after the
+other. Random configurations may show what the user's do not: targets, anchors, planes and boards stay where they are,
+known or not as they are; the arm goes to random configurations, and measures what it predicts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from fg_calib.graph import SUPPORT_TOLERANCE, Problem, named_triangle
-from fg_calib.inputs import Booleans, Floats
-from fg_calib.observability.confounding import Confounding
+from fg_calib.graph import (
+    SUPPORT_TOLERANCE,
+    Places,
+    Problem,
+    eliminate,
+    named_triangle,
+    places_of,
+    square_root,
+    true_problem,
+)
+from fg_calib.inputs import (
+    PAIR_MODELS,
+    POSE_MODELS,
+    Booleans,
+    Floats,
+    FrameKnowledge,
+    Integers,
+    Model,
+    Options,
+    Pairing,
+)
+from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Labels, Measurements, Table
+from fg_calib.measurements.kinds import Instrument
 from fg_calib.observability.indices import Observability
-from fg_calib.observability.observed_quantities import ObservedQuantities
-from fg_calib.observability.random_configurations import at_random_configurations
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import build_chain, forward, random_readings
+from fg_calib.robot import Robot, build_chain, forward, random_readings
+
+
+@dataclass(frozen=True)
+class ObservedQuantities:
+    """What tables together see of the tool's motion; custom kinds may see anything, in any frame.
+
+    Attributes:
+        views: Models with the knowledge of their frames, each once.
+        custom: Whether there are measurements of custom kinds.
+    """
+
+    views: tuple[tuple[Model, FrameKnowledge], ...]
+    custom: bool
+
+    @classmethod
+    def of_tables(cls, tables: Sequence[Table]) -> ObservedQuantities:
+        """What tables see."""
+        views: list[tuple[Model, FrameKnowledge]] = []
+        for t in tables:
+            if t.model is not None:
+                relative = t.unknown_frame or (INSTRUMENTS[t.model].sees_landmarks and not t.known)
+                views.append((t.model, "unknown" if relative else "known"))
+        return cls(tuple(dict.fromkeys(views)), any(t.own for t in tables))
+
+    @classmethod
+    def of(cls, problem: Problem) -> ObservedQuantities:
+        """What the tables of a problem see, and those that its prior information is from."""
+        found = cls.of_tables(problem.data.tables)
+        before = () if problem.knowledge is None else problem.knowledge.views
+        return replace(found, views=tuple(dict.fromkeys((*found.views, *before))))
+
+    @property
+    def position(self) -> bool:
+        """Whether something depends on where the tool point is, or may."""
+        return self.custom or any(one.sees_position for one in self.instruments)
+
+    @property
+    def orientation(self) -> bool:
+        """Whether something depends on the tool's orientation, or may."""
+        return self.custom or any(one.sees_orientation for one in self.instruments)
+
+    @property
+    def pairs(self) -> bool:
+        """Whether all that is measured is between configurations."""
+        return not self.custom and all(one.uses_pairs for one in self.instruments)
+
+    @property
+    def instruments(self) -> list[Instrument]:
+        """The instrument of each view."""
+        return [INSTRUMENTS[model] for model, _ in self.views]
+
+    def is_relative(self, *, position: bool, orientation: bool) -> bool:
+        """Whether what depends on position, or on orientation, says nothing of where the base is."""
+        return all(
+            one.uses_pairs or frame == "unknown"
+            for one, (_, frame) in zip(self.instruments, self.views, strict=True)
+            if self.custom or (position and one.sees_position) or (orientation and one.sees_orientation)
+        )
+
+    @property
+    def blind_to_base(self) -> bool:
+        """Whether nothing says where the base is: an error then counts after the best rigid fit alone."""
+        return not self.custom and self.is_relative(position=True, orientation=True)
+
+    def __str__(self) -> str:
+        return " and ".join(dict.fromkeys(model for model, _ in self.views))
+
+
+NOT_SEEN = 1e-6
+"""Length of a direction's rows over that of what its members do one by one, up to which it is not seen."""
+
+ROUNDING = 1e-8
+"""The part of that which is rounding, as directions are rounded to nine digits."""
+
+HARDLY_SEEN = 1e-3
+"""Part of a direction's rows that landmarks leave, above which it is not lost to them, but hardly seen."""
+
+OTHERS = {"X": "the unknown measurement frame", "": "variables added to the graph"}
+"""Variables that are no landmarks, by the letter of their symbols."""
+
+SINGULAR = (("O",), ("X",))
+"""Letters whose words are a singular."""
+
+
+def find_confounding(problem: Problem, parameters: Floats, directions: Floats) -> list[tuple[str, ...] | None]:
+    """Letters of what each of a problem's null-space directions is confounded with.
+
+    Args:
+        problem: The problem.
+        parameters: The parameter vector that the directions were found at.
+        directions: One a column, shape (n_robot_columns, n), [m] and [rad].
+
+    Returns:
+        None where nothing is confounded with a direction that is seen, empty where nothing shows it anyway.
+    """
+    variables, found = problem.variables, list[tuple[str, ...] | None]([()] * directions.shape[1])
+    if not variables.nuisance:
+        return found  # measurement frames alone hide what moves the whole arm as one body, nothing else
+    columns = dict[str, list[Integers]]()
+    for v in (*variables.frames, *variables.nuisance):
+        letter = "X" if v.kind == "frame" else v.letter if v.kind == "unknown" else ""
+        columns.setdefault(letter, []).append(np.arange(v.columns.start, v.columns.stop))
+    A = square_root(problem, parameters)[:, :-1]
+    J = A[:, : variables.n_columns] @ variables.tangent_derivative(parameters)[:, : variables.n_robot_columns]
+    rows, lengths, changes = J @ directions, np.linalg.norm(J, axis=0), np.abs(directions)
+    size = np.linalg.norm(rows, axis=0)
+    one_by_one = np.maximum(lengths @ changes, NOT_SEEN * lengths.max() * changes.max(axis=0))
+    shown = np.flatnonzero(size > NOT_SEEN * one_by_one)
+
+    def left(held: Collection[str] = ()) -> Floats:
+        """Length of what landmarks do not explain of directions' rows, but for kinds that are held, shape (n,)."""
+        free = [c for letter, of in columns.items() if letter not in held for c in of]
+        wide = np.column_stack([rows[:, shown], *(A[:, c] for c in free)])
+        return np.asarray(np.linalg.norm(eliminate(wide, np.zeros(len(wide)), len(shown)).A, axis=0))
+
+    without = {letter: left((letter,)) for letter in columns}
+    alone, every = {letter: left(set(columns) - {letter}) for letter in columns}, left()
+    for i, k in enumerate(shown.tolist()):
+        most = max(NOT_SEEN * size[k], ROUNDING * one_by_one[k], 10.0 * every[i])
+        needed = tuple(letter for letter in columns if without[letter][i] > most)
+        enough = [(letter,) for letter in columns if alone[letter][i] <= most]
+        found[k] = (enough[0] if enough else needed or tuple(columns)) if every[i] <= HARDLY_SEEN * size[k] else None
+    return found
+
+
+def confounding_in_words(letters: Sequence[str]) -> str:
+    """What a direction is confounded with, and which additional knowledge would show it."""
+    names = [OTHERS.get(letter) or LANDMARKS[letter].description for letter in letters]
+    kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
+    remedy = f": to see it, give places of {kind.name}s (key {kind.key})" if kind is not None and kind.key else ""
+    together = " together" if len(letters) > 1 else ""
+    return f"{' and '.join(names)} {'takes' if letters in SINGULAR else 'take'} it up{together}{remedy}"
+
+
+N_RANDOM = 60
+"""Random configurations of each table."""
+
+
+def at_random_configurations(problem: Problem, parameters: Floats) -> Problem | None:
+    """The tables of a problem at random configurations, each of those that would say the same once.
+
+    Contacts cannot be planned at random configurations: a table of contacts alone counts as one of positions in an
+    unknown frame. Custom kinds are left out.
+
+    Args:
+        problem: The problem.
+        parameters: Its parameter vector: where the arm and everything else is.
+
+    Returns:
+        A problem of the same parameters, noise assumed as `Robot.scale_of` says; None where nothing is left.
+    """
+    robot = problem.robot.with_values(parameters[problem.variables.robot_span])
+    places, before = places_of(problem, parameters), () if problem.knowledge is None else problem.knowledge.views
+    q = np.zeros((1, problem.robot.n_joints))
+    anything = Measurements.from_arrays(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
+    earlier = [Table(anything, m, frame=frame) for m, frame in before if m in (*POSE_MODELS, *PAIR_MODELS)]
+    different: dict[tuple[object, ...], Table] = {}
+    for table in (*problem.data.tables, *earlier):
+        if table.model is not None and (named := _named(table))[1]:
+            model = INSTRUMENTS[table.model].random_model(table)
+            different[model, table.frame, named[0], frozenset(named[1]), table.offset] = table
+    generator = np.random.default_rng(0)
+    tables = [
+        at_configurations(robot, table, random_readings(robot, N_RANDOM, generator), places, f"random {i}")
+        for i, table in enumerate(different.values())
+    ]
+    return true_problem(robot, tables, Options(gauge="none", pair_errors="independent"), places) if tables else None
+
+
+def _named(table: Table) -> tuple[str, list[str | None]]:
+    """The column that names landmarks, and those of the train rows; None of rows without a name."""
+    instrument = INSTRUMENTS[INSTRUMENTS[str(table.model)].random_model(table)]
+    column = next(iter(instrument.labels), "")
+    labels, train = table.measurements.labels.get(column), ~table.measurements.test
+    if labels is None:
+        return column, [column] if instrument.sees_landmarks and column not in instrument.optional_labels else [None]
+    return column, [labels.names[k] if k >= 0 else None for k in np.unique(labels.index[train]).tolist()]
+
+
+def at_configurations(robot: Robot, table: Table, q: Floats, places: Places, source: str) -> Table:
+    """A table of what the arm predicts at configurations, landmarks in turn.
+
+    Args:
+        robot: The arm.
+        table: What instrument it is; for pixels boards are seen, or the tool from the room.
+        q: The configurations, shape (n, n_joints).
+        places: Of the landmarks that the table names.
+        source: What the table is called.
+    """
+    model = INSTRUMENTS[str(table.model)].random_model(table)
+    poses, (column, names) = forward(build_chain(robot), robot.trig(q)), _named(table)
+    real = [name for name in names if name is not None]
+    index = np.array([real.index(name) if name is not None else -1 for name in names])[np.arange(len(q)) % len(names)]
+    length = np.full(len(q), robot.scale_of("m"))
+    m = Measurements.from_arrays(
+        q,
+        position=poses.position,
+        rotation=poses.rotation,
+        sigma_position=robot.scale_of("m"),
+        sigma_orientation=robot.scale_of("rad"),
+        source=table.measurements.source,
+    )
+    sigmas = dict.fromkeys(INSTRUMENTS[model].generic_columns, length)
+    m = replace(m, labels={column: Labels(tuple(real), index)} if real else {}, sigma_length=length, sigmas=sigmas)
+    m = INSTRUMENTS[model].predict(m, poses, lambda kind, name: places[kind.letter, name])
+    frame = "unknown" if model != table.model and INSTRUMENTS[model].is_pose else table.frame
+    known = {name: k for name, k in table.known.items() if name in real}
+    return Table(replace(m, source=source), model, Pairing("chain"), frame, known=known, offset=table.offset)
+
 
 NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"
@@ -47,18 +279,12 @@ class LostDirection:
 @single_threaded
 def explain(problem: Problem, parameters: Floats, observability: Observability) -> tuple[LostDirection, ...]:
     """The reason for every lost direction of an observability found for a problem at a parameter vector."""
-    return explain_relations(problem, observability.names, observability.lost, parameters)
-
-
-def explain_relations(
-    problem: Problem, names: Sequence[str], lost: Sequence[dict[str, float]], parameters: Floats
-) -> tuple[LostDirection, ...]:
-    """The reason for every one of some relations of a problem's parameters, by these names, at a parameter vector."""
+    names, lost = observability.names, observability.lost
     if not lost:
         return ()
     motion = _Motion(problem, parameters, ObservedQuantities.of(problem))
     directions = np.array([[relation.get(name, 0.0) for name in names] for relation in lost]).T
-    confounding = Confounding(problem, parameters, directions)
+    confounding = find_confounding(problem, parameters, directions)
     touched = any(table.measurements.groups is not None for table in problem.data.tables)
 
     @cache
@@ -71,13 +297,13 @@ def explain_relations(
         return shown
 
     def reason(k: int, direction: Floats) -> str:
-        by = confounding.by(k)
+        by = confounding[k]
         cause = motion.reason(direction) if by == () else NO_CAUSE
         if cause != NO_CAUSE:
             return cause
         if not (by and touched) and seen()[k]:  # nor is it known what touches of the same points would show
             return NOT_EXCITED
-        return NO_CAUSE if not by else BASE if motion.of_base(direction) else confounding.words(k)
+        return NO_CAUSE if not by else BASE if motion.of_base(direction) else confounding_in_words(by)
 
     return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
 
@@ -100,53 +326,37 @@ class _Motion:
         self._scales = np.array([scale[p.unit] for p in self._parameters])
         self._sizes = np.abs(self._J)
         self._most = [float((J * self._scales).max(initial=0.0)) for J in np.split(self._sizes, 2, axis=1)]
-        axes = np.moveaxis(poses.jacobian[:, :3, n:], 2, 1)[:, [not j.prismatic for j in robot.joints]]
-        axes = axes * np.where(np.sum(axes * axes[:1, :1], axis=2, keepdims=True) < 0.0, -1.0, 1.0)
-        self._common_axis = axes[:, 0] if axes.size and self._constant(axes.reshape(-1, 3)) else None
         last = poses.jacobian[:, 3:, -1]
         self._on_last_axis = not robot.joints[-1].prismatic and float(np.abs(last).max()) < _NOTHING
 
-    def reason(self, direction: Floats) -> str:  # noqa: PLR0911 - one return a cause
+    def reason(self, direction: Floats) -> str:
         """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
-        w, dp, turns, moves = self._of_tool(direction)
-        sees_orientation, sees_position, pairs = self._seen.orientation, self._seen.position, self._seen.pairs
+        w, _, turns, moves = self._of_tool(direction)
+        seen, still = self._seen, not turns and not moves
         members = [p for p, v in zip(self._parameters, direction, strict=True) if v != 0.0]
         units, on_last_axis = {p.unit for p in members}, "the tool point lies on the last axis: " * self._on_last_axis
-        parallel = "parallel directions"
+        parallel, about = "parallel directions", "it" if self._on_last_axis else "its own point"
         if all(p.kind in ("d", "theta") for p in members):
             parallel = f"parallel axes {', '.join(str(p.owner) for p in members)}"
-        if not turns and not moves and units == {"m"}:
-            return f"{parallel}: only the sum of the shifts along them acts"
-        if not turns and not moves:
-            return (
-                "only their sum turns about the same axis" if units == {"rad"} else "together they do not move the tool"
-            )
-        if not sees_orientation and not moves:
-            about = "it" if self._on_last_axis else "its own point"
-            return f"{on_last_axis}the tool only turns about {about}, unseen by {self._seen}"
-        if not sees_position and not turns and units == {"rad"}:
-            return f"{parallel}: only the sum of their turns is seen, and no lengths are"
-        if not sees_position and not turns:
-            return f"the tool only moves without turning, unseen by {self._seen}"
-        if self._is_of_base(w, dp, turns):
-            return BASE
-        if pairs and not (moves and sees_position) and self._constant(np.einsum("nji,nj->ni", self._R, w)):
-            of_the_tool = all(p.name.startswith("tool.") for p in members)
-            what = "the tool frame turns by the same in itself everywhere, which no angle between two poses shows"
-            return what if of_the_tool else f"{on_last_axis}{what}"
-        if pairs and self._common_axis is not None and self._tilts(w, dp, self._common_axis):
-            return "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
-        return NO_CAUSE
+        in_itself = self._constant(np.einsum("nji,nj->ni", self._R, w)) and not (moves and seen.position)
+        of_what = "" if all(p.name.startswith("tool.") for p in members) else on_last_axis
+        causes = (
+            (still and units == {"m"}, f"{parallel}: only the sum of the shifts along them acts"),
+            (still and units == {"rad"}, "only their sum turns about the same axis"),
+            (still, "together they do not move the tool"),
+            (not (seen.orientation or moves), f"{on_last_axis}the tool only turns about {about}, unseen by {seen}"),
+            (not (seen.position or turns) and units == {"rad"}, f"{parallel}: only the sum of their turns is seen"),
+            (not (seen.position or turns), f"the tool only moves without turning, unseen by {seen}"),
+            (self.of_base(direction), BASE),
+            (seen.pairs and in_itself, f"{of_what}the tool frame turns by the same in itself everywhere"),
+        )
+        return next((words for applies, words in causes if applies), NO_CAUSE)
 
     def of_base(self, direction: Floats) -> bool:
         """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""
         w, dp, turns, _ = self._of_tool(direction)
-        return self._is_of_base(w, dp, turns)
-
-    def _is_of_base(self, w: Floats, dp: Floats, turns: bool) -> bool:
-        if not self._seen.is_relative(position=True, orientation=turns):
-            return False
-        return self._constant(w) and (not self._seen.position or self._constant(dp - np.cross(w, self._p)))
+        relative = self._seen.is_relative(position=True, orientation=turns) and self._constant(w)
+        return relative and (not self._seen.position or self._constant(dp - np.cross(w, self._p)))
 
     def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
         """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""
@@ -157,12 +367,6 @@ class _Motion:
         turns = float(np.abs(w).max()) > max(_NOTHING * size_w, 1e-3 * _NOTHING * size_p, share * self._most[0])
         moves = float(np.abs(dp).max()) > max(_NOTHING * size_p, 1e-3 * _NOTHING * size_w, share * self._most[1])
         return w, dp, turns, moves
-
-    def _tilts(self, w: Floats, dp: Floats, axis: Floats) -> bool:
-        """Whether the tool moves along the common axis of the joints only, and turns across it only."""
-        along = np.sum(w * axis, axis=1)
-        in_plane = dp - np.sum(dp * axis, axis=1, keepdims=True) * axis
-        return bool(np.abs(along).max() < 1e-8 and np.abs(in_plane).max() < 1e-8)
 
     @staticmethod
     def _constant(values: Floats) -> bool:

@@ -126,11 +126,3 @@ def test_the_task_counts_in_its_own_units_and_without_what_none_determines(lost)
         share = at @ W @ at / np.sum(np.diag(W) * poses.scales[:3] ** 2)
     assert system.unknown == pytest.approx(share, abs=1e-9)
     assert len(system.core) == (2 if lost else 3)
-
-
-def test_what_was_measured_already_is_no_longer_to_be_chosen():
-    system = SYSTEMS[0]
-    more = system.with_known(np.array([2, 7]))
-    assert np.abs(more.known - information(system, [2, 7])).max() < rounding(more.known)
-    some = more.select(np.array([4, 1]))
-    assert np.abs(some.information(np.array([1])) - information(system, [2, 7, 1])).max() < rounding(more.known)

