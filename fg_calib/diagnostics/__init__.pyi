@@ -1,7 +1,6 @@
 from .inspection import Inspection, inspect_job
 from .linearity import NEAR_SIGMAS
-from .nominal_residuals import MAX_ROWS
-from .robust_screening import Disagreements
+from .nominal_residuals import MAX_ROWS, Disagreements
 from .setup_check import SetupCheck, check_setup, check_tables, reporting
 from .unmodelled_effects import basis_of
 from .verdict import LIKE_NOISE, MOST_ESTIMATED, Verdict, chi2_in_words, judge, predicted_in_words, probability

@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from itertools import chain
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from fg_calib.diagnostics.linearity import find_ambiguous_rows
-from fg_calib.diagnostics.robust_screening import Disagreements, find_disagreements
-from fg_calib.diagnostics.setup_check import SetupCheck, check_tables, reporting
-from fg_calib.diagnostics.setup_hypotheses import MOTION_M, MOTION_RAD
-from fg_calib.diagnostics.verdict import Statement, listed
+from fg_calib.diagnostics.nominal_residuals import Disagreements, find_disagreements
+from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
+from fg_calib.diagnostics.verdict import Severity, Statement, listed, texts
 from fg_calib.graph import Problem, Solution, linear_system, problem_of, tables_of, unsolved
 from fg_calib.inputs import Brief, checked
 from fg_calib.job import Job
@@ -189,9 +187,8 @@ def inspect_job(job: Job) -> Inspection:
         n_excluded={reason: n for reason, n in problem.n_excluded.items() if n},
         evaluated=problem.evaluated,
     )
-    statements = list(chain(_check_rows(found, job), _check_result(found, job), _check_tables(found, job)))
-    errors, notes = (tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "note"))
-    return replace(found, findings=errors, cautions=notes)
+    statements = [statement for check in CHECKS for statement in check(found, job)]
+    return replace(found, findings=texts(statements, "error"), cautions=texts(statements, "note"))
 
 
 def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
@@ -242,87 +239,79 @@ def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
     )
 
 
-def _check_rows(found: Inspection, job: Job) -> Iterator[Statement]:
-    """Check set-up, single rows and readings."""
+def _check_setups(found: Inspection, job: Job) -> Iterator[Statement]:
+    """Check the set-up of each table; where single rows disagree with the arm the others are not to blame."""
     arm = [p for p in job.robot.parameters if p.estimated and 1 <= p.owner <= job.robot.n_joints]
     has_priors = job.options.has_priors and all(p.tolerance is not None for p in arm)
-    wrong, loss = found.disagreements.found, job.options.loss
+    wrong = {one.table for one in found.disagreements.found}
     for check in reporting(found.setups):
-        if check.explanations or all(check.table != one.table for one in wrong):
-            yield Statement("error" if check.explanations or has_priors else "note", str(check))
+        severity: Severity = "error" if check.explanations or has_priors else "note"
+        yield Statement(severity, str(check), check.explanations or check.table not in wrong)
+
+
+def _check_disagreements(found: Inspection, job: Job) -> Iterator[Statement]:
+    """Check single rows, and the range of the readings."""
+    wrong, loss = found.disagreements.found, job.options.loss
     if wrong:
         tables, tested = {one.table for one in wrong}, sum(one.test for one in wrong)
         names = [f"{'-'.join(one.ends)}{f' of {one.table}' * (len(tables) > 1)}" for one in wrong]
         of = f" of {wrong[0].table}" * (len(tables) == 1 and bool(wrong[0].table))
         text = f"measurements that disagree with the nominal arm far more than the others do: {len(wrong)}"
-        text += f" ({listed(list(dict.fromkeys(names)))}{of})"
-        if tested or loss == "none":
-            text += ": look at them" + ", or let a robust loss do so (loss: gnc)" * (
-                loss == "none" and tested < len(wrong)
-            )
-            text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
+        text += f" ({listed(list(dict.fromkeys(names)))}{of})" + ": look at them" * bool(tested or loss == "none")
+        text += ", or let a robust loss do so (loss: gnc)" * (loss == "none" and tested < len(wrong))
+        text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
         yield Statement("error" if tested or loss == "none" else "note", text)
     for joint in found.joints:
-        if joint.n_outside:
-            text = f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
-            yield Statement("error", text)
+        text = f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
+        yield Statement("error", text, joint.n_outside)
 
 
 def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
     """Check what makes any result worthless: nothing determined, nothing to check it by; and what it will lack."""
-    observability, accept = found.identifiability.observability, job.options.accept
+    seen, lost, options = found.identifiability.observability, found.identifiability.lost, job.options
     tested = any(table.n_test or table.n_test_pairs for table in found.tables)
-    if observability.names and not observability.rank:
-        yield Statement("error", "these rows determine none of the parameters that are estimated")
-    if found.dof <= 0:
-        text = "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
-        yield Statement("error", text)
     measured = {kind for table in found.tables for kind in table.n_residuals}
-    given = [f.name for f in fields(accept) if getattr(accept, f.name) is not None]
-    for kind in given:
-        if kind not in measured:
-            text = f"accept: nothing in this job measures any {kind}: its limit cannot be evaluated"
-            yield Statement("error", text)
-    if not (tested or job.options.folds is not None or found.evaluated) and measured & set(given):
-        text = "accept: limits are judged by what is held out, and nothing is: add test rows (column split), or folds"
-        yield Statement("error", text)
-    yield from (Statement("note", str(motion)) for motion in found.identifiability.missing)
+    limited = [f.name for f in fields(options.accept) if getattr(options.accept, f.name) is not None]
+    text = "these rows determine none of the parameters that are estimated"
+    yield Statement("error", text, seen.names and not seen.rank)
+    text = "no degree of freedom is left: nothing would say whether the fit is right, or the noise; measure more"
+    yield Statement("error", text, found.dof <= 0)
+    for kind in limited:
+        text = f"accept: nothing in this job measures any {kind}: its limit cannot be evaluated"
+        yield Statement("error", text, kind not in measured)
+    text = "accept: limits are judged by what is held out, and nothing is: add test rows (column split), or folds"
+    held_out = tested or options.folds is not None or found.evaluated
+    yield Statement("error", text, measured.intersection(limited) and not held_out)
+    for motion in found.identifiability.missing:
+        yield Statement("note", str(motion))
     still = [joint.name for joint in found.joints if joint.still]
-    if still:
-        what = "moves: its zero is" if len(still) == 1 else "move: their zeros are"
-        yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before")
-    if n := sum(direction.reason == NOT_EXCITED for direction in found.identifiability.lost):
-        text = (
-            f"directions not excited by these configurations although the model sees more: {n}; move every joint more"
-        )
-        yield Statement("note", text)
-    if not found.evaluated and not tested:
-        text = "no test rows: nothing would check how well the calibration predicts (column split)"
-        yield Statement("note", text)
-    if job.options.gauge == "none" and found.identifiability.lost:
-        yield Statement("note", "gauge none: what is not determined has no sigma")
+    what = "moves: its zero is" if len(still) == 1 else "move: their zeros are"
+    yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before", still)
+    n = sum(direction.reason == NOT_EXCITED for direction in lost)
+    text = f"directions not excited by these configurations although the model sees more: {n}; move every joint more"
+    yield Statement("note", text, n)
+    text = "no test rows: nothing would check how well the calibration predicts (column split)"
+    yield Statement("note", text, not (found.evaluated or tested))
+    yield Statement("note", "gauge none: what is not determined has no sigma", options.gauge == "none" and lost)
 
 
 def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
     """Check each table for copies, leaked test rows, pairs of ambiguous sign; noise and priors to be estimated."""
     for t in found.tables:
-        if t.n_copies:
-            text = f"{t.name}: rows that are exact copies of others: {t.n_copies} ({t.copy}); each counts as one more"
-            yield Statement("note", f"{text} measurement: remove it")
-        if t.n_leaked:
-            text = f"{t.name}: test rows at configurations of train rows, no check of a prediction: {t.n_leaked}"
-            yield Statement("note", text)
-        if t.n_pairs and t.n_ambiguous > AMBIGUOUS_SHARE * t.n_pairs:
-            text = f"{t.name}: the sign of {t.n_ambiguous} of {t.n_pairs} train pairs is ambiguous within the prior"
-            text += " sigmas (near 0 or 180 deg): measure longer and wider motions, in which more joints move"
-            yield Statement("note", text)
-    if job.options.estimate_noise:
-        text = "noise is to be estimated: sigmas and accuracy here are for specified noise, or 1 mm and 1 mrad"
-        yield Statement("note", text)
-    if job.options.estimate_tolerance:
-        text = "prior sigmas are to be estimated: accuracy here is for those specified, or 1 mm and 1 mrad"
-        yield Statement("note", text)
+        text = f"{t.name}: rows that are exact copies of others: {t.n_copies} ({t.copy}); each counts as one more"
+        yield Statement("note", f"{text} measurement: remove it", t.n_copies)
+        text = f"{t.name}: test rows at configurations of train rows, no check of a prediction: {t.n_leaked}"
+        yield Statement("note", text, t.n_leaked)
+        text = f"{t.name}: the sign of {t.n_ambiguous} of {t.n_pairs} train pairs is ambiguous within the prior sigmas"
+        text += " (near 0 or 180 deg): measure longer and wider motions, in which more joints move"
+        yield Statement("note", text, t.n_ambiguous > AMBIGUOUS_SHARE * t.n_pairs)
+    text = "is to be estimated: sigmas and accuracy here are for what is specified, or 1 mm and 1 mrad"
+    yield Statement("note", f"noise {text}", job.options.estimate_noise)
+    yield Statement("note", f"the scale of prior sigmas {text}", job.options.estimate_tolerance)
     unseen = [t.name for t, check in zip(found.tables, found.setups, strict=True) if t.model and not check.residuals]
-    if unseen:
-        text = f"{listed(unseen)}: too few rows to look for common mistakes (units, signs, columns) before solving"
-        yield Statement("note", text)
+    text = f"{listed(unseen)}: too few rows to look for common mistakes (units, signs, columns) before solving"
+    yield Statement("note", text, unseen)
+
+
+CHECKS = (_check_setups, _check_disagreements, _check_result, _check_tables)
+"""The checks of a job, in the order of their statements."""

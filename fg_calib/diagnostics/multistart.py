@@ -14,6 +14,7 @@ Note:
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
         return solution
     found = [solution]
     with one_blas_thread:
-        starts = [_moved(solution, step) for step in _steps(solution)]
+        starts = [solution.problem.variables.moved(solution.parameters, step) for step in _steps(solution)]
     for start in starts:
         found += _solve_from(solution, solution.problem, options, start)
     for landmark in _mirrored_landmarks(solution.problem) if solution.problem.options.loss == "none" else ():
@@ -87,8 +88,7 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
     return replace(kept, others=tuple(one.parameters for one in others), seconds=seconds)
 
 
-def _objective(solution: Solution) -> float:
-    return solution.objective
+_objective = attrgetter("objective")
 
 
 def _solve_from(
@@ -105,16 +105,13 @@ def _solve_from(
     return [replace(other, estimated_noise=noise, estimated_tolerances=tolerances)] if other.converged else []
 
 
-def _moved(solution: Solution, step: Floats) -> Floats:
-    """The parameter vector a step of the core from the estimate, landmarks as they are there."""
-    return solution.problem.variables.moved(solution.parameters, step)
-
-
 def _steps(solution: Solution) -> list[Floats]:
     """Steps from the estimate to other starts, shape (n_columns,) each."""
     problem, variables = solution.problem, solution.problem.variables
     scales, steps = variables.prior_scales, list[Floats]()
-    nominal = _nominal(solution)
+    nominal, robot = solution.before.copy(), problem.robot
+    known = np.array([p.tolerance is not None for p in robot.parameters])
+    nominal[variables.robot_span][known] = robot.nominal[known]
     s, V = directions(problem, solution.parameters)
     s_nominal, V_nominal = directions(problem, nominal)
     ratio = np.linalg.norm((V.T @ V_nominal) / np.maximum(s, SIGNAL_FLOOR)[:, None], axis=0)
@@ -133,15 +130,6 @@ def _steps(solution: Solution) -> list[Floats]:
         step /= max(1.0, float(np.max(np.abs(step) / longest)))
         steps += [step, -step]
     return steps
-
-
-def _nominal(solution: Solution) -> Floats:
-    """The parameter vector before the descent, with nominal values wherever a prior says how good they are."""
-    nominal = solution.before.copy()
-    for i, parameter in enumerate(solution.problem.robot.parameters):
-        if parameter.tolerance is not None:
-            nominal[i] = parameter.nominal
-    return nominal
 
 
 def _is_an_arm(other: Solution, best: Solution) -> bool:

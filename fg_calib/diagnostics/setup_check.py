@@ -8,23 +8,25 @@ their own, last.
 
 Base and tool are one for all tables, so a table that is wrong spoils the residuals of all others; each is therefore
 judged by the base and tool that it determines alone. Only where all tables are right alone can they disagree on base
-and tool, and it is reported of those that are farthest off: both, where there are two.
+and tool, which is reported of all that are far off together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
+from itertools import combinations, permutations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fg_calib.diagnostics.nominal_residuals import Setup, TypicalResidual, nominal_residuals, residuals_at, setup_of
-from fg_calib.diagnostics.setup_hypotheses import About, Mistake, setup_hypotheses, still_joints
 from fg_calib.graph import Problem
-from fg_calib.inputs import Brief, Floats, FrameKnowledge, Model, checked
+from fg_calib.inputs import Booleans, Brief, Floats, FrameKnowledge, Model, checked
 from fg_calib.measurements import Measurements, Table
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot import Robot
+from fg_calib.robot import CONVENTIONS, Robot
 
 FAR = 5.0
 """Excess above which residuals before a calibration are not what noise and prior sigmas predict."""
@@ -40,9 +42,6 @@ N_COMBINED = 6
 
 NEGLIGIBLE_EXCESS = 1e-6
 """Excess below which there is nothing to explain: each unknown takes its own row up."""
-
-FARTHEST_SHARE = 0.7
-"""Excess of a table over that of the one that is farthest off, from which it is named too: two tables are both."""
 
 OTHER_TOOL = "tool or base differ from those of the other tables (another target on the tool, another frame)"
 
@@ -189,20 +188,21 @@ def check_tables(
         with_landmarks: Look at tables whose targets, anchors, planes or boards have to be located first.
     """
     whole, labels = problem.whole or problem, problem.data.labels
-    checks, joint = list[SetupCheck](), dict[int, tuple[Setup, SetupCheck]]()
+    checks, together = list[SetupCheck](), [SetupCheck()] * len(labels)
     with one_blas_thread:
         for number, (label, table) in enumerate(zip(labels, problem.data.tables, strict=True)):
             setup, one = setup_of(whole.robot, table), SetupCheck()
             if setup is not None and setup.has_landmarks and with_landmarks:
                 one = _check_alone(setup, True)
             elif setup is not None and not setup.has_landmarks and _enough(setup):
-                together = residuals_at(whole, before, whole.robot, number)
-                one = _check_alone(setup, doubtful, together)
-                joint[number] = setup, SetupCheck(together, table=label)
+                together[number] = SetupCheck(residuals_at(whole, before, whole.robot, number))
+                one = _check_alone(setup, doubtful, together[number])
             checks.append(replace(one, table=label if len(labels) > 1 else ""))
-        if len(checks) > 1 and not reporting(checks):
-            for number, one in _disagreeing(joint):
-                checks[number] = one
+    if not reporting(checks):
+        for number, one in enumerate(together):
+            if one.far:  # and the table alone is not
+                other = Explanation((OTHER_TOOL,), checks[number].residuals)
+                checks[number] = replace(one, table=labels[number], explanations=(other,))
     return checks
 
 
@@ -214,7 +214,7 @@ def _enough(setup: Setup) -> bool:
     return n_rows >= 2 * n_free + 6
 
 
-def _check_alone(setup: Setup, doubtful: bool, together: tuple[TypicalResidual, ...] = ()) -> SetupCheck:
+def _check_alone(setup: Setup, doubtful: bool, together: SetupCheck | None = None) -> SetupCheck:
     """The check of a table, and the mistakes that explain its residuals.
 
     Args:
@@ -222,27 +222,12 @@ def _check_alone(setup: Setup, doubtful: bool, together: tuple[TypicalResidual, 
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
         together: Its residuals with the base and the tool that all tables determine together.
     """
-    found = SetupCheck(together)
-    if not together or found.far or doubtful:
+    found = together or SetupCheck()
+    if not found.residuals or found.far or doubtful:
         alone = SetupCheck(nominal_residuals(setup))
-        found = alone if not together or 0.0 < alone.excess < found.excess else found
+        found = alone if not found.residuals or 0.0 < alone.excess < found.excess else found
     look = found.far or (doubtful and not setup.has_landmarks and found.excess >= NEGLIGIBLE_EXCESS)
     return replace(found, explanations=_explanations(setup, found)) if look else found
-
-
-def _disagreeing(joint: dict[int, tuple[Setup, SetupCheck]]) -> list[tuple[int, SetupCheck]]:
-    """Tables that only a tool and a base of their own fit, by their numbers; those that are farthest off.
-
-    Args:
-        joint: Each table alone, and its residuals with the base and the tool that all tables determine together.
-    """
-    found = []
-    for number, (setup, one) in joint.items():
-        alone = Explanation((OTHER_TOOL,), nominal_residuals(setup))
-        if one.far and alone.excess <= min(EXPLAINED, one.excess / REDUCTION):
-            found.append((number, replace(one, explanations=(alone,))))
-    farthest = max((one.excess for _, one in found), default=0.0)
-    return [(number, one) for number, one in found if one.excess > FARTHEST_SHARE * farthest]
 
 
 def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
@@ -251,12 +236,10 @@ def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
     least = About.FRAME if given.excess < 1.0 else About.UNIT
     single, most = [_trial(m) for m in setup_hypotheses(setup) if m.about >= least], given.excess / REDUCTION
     found = _accepted(single, most)
-    if given.far and (not found or any("readings" in str(one) for one in found)):
-        found = _accepted([*single, *map(_trial, still_joints(setup))], most)
     return found if found or not given.far or setup.has_landmarks else _accepted(_doubles(single, given.excess), np.inf)
 
 
-_Trial = tuple[tuple[Mistake, ...], Explanation]
+_Trial = tuple[tuple["Mistake", ...], Explanation]
 """Mistakes that were undone, and the residuals that are left then."""
 
 
@@ -291,3 +274,224 @@ def _accepted(trials: Sequence[_Trial], most: float) -> tuple[Explanation, ...]:
     best = max(min((trial.excess for _, trial in good), default=0.0), 0.5)
     chosen = [one for one in good if one[1].excess <= 2.0 * best]
     return tuple(trial for _, trial in sorted(chosen, key=lambda one: sum(mistake.about for mistake in one[0])))
+
+
+# --- hypotheses, each undone ------------------------------------------------------------------------------------------
+
+MAX_REACH, MIN_REACH = 50.0, 0.02
+"""Reach of an arm beyond which its own lengths are taken for the mistake, [m]."""
+
+MOTION_RAD, MOTION_M = 0.2, 0.01
+"""Range of a joint's readings, below which another unit is no explanation but a joint that does not move."""
+
+_UNITS = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "inches": 0.0254}
+LENGTHS = {_UNITS[one] / _UNITS[other]: f"{one}, not {other}" for one, other in permutations(_UNITS, 2)}
+ANGLES = {np.pi / 180.0: "deg, not rad", 180.0 / np.pi: "rad, not deg"}
+"""Units that are meant by values in another, by the factor that converts them."""
+
+
+class About(IntEnum):
+    """The subject of a mistake, the simplest first."""
+
+    UNIT = 0
+    COLUMNS = 1
+    JOINT = 2
+    FRAME = 3
+    TOOL = 4
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake in a set-up, undone.
+
+    Attributes:
+        about: Its subject.
+        words: The end of a sentence "residuals fall if ...".
+        without: The set-up with it undone.
+    """
+
+    about: About
+    words: str
+    without: Setup
+
+
+_Found = Iterator[tuple[str, Setup]]
+"""Words of a `Mistake`, and the set-up with it undone."""
+
+
+def setup_hypotheses(setup: Setup) -> Iterator[Mistake]:
+    """Every mistake that is known, undone in a set-up."""
+    for about, hypothesis in HYPOTHESES:
+        for words, without in hypothesis(setup):
+            yield Mistake(about, words, without)
+
+
+def _robot_in_units(setup: Setup) -> _Found:
+    """Lengths of the robot, where no arm has such a size, and angles."""
+    robot = setup.robot
+    in_m = np.array([parameter.unit == "m" for parameter in robot.parameters])
+    reach = float(np.sum(np.abs(robot.nominal[in_m])))
+    far, has_angles = reach > MAX_REACH, robot.convention in CONVENTIONS and robot.nominal[~in_m].any()
+    for factor, unit in LENGTHS.items() if far or 0.0 < reach < MIN_REACH else ():
+        if (factor < 1.0) == far:
+            yield f"the robot's lengths are in {unit}", setup.with_values(robot.nominal * np.where(in_m, factor, 1.0))
+    for factor, unit in ANGLES.items() if has_angles else ():
+        yield f"the robot's angles are in {unit}", setup.with_values(robot.nominal * np.where(in_m, 1.0, factor))
+
+
+def _measured_in_units(setup: Setup) -> _Found:
+    """Lengths and angles of the measurements."""
+    m = setup.table.measurements
+    pairs, groups, image, angles = m.pairs, m.groups, m.image, m.roll_pitch_yaw
+    for f, unit in LENGTHS.items():
+        if setup.sees_lengths:
+            of_groups = groups and replace(groups, pairs=replace(groups.pairs, distance=groups.pairs.distance * f))
+            of_pairs = pairs and replace(pairs, distance=pairs.distance * f)
+            position, length = (None if v is None else v * f for v in (m.position, m.length))
+            what = "distances" if pairs is not None or m.position is None else "x, y, z"
+            without = setup.measuring(position=position, length=length, pairs=of_pairs, groups=of_groups)
+            yield f"{what} are in {unit}", without
+        if image is not None:
+            yield f"corner_x, corner_y are in {unit}", setup.measuring(image=image * [1.0, 1.0, f, f])
+    for f, unit in ANGLES.items():
+        if pairs is not None and np.isfinite(pairs.angle).any():
+            yield f"angles of pairs are in {unit}", setup.measuring(pairs=replace(pairs, angle=pairs.angle * f))
+        if angles is not None:
+            without = _rotated(setup, Rotation.from_euler("xyz", angles * f), angles * f)
+            yield f"roll, pitch, yaw are in {unit}", without
+        elif m.rotation is not None and setup.instrument.sees_orientation and f > 1.0:
+            vector = Rotation.from_matrix(m.rotation.copy()).as_rotvec()
+            yield f"rx, ry, rz are in {unit}", _rotated(setup, Rotation.from_rotvec(vector * f))
+
+
+def _readings_in_units(setup: Setup) -> _Found:
+    """Readings of all joints of a kind."""
+    prismatic = np.array([joint.prismatic for joint in setup.robot.joints])
+    yield from _in_units(setup, "readings of prismatic joints", prismatic)
+    yield from _in_units(setup, "joint readings", ~prismatic)
+
+
+def _in_units(setup: Setup, what: str, joints: Booleans) -> _Found:
+    """Readings of some joints, which would not hardly move then."""
+    q, prismatic = setup.table.measurements.readings, [joint.prismatic for joint in setup.robot.joints]
+    least = np.where(prismatic, MOTION_M, MOTION_RAD)
+    for factor, unit in (LENGTHS if np.any(joints & prismatic) else ANGLES).items() if joints.any() else ():
+        if factor >= 1.0 or np.any((np.ptp(q, axis=0) * factor > least)[joints]):
+            yield f"{what} are in {unit}", setup.measuring(readings=np.where(joints, q * factor, q))
+
+
+def _inverted(setup: Setup) -> _Found:
+    """Poses of the world in the tool frame instead of the tool in the world; orientations alone."""
+    m = setup.table.measurements
+    if m.rotation is None or m.pairs is not None:
+        return
+    inverse = Rotation.from_matrix(m.rotation.copy()).inv()
+    if m.position is not None and setup.sees_lengths:
+        measured, fixed = ("board", "camera") if setup.instrument.sees_landmarks else ("tool", "world")
+        words = f"the poses are inverted ({measured}_T_{fixed} instead of {fixed}_T_{measured})"
+        yield words, _rotated(setup, inverse).measuring(position=-inverse.apply(m.position.copy()))
+    if setup.instrument.sees_orientation:
+        yield "the orientations are inverted", _rotated(setup, inverse)
+
+
+def _columns(setup: Setup) -> _Found:
+    """Columns in another order, or with the other sign."""
+    m, image = setup.table.measurements, setup.table.measurements.image
+    if m.position is not None and m.pairs is None and setup.sees_lengths:
+        for order in list(permutations(range(3)))[1:]:  # column k holds coordinate order[k]
+            words = f"columns x, y, z hold {', '.join('xyz'[i] for i in order)}"
+            yield words, setup.measuring(position=m.position[:, np.argsort(order)])
+        for k in range(3):
+            yield f"{'xyz'[k]} has the wrong sign", setup.measuring(position=m.position * (1.0 - 2.0 * np.eye(3)[k]))
+    if image is not None:
+        yield "columns u, v hold v, u", setup.measuring(image=image[:, [1, 0, 2, 3]])
+        yield "columns corner_x, corner_y hold y, x", setup.measuring(image=image[:, [0, 1, 3, 2]])
+
+
+ORIENTATIONS: dict[str, Callable[[Floats], Rotation]] = {
+    "roll, pitch, yaw are rotations about the moving axes x, y, z": lambda a: Rotation.from_euler("XYZ", a),
+    "columns roll, pitch, yaw hold yaw, pitch, roll": lambda a: Rotation.from_euler("ZYX", a),
+    "roll, pitch, yaw are angles about the moving axes z, y, z": lambda a: Rotation.from_euler("ZYZ", a),
+    "roll, pitch, yaw are a rotation vector": Rotation.from_rotvec,
+}
+"""Meanings of three columns that are not roll, pitch, yaw about fixed axes."""
+
+
+def _orientations(setup: Setup) -> _Found:
+    """A quaternion with its scalar first; three angles of another meaning."""
+    m = setup.table.measurements
+    if m.rotation is None or m.pairs is not None:
+        return
+    if m.roll_pitch_yaw is None:
+        wxyz = Rotation.from_matrix(m.rotation.copy()).as_quat()
+        words = "columns qx, qy, qz, qw hold w, x, y, z"
+        yield words, _rotated(setup, Rotation.from_quat(np.roll(wxyz, -1, axis=1)))
+        return
+    for words, rotation_of in ORIENTATIONS.items():
+        yield words, _rotated(setup, rotation_of(m.roll_pitch_yaw.copy()), m.roll_pitch_yaw)
+
+
+def _conventions(setup: Setup) -> _Found:
+    """Parameters of the other Denavit-Hartenberg convention."""
+    robot = setup.robot
+    if robot.convention not in CONVENTIONS:
+        return
+    other = robot.convention[1:] if robot.convention.startswith("m") else f"m{robot.convention}"
+    order = {kind: place for place, kind in enumerate(CONVENTIONS[other])}
+    owned = [robot.parameters[e.parameter] for e in robot.elements if e.parameter is not None]
+    places = [(p.owner, order.get(p.kind, i)) for i, p in enumerate(owned)]  # frames stay as they are
+    elements = tuple(robot.elements[i] for i in sorted(range(len(places)), key=lambda i: places[i]))
+    words = f"the robot's convention is {other}, not {robot.convention}"
+    yield words, replace(setup, robot=replace(robot, convention=other, elements=elements))
+
+
+def _joint_columns(setup: Setup) -> _Found:
+    """A joint in another unit, moving the other way, or a quarter or half a turn away; columns of joints exchanged."""
+    q, joints = setup.table.measurements.readings, setup.robot.joints
+    n, others = len(joints), dict[str, Floats]()
+    for i, only in enumerate(np.eye(n)):
+        if sum(joint.prismatic == joints[i].prismatic for joint in joints) > 1:
+            yield from _in_units(setup, f"readings of joint {i + 1}", only > 0.0)
+        others[f"joint {i + 1} moves the other way (the sign of its readings)"] = q * (1.0 - 2.0 * only)
+        for degrees in () if joints[i].prismatic else (90, -90, 180):
+            others[f"the zero of joint {i + 1} is off by {degrees} deg"] = q + np.deg2rad(degrees) * only
+    for i, j in combinations(range(n), 2):
+        order = [j if k == i else i if k == j else k for k in range(n)]
+        others[f"the readings of joints {i + 1} and {j + 1} are exchanged"] = q[:, order]
+    if n > 3:
+        others["the joints are in the opposite order"] = q[:, ::-1]
+    for words, readings in others.items():
+        yield words, setup.measuring(readings=readings)
+
+
+def _frame(setup: Setup) -> _Found:
+    """A measurement frame that is not the base."""
+    if setup.instrument.is_pose and setup.table.frame == "known":
+        words = "the measurement frame is not the base (frame: unknown)"
+        yield words, replace(setup, table=replace(setup.table, frame="unknown"))
+
+
+def _tool(setup: Setup) -> _Found:
+    """A tool that is not where the robot's file says."""
+    rotations, lengths = setup.instrument.sees_orientation, setup.sees_lengths
+    point, fitted = frozenset(setup.tool[:3]), setup.fitted_tool
+    if setup.tool and lengths and not point <= fitted:
+        yield "the tool point is another one (estimate: [tool.x, tool.y, tool.z])", setup.with_tool(fitted | point)
+    if setup.tool and rotations and setup.instrument.is_pose and not fitted & frozenset(setup.tool[3:]):
+        words = "the tool frame is another one (estimate: all of tool.x ... tool.yaw)"
+        yield words, setup.with_tool(frozenset(setup.tool if lengths else (*setup.tool[3:], *fitted)))
+
+
+HYPOTHESES: tuple[tuple[About, Callable[[Setup], _Found]], ...] = (
+    *((About.UNIT, found) for found in (_robot_in_units, _measured_in_units, _readings_in_units)),
+    *((About.COLUMNS, found) for found in (_inverted, _columns, _orientations, _conventions)),
+    (About.JOINT, _joint_columns),
+    (About.FRAME, _frame),
+    (About.TOOL, _tool),
+)
+"""Hypotheses by what they are about."""
+
+
+def _rotated(setup: Setup, rotation: Rotation, roll_pitch_yaw: Floats | None = None) -> Setup:
+    """The set-up with other orientations."""
+    return setup.measuring(rotation=rotation.as_matrix(), roll_pitch_yaw=roll_pitch_yaw)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-from scipy import special
 
 from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
@@ -30,7 +29,6 @@ from fg_calib.statistics import (
     Fit,
     GrossErrors,
     PredictedFit,
-    PriorFit,
     Spread,
     has_joint_noise,
 )
@@ -74,10 +72,11 @@ _TOO_LARGE = frozenset(("too small", "both", "many"))
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement about a result: one line, and how severe it is."""
+    """A statement about a result: one line, how severe it is, and whether it applies."""
 
     severity: Severity
     text: str
+    applies: object = True
 
 
 @dataclass(frozen=True)
@@ -169,7 +168,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     change = effects.find_change(solution) if tested or ("outliers" in verdicts and not problem.evaluated) else None
     noise_like = effects.probability_of_noise(solution) if tested and change is None else None
     case = Case(solution, spread, fit, missing, change, noise_like)
-    statements = [statement for check in CHECKS for statement in check(case)]
+    statements = [statement for check in CHECKS for statement in check(case) if statement.applies]
     doubts = any(s.severity == "error" for s in statements)
     if not problem.evaluated:
         much = any(kind.factor > MOST_ESTIMATED for kind in fit.goodness.kinds)
@@ -177,23 +176,24 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     fits = not (doubts or solution.estimated_noise is not None)
     statements = [*check_setup(case, fits=fits), *check_optima(case), *statements]
     statements += [*check_systematic(case), *check_offsets(case), *check_missing(case)]
-    errors, warnings, notes = (
-        tuple(s.text for s in statements if s.severity == severity) for severity in ("error", "warning", "note")
-    )
+    errors, warnings, notes = (texts(statements, severity) for severity in ("error", "warning", "note"))
     return Verdict(errors, warnings, notes, case.setup, noise_like, change)
+
+
+def texts(statements: Sequence[Statement], severity: str) -> tuple[str, ...]:
+    """The statements of a severity that apply."""
+    return tuple(s.text for s in statements if s.severity == severity and s.applies)
 
 
 def check_solver(case: Case) -> Iterator[Statement]:
     """Check whether the solver converged, and whether a robust loss left enough."""
-    if not case.solution.converged:
-        yield Statement("error", case.solution.message)
+    yield Statement("error", case.solution.message, not case.solution.converged)
     weights, data, loss = case.problem.state.weights, case.problem.data, case.problem.options.loss
     for s, w in zip(data.series, weights or (), strict=False):
         n, lost = len(s.train), int(np.sum(w[s.train] < OUTLIER_WEIGHT))
-        if lost > MAX_OUTLIER_SHARE * n:
-            of = f" of {data.labels[s.table]}" if len(data.labels) > 1 else ""
-            text = f"loss {loss} takes {lost} of {n} measurements of {s.kind.names[0].partition('.')[0]}{of}"
-            yield Statement("error", f"{text} for outliers: more than it can tell from noise")
+        of = f" of {data.labels[s.table]}" if len(data.labels) > 1 else ""
+        text = f"loss {loss} takes {lost} of {n} measurements of {s.kind.names[0].partition('.')[0]}{of} for outliers"
+        yield Statement("error", f"{text}: more than it can tell from noise", lost > MAX_OUTLIER_SHARE * n)
 
 
 def check_change(case: Case) -> Iterator[Statement]:
@@ -205,21 +205,20 @@ def check_change(case: Case) -> Iterator[Statement]:
         yield Statement("error", f"{where} ({gain}): look for a target, a base or an instrument that moved")
 
 
-def check_fit(case: Case) -> list[Statement]:
+def check_fit(case: Case) -> Iterator[Statement]:
     """Check chi-square, but where only the corrections make it too large."""
-    if case.fit.priors is not None and case.fit.chi_square.too_large and not case.too_large:
-        return []
-    updated = case.problem.knowledge is not None
-    found = check_chi_square(case.fit.chi_square, case.gross, evaluated=case.problem.evaluated, updated=updated)
-    if not case.fit.goodness.searched and case.fit.chi_square.too_large:
+    chi2, problem = case.fit.chi_square, case.problem
+    if case.fit.priors is None or case.too_large or not chi2.too_large:
+        yield from check_chi_square(
+            chi2, case.gross, evaluated=problem.evaluated, updated=problem.knowledge is not None
+        )
         text = "outliers were not searched for: there are too many rows; let a robust loss do so (loss: gnc)"
-        found.append(Statement("warning", text))
-    return found
+        yield Statement("warning", text, chi2.too_large and not case.fit.goodness.searched)
 
 
 def check_chi_square(
     chi2: ChiSquare, gross: GrossErrors | None = None, *, evaluated: bool = False, updated: bool = False
-) -> list[Statement]:
+) -> Iterator[Statement]:
     """Check chi-square of the fitted rows and priors.
 
     Args:
@@ -230,27 +229,25 @@ def check_chi_square(
     """
     if chi2.dof <= 0:
         text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
-        return [Statement("error", text)]
+        yield Statement("error", text)
+        return
     reduced, ratio, (low, high) = chi2.value / chi2.dof, float(np.sqrt(chi2.ratio)), chi2.bounds
-    outside = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]"
-    if reduced > high:
-        cause = "noise specified too small, unmodelled effects, or outliers"
-        if evaluated:
-            cause = "the arm does not predict these test rows, noise specified too small, or outliers"
-        elif gross is not None:
-            cause = (
-                f"outliers: {gross.n} ({listed(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
-            )
-            cause += " loss do so (loss: gnc)"
-        elif updated:
-            cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
-        return [Statement("error", f"{outside}: {cause}")]
-    if reduced < low:
-        return [Statement("note", f"{outside}: noise specified too large; sigmas are larger than they need be")]
-    if chi2.p_value is not None and chi2.p_value < SIGNIFICANT and ratio > NOTABLE_RATIO:
-        text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
-        return [Statement("note", f"{text} ({ratio:.2f} times); sigmas may be too small by as much or more")]
-    return []
+    outside, cause = f"reduced chi-square {reduced:.3g} is outside [{low:.2f}, {high:.2f}]", ""
+    if evaluated:
+        cause = "the arm does not predict these test rows, noise specified too small, or outliers"
+    elif gross is not None:
+        cause = f"outliers: {gross.n} ({listed(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
+        cause += " loss do so (loss: gnc)"
+    elif updated:
+        cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
+    cause = cause or "noise specified too small, unmodelled effects, or outliers"
+    yield Statement("error", f"{outside}: {cause}", reduced > high)
+    text = f"{outside}: noise specified too large; sigmas are larger than they need be"
+    yield Statement("note", text, reduced < low)
+    significant = low <= reduced <= high and chi2.p_value is not None and chi2.p_value < SIGNIFICANT
+    text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
+    text += f" ({ratio:.2f} times); sigmas may be too small by as much or more"
+    yield Statement("note", text, significant and ratio > NOTABLE_RATIO)
 
 
 def check_kept_noise(case: Case) -> Iterator[Statement]:
@@ -259,13 +256,11 @@ def check_kept_noise(case: Case) -> Iterator[Statement]:
     if estimated is None:
         return
     kept = [kind.kind for kind in case.fit.goodness.kinds if (kind.table, kind.kind) not in estimated]
-    if has_joint_noise(case.problem) and JOINT_NOISE not in estimated:
-        kept.append("the joint readings")
-    if kept:
-        text = f"the noise of {', '.join(dict.fromkeys(kept))} could not be estimated: fewer than {LEAST_REDUNDANCY:g}"
-        text += " degrees of freedom are left to it; it is as specified, or 1 mm and 1 mrad where nothing was"
-        text += "; nothing says whether it is right: measure more" * (not estimated)
-        yield Statement("note" if estimated else "error", text)
+    kept += ["the joint readings"] * (has_joint_noise(case.problem) and JOINT_NOISE not in estimated)
+    text = f"the noise of {', '.join(dict.fromkeys(kept))} could not be estimated: fewer than {LEAST_REDUNDANCY:g}"
+    text += " degrees of freedom are left to it; it is as specified, or 1 mm and 1 mrad where nothing was"
+    text += "; nothing says whether it is right: measure more" * (not estimated)
+    yield Statement("note" if estimated else "error", text, kept)
 
 
 def check_test_rows(case: Case) -> Iterator[Statement]:
@@ -273,48 +268,48 @@ def check_test_rows(case: Case) -> Iterator[Statement]:
     fit, of_fitted = case.fit.goodness.test, case.fit.chi_square.ratio
     if fit is None:
         return
-    count, ratio = fit.outliers, fit.chi2 / fit.expected if fit.n else 0.0
-    most = min(1.0, (count.fitted + 1.0 + 3.0 * np.sqrt(count.fitted + 1.0)) / max(count.n_fitted, 1))
-    if count.test and special.bdtrc(count.test - 1, count.n_test, most) < SIGNIFICANT:
-        text = f"test rows: the loss takes {count.test} of {count.n_test} measurements for outliers"
-        yield Statement("error", f"{text}, of those fitted {count.fitted} of {count.n_fitted}")
-    elif ratio >= NOTABLE_RATIO**2 and fit.p_value < SIGNIFICANT and not FACTOR < of_fitted > ratio / FACTOR:
-        # noise specified too small is reported once
+    ratio, many = fit.chi2 / fit.expected if fit.n else 0.0, fit.n_outliers > MAX_OUTLIER_SHARE * fit.n_measurements
+    text = f"test rows: {fit.n_outliers} of {fit.n_measurements} measurements are outliers"
+    yield Statement("error", f"{text}: more than a robust loss can tell from noise", many)
+    large = ratio >= NOTABLE_RATIO**2 and fit.p_value < SIGNIFICANT
+    if large and not many and not FACTOR < of_fitted > ratio / FACTOR:  # noise specified too small is reported once
         worst = [case.problem.end_names[c.configuration + 1] for c in fit.configurations]
         text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
         text += f"; suspicious: {listed(worst)}" if worst else ""
         yield Statement("error" if ratio > FACTOR else "warning", text)
 
 
-def check_priors(fit: PriorFit | None) -> list[Statement]:
+def check_priors(case: Case) -> Iterator[Statement]:
     """Check corrections against their prior sigmas; nothing without priors."""
+    fit = case.fit.priors
     if fit is None:
-        return []
-    places = [one for one in fit.beyond if one.is_place]
-    found = [f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified" for one in places]
-    if worst := [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]:
-        found.append(f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)})")
-    certain = bool(found)
-    if not found and fit.p_value is not None and fit.p_value < SIGNIFICANT:
-        largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
-        text = f"corrections are too large for their prior sigmas (in sigma of these: {listed(largest)}; sum of"
-        found.append(f"{text} squares {fit.chi2:.3g} where {fit.expected:.3g} is expected)")
-        certain = fit.chi2 > FACTOR * fit.expected and fit.p_value < PRIOR_P_VALUE
+        return
     causes = "prior sigmas (key tolerance) specified too small, or the measurements are not what the job says"
-    return [Statement("error" if certain else "note", f"{text}: {causes}") for text in found]
+    for one in fit.beyond:
+        text = f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}"
+        yield Statement("error", text, one.is_place)
+    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
+    text = f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)}): {causes}"
+    yield Statement("error", text, worst)
+    largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
+    text = f"corrections are too large for their prior sigmas (in sigma of these: {listed(largest)}; sum of squares"
+    text += f" {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
+    p_value = 1.0 if fit.beyond or fit.p_value is None else fit.p_value
+    certain = fit.chi2 > FACTOR * fit.expected and p_value < PRIOR_P_VALUE
+    yield Statement("error" if certain else "note", text, p_value < SIGNIFICANT)
 
 
 def check_prior_scales(case: Case) -> Iterator[Statement]:
     """Check prior sigmas that were estimated."""
     estimated = case.solution.estimated_tolerances
     scales = () if estimated is None else estimated.scales
-    if far := [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > MAX_PRIOR_SCALE]:
-        text = f"corrections are far larger than the prior sigmas specified ({', '.join(far)} times)"
-        text += ": residuals are too large as well, so corrections may hide unmodelled effects" * case.too_large
-        yield Statement("note", text)
+    far = [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > MAX_PRIOR_SCALE]
+    text = f"corrections are far larger than the prior sigmas specified ({', '.join(far)} times)"
+    text += ": residuals are too large as well, so corrections may hide unmodelled effects" * case.too_large
+    yield Statement("note", text, far)
 
 
-def check_signs(case: Case) -> list[Statement]:
+def check_signs(case: Case) -> Iterator[Statement]:
     """Check lengths and angles near 0 and 180 degrees, and what is not linear within the posterior.
 
     Near 180 degrees a vector has one other sign only: where there are more rows than they determine, a wrong sign shows
@@ -324,7 +319,7 @@ def check_signs(case: Case) -> list[Statement]:
     return check_linear(rows, check_linearity(case.solution, case.spread), case.fit.chi_square.too_large)
 
 
-def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = False) -> list[Statement]:
+def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = False) -> Iterator[Statement]:
     """Check ambiguous signs, else nonlinearity, by which the covariance is optimistic: one statement with the remedy.
 
     Args:
@@ -333,22 +328,19 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
         high: Whether residuals are too large for the noise, which a single wrong sign may be the cause of.
     """
     curved = nonlinear.directions >= NONLINEAR
-    if rows.names and (high or curved or rows.share >= AMBIGUOUS_SHARE):
-        text = f"the sign of {len(rows.names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
-        share = f"{100.0 * rows.share:.0f} % of the information rests on them"
-        text += f" ({listed(rows.names)} near 0 or 180 deg; {share}): there may be a better optimum far away,"
-        text += (
-            " and sigmas may be too small; leave these out, or measure longer and wider motions, in which more joints"
-        )
-        text += " move"
-        return [Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text)]
-    if not curved:
-        return []
+    ambiguous = bool(rows.names) and (high or curved or rows.share >= AMBIGUOUS_SHARE)
+    text = f"the sign of {len(rows.names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
+    share = f"{100.0 * rows.share:.0f} % of the information rests on them"
+    text += (
+        f" ({listed(rows.names)} near 0 or 180 deg; {share}): there may be a better optimum far away, and sigmas may"
+    )
+    text += " be too small; leave these out, or measure longer and wider motions, in which more joints move"
+    yield Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text, ambiguous)
     most = f" (most: {listed(nonlinear.rows)})" * bool(nonlinear.rows)
     beyond = f"some {np.sqrt(1.0 + nonlinear.directions):.2g}" if np.isfinite(nonlinear.directions) else "many"
     text = f"the measurements are nonlinear within the posterior sigmas{most}, so the covariance is optimistic in weak"
     text += f" directions: errors there are {beyond} times what it says; measure at more configurations, or specify"
-    return [Statement("warning", f"{text} smaller prior sigmas")]
+    yield Statement("warning", f"{text} smaller prior sigmas", curved and not ambiguous)
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
@@ -356,27 +348,30 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
     sizes, estimated = {"m": case.problem.robot.reach, "rad": 1.0}, case.solution.estimated_noise or ()
     for fit in case.fit.goodness.kinds:
         ratio = fit.factor * fit.stated_sigma_rms / sizes.get(fit.unit, np.inf)
-        if (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE:
-            text = (
-                f"the noise estimated of {fit.kind} is {ratio:.2g} times {'the reach' if fit.unit == 'm' else '1 rad'}"
-            )
-            yield Statement("error", f"{text}: the arm explains next to nothing; check the table and the job")
+        text = f"the noise estimated of {fit.kind} is {ratio:.2g} times {'the reach' if fit.unit == 'm' else '1 rad'}"
+        text += ": the arm explains next to nothing; check the table and the job"
+        yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)
 
 
-def check_tables(case: Case) -> list[Statement]:
+def check_tables(case: Case) -> Iterator[Statement]:
     """Check whether tables lack values that their model needs."""
-    return [Statement("note", text) for table in case.problem.data.tables for text in missing_values(table)]
+    for table in case.problem.data.tables:
+        yield from (Statement("note", text) for text in missing_values(table))
+
+
+CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (
+    *(check_solver, check_change, check_fit, check_kept_noise, check_test_rows, check_priors, check_prior_scales),
+    *(check_signs, check_estimated_noise, check_tables),
+)
+"""The checks of every solution, in the order of their statements; for what comes before and after them see `judge`."""
 
 
 def check_systematic(case: Case) -> Iterator[Statement]:
     """Check whether residuals are systematic; a wrong set-up has them as its consequence."""
-    if case.noise_like is not None and case.noise_like < LIKE_NOISE and not case.setup.explanations:
-        several = "several times those claimed: rely on the test rows"
-        claim = several if case.noise_like < NOT_NOISE else "twice those claimed"
-        text = (
-            f"the residuals are systematic (p = {case.noise_like:.1g}): unmodelled effects; true errors may be {claim}"
-        )
-        yield Statement("warning", text)
+    p = 1.0 if case.noise_like is None or case.setup.explanations else case.noise_like
+    claim = "several times those claimed: rely on the test rows" if p < NOT_NOISE else "twice those claimed"
+    text = f"the residuals are systematic (p = {p:.1g}): unmodelled effects; true errors may be {claim}"
+    yield Statement("warning", text, p < LIKE_NOISE)
 
 
 def check_offsets(case: Case) -> Iterator[Statement]:
@@ -438,21 +433,6 @@ def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
             words.append(f"{robot.parameters[i].name} {factor * here[i]:+.3g} or {factor * there[i]:+.3g} {unit}")
         text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
         yield Statement("error", text + advice)
-
-
-CHECKS: tuple[Callable[[Case], list[Statement] | Iterator[Statement]], ...] = (
-    check_solver,
-    check_change,
-    check_fit,
-    check_kept_noise,
-    check_test_rows,
-    lambda case: check_priors(case.fit.priors),
-    check_prior_scales,
-    check_signs,
-    check_estimated_noise,
-    check_tables,
-)
-"""The checks of every solution, in the order of their statements."""
 
 
 def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 from touches import reach
 
-from fg_calib import Job, Measurements, Options, Robot, simulate
+from fg_calib import Job, Options, Robot, simulate
 from fg_calib.diagnostics import inspect_job
-from fg_calib.diagnostics import robust_screening as disagreement
 from fg_calib.io.job import read_job
 from fg_calib.robot.kinematics import pose
 
@@ -165,14 +164,6 @@ def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
     assert found.cautions[0].endswith(": 1 (7)")
 
 
-def test_some_rows_of_a_long_table_are_screened(arm, monkeypatch):
-    monkeypatch.setattr(disagreement, "MAX_ROWS", 25)
-    m = measured(arm)
-    found = inspected(arm, replace(m, position=plus(m.position, [49], 0.05)))
-    assert [one.row for one in found.disagreements.found] == [49]
-    assert (found.disagreements.n, found.disagreements.of) == (25, 50)
-
-
 # --- what rows hold --------------------------------------------------------------------------------------------------
 
 
@@ -244,12 +235,3 @@ def test_a_job_whose_rows_determine_nothing_is_not_ready():
     found = inspected(robot, measured(robot, placed=None), "orientation", "known")
     assert found.identifiability.observability.rank == 0
     assert found.findings == ("these rows determine none of the parameters that are estimated",)
-
-
-def test_as_many_unknowns_as_rows_leave_nothing_to_judge_by():
-    robot = Robot.from_dh([[0.5, 0, 0, 0], [0.4, 0, 0, 0]], "dh").with_estimated(["a1", "a2", "d1"])
-    at = pose(robot, [[0.3, 1.0]])
-    m = Measurements.from_arrays([[0.3, 1.0]], position=at.position, sigma_position=1e-3)
-    found = inspected(robot, m, "position", "known", gauge="none")
-    assert found.dof == 0
-    assert found.findings[-1].startswith("no degree of freedom is left")

@@ -9,9 +9,8 @@ from simulated import measure, small_arm, true_robot
 
 from fg_calib import Measurements, Robot, calibrate
 from fg_calib.assessment import assess
-from fg_calib.diagnostics import linearity
+from fg_calib.diagnostics import linearity, verdict
 from fg_calib.diagnostics.linearity import AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
-from fg_calib.diagnostics.verdict import check_linear
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve, unsolved
 from fg_calib.inputs import Pairing
@@ -20,6 +19,11 @@ from fg_calib.robot import pose
 WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}
 SIGMA = 1e-5
 AMBIGUOUS, NONLINEAR = "is ambiguous within the prior sigmas", "nonlinear within the posterior sigmas"
+
+
+def check_linear(*found):
+    """The statements that apply."""
+    return [one for one in verdict.check_linear(*found) if one.applies]
 
 
 def positions(n, sigma, seed):
@@ -210,8 +214,8 @@ CELLS = {
 def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):
     """Half of such draws end at the arm with the other sign, and their chi-square may be as good."""
     robot, m, model = CELLS[cell](seed)
-    verdict = calibrate(robot, m, model=model).assessed[1].verdict
-    (said,) = [text for text in (*verdict.errors, *verdict.warnings) if AMBIGUOUS in text or NONLINEAR in text]
+    found = calibrate(robot, m, model=model).assessed[1].verdict
+    (said,) = [text for text in (*found.errors, *found.warnings) if AMBIGUOUS in text or NONLINEAR in text]
     assert re.search(r"ambiguous within the prior sigmas \(\d+-\d+", said)
     assert "leave these out, or measure longer and wider motions" in said
 
@@ -223,13 +227,13 @@ def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):
 )
 def test_stars_at_wide_priors_are_warned_of(name, wider, model, seed):
     """Mean NEES of 10 draws 2.4 for the SCARA at tolerances times 10, of single draws up to 14."""
-    verdict = assess(solve(star(name, wider, seed, model))).verdict
-    (said,) = [text for text in (*verdict.errors, *verdict.warnings) if AMBIGUOUS in text or NONLINEAR in text]
+    found = assess(solve(star(name, wider, seed, model))).verdict
+    (said,) = [text for text in (*found.errors, *found.warnings) if AMBIGUOUS in text or NONLINEAR in text]
     assert re.search(r"nonlinear within the posterior sigmas \(most: 0-\d+", said)
     assert said.endswith("measure at more configurations, or specify smaller prior sigmas")
 
 
 @pytest.mark.parametrize("name", ARMS)
 def test_stars_at_usual_priors_are_not_warned_of(name):
-    verdict = assess(solve(star(name, 1.0, 0, "distance-rotation"))).verdict
-    assert not any(words in text for text in (*verdict.errors, *verdict.warnings) for words in (AMBIGUOUS, NONLINEAR))
+    found = assess(solve(star(name, 1.0, 0, "distance-rotation"))).verdict
+    assert not any(words in text for text in (*found.errors, *found.warnings) for words in (AMBIGUOUS, NONLINEAR))

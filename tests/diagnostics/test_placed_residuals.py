@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.assessment import assess
 from fg_calib.diagnostics import nominal_residuals as placed_residuals
-from fg_calib.diagnostics.nominal_residuals import setup_of
 from fg_calib.diagnostics.setup_check import check_setup
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
@@ -71,15 +70,6 @@ def test_healthy_tables_have_no_mistake(instrument):
         found = check(robot, table)
         assert 0.05 < found.excess < 3.0
         assert found.explanations == ()
-
-
-def test_rows_are_drawn_so_that_every_target_and_anchor_is_there():
-    for instrument, label in (("targets", "target"), ("anchors", "anchor")):
-        robot, _, table = measured_by(instrument, np.random.default_rng(2), n=150)
-        setup = setup_of(robot, table)
-        assert len(setup.table.measurements.readings) <= 80
-        assert set(setup.table.measurements.labels[label].index) == {0, 1, 2}
-        assert setup.has_landmarks
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from jobs import SIGMA, only, ur5e, write_job
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
-from sparing import as_case, diagonal
+from sparing import as_case
 
 from fg_calib.assessment import assess, solve_job
 from fg_calib.diagnostics import setup_check as mistakes
@@ -17,7 +17,7 @@ from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_se
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import MODELS, PAIR_MODELS, POSE_MODELS, SolverError
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, SolverError
 from fg_calib.io.job import read_job
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
@@ -50,8 +50,6 @@ def wxyz(m):
 SPOILT = {
     "x, y, z are in mm, not m": lambda m: replace(m, position=m.position * 1e3),
     "x, y, z are in m, not mm": lambda m: replace(m, position=m.position * 1e-3),
-    "x, y, z are in cm, not m": lambda m: replace(m, position=m.position * 1e2),
-    "x, y, z are in inches, not mm": lambda m: replace(m, position=m.position / 25.4),
     "readings of joint 3 are in deg, not rad": lambda m: replace(m, readings=m.readings * only(3, 180 / np.pi, 1)),
     "joint readings are in deg, not rad": lambda m: replace(m, readings=np.rad2deg(m.readings)),
     "joint readings are in rad, not deg": lambda m: replace(m, readings=np.deg2rad(m.readings)),
@@ -59,14 +57,11 @@ SPOILT = {
     "the orientations are inverted": lambda m: replace(m, rotation=np.swapaxes(m.rotation, 1, 2)),
     "columns qx, qy, qz, qw hold w, x, y, z": wxyz,
     "columns x, y, z hold y, z, x": lambda m: replace(m, position=m.position[:, [1, 2, 0]]),
-    "columns x, y, z hold y, x, z": lambda m: replace(m, position=m.position[:, [1, 0, 2]]),
     "z has the wrong sign": lambda m: replace(m, position=m.position * [1, 1, -1]),
     "joint 2 moves the other way": lambda m: replace(m, readings=m.readings * only(2, -1, 1)),
-    "joint 6 moves the other way": lambda m: replace(m, readings=m.readings * only(6, -1, 1)),
     "the readings of joints 2 and 3 are exchanged": lambda m: exchanged(m, 2, 3),
     "the joints are in the opposite order": lambda m: replace(m, readings=m.readings[:, ::-1]),
     "the zero of joint 2 is off by 90 deg": lambda m: replace(m, readings=m.readings - only(2, np.pi / 2)),
-    "the zero of joint 3 is off by 180 deg": lambda m: replace(m, readings=m.readings + only(3, np.pi)),
 }
 """Mistakes in a table: how they are named, and how they are made."""
 
@@ -100,35 +95,16 @@ def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     assert check.explanations[0].excess <= min(EXPLAINED, check.excess / REDUCTION)
 
 
-def stuck(robot, joint, place, seed=0, *, placed=PLACED):
-    """What is measured where one joint stands still while its readings change."""
-    rng = np.random.default_rng(seed)
-    true = true_robot(robot, rng)
-    most = np.array([0.3 if joint.prismatic else 3.1 for joint in robot.joints])
-    q = rng.uniform(-most, most, (50, robot.n_joints))
-    still = np.where(np.arange(robot.n_joints) == joint, place, q)
-    m = measure(true, 50, rng, sigma=SIGMA, frame=placed, readings=still)
-    return replace(m, readings=q)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(("stands", "model"), diagonal([(0, 0.4), (3, -2.2), (5, 0.3), (5, 3.0)], ["pose", "position"]))
-def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, stands, model):
-    joint, place = stands
-    robot = ur5e(tmp_path)
-    check = check_setup(robot, stuck(robot, joint, place), model, "unknown")
-    assert named(check).startswith(f"joint {joint + 1} does not move: its readings change, but the arm does not follow")
+@pytest.mark.parametrize("joint", [0, 5])
+def test_a_joint_that_is_stuck_is_not_called_one_in_another_unit(tmp_path, joint):
+    robot, rng = ur5e(tmp_path), np.random.default_rng(0)
+    q = rng.uniform(-3.1, 3.1, (50, 6))
+    still = np.where(np.arange(6) == joint, 0.4, q)
+    m = measure(true_robot(robot, rng), 50, rng, sigma=SIGMA, frame=PLACED, readings=still)
+    check = check_setup(robot, replace(m, readings=q), "position", "unknown")
+    assert check.far
     assert not any("in deg" in str(e) for e in check.explanations)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("factor", [np.pi / 180, 180 / np.pi])
-def test_readings_of_a_joint_in_another_unit_are_not_called_stuck(tmp_path, factor):
-    robot = ur5e(tmp_path)
-    m = measured(robot, placed=PLACED)
-    check = check_setup(robot, replace(m, readings=m.readings * only(4, factor, 1)), "pose", "unknown")
-    assert "readings of joint 4 are in" in named(check)
-    assert not any("does not move" in str(e) for e in check.explanations)
 
 
 TWO = [
@@ -235,26 +211,16 @@ def test_a_healthy_job_is_looked_at_once(monkeypatch, tmp_path):
     assert check_setup(robot, measured(robot), "pose").excess < 2.0
 
 
-def test_gross_errors_are_no_mistake_in_the_set_up(tmp_path):
-    robot = ur5e(tmp_path)
-    m = measured(robot)
-    position = m.position.copy()
-    position[::5] += 0.5
-    check = check_setup(robot, replace(m, position=position), "pose", doubtful=True)
-    assert not check.far
-    assert check.explanations == ()
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_rows_that_are_not_there_say_nothing(tmp_path, model):
+def test_rows_that_are_not_there_say_nothing(tmp_path):
     """Test rows alone, and a table without what the model uses."""
     robot = ur5e(tmp_path)
     m = measured(robot)
-    assert check_setup(robot, replace(m, test=np.ones(50, dtype=bool)), model).residuals == ()
+    assert check_setup(robot, replace(m, test=np.ones(50, dtype=bool)), "pose").residuals == ()
     bare = replace(m, position=None, rotation=None, sigma_position=None, sigma_orientation=None)
-    assert check_setup(robot, bare, model, doubtful=True).residuals == ()
+    assert check_setup(robot, bare, "distance", doubtful=True).residuals == ()
 
 
+@pytest.mark.slow
 def test_real_poses_raise_no_alarm(data_folder, tmp_path):
     robot = data_folder / "ur10_tmac" / "robot.yaml"
     job = {"robot": str(robot), "measurements": str(robot.parent / "series_b.csv"), "frame": "unknown"}

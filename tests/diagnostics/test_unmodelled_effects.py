@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from reported import format_report
-from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
 from simulated import measure, plus, true_robot
 from sparing import diagonal
@@ -71,7 +70,7 @@ def test_p_values_of_noise_are_uniform(name, model):
 
 def test_a_warning_of_systematic_residuals_goes_by_the_p_value():
     def said(noise_like):
-        return list(check_systematic(Case(None, None, None, noise_like=noise_like)))
+        return [one for one in check_systematic(Case(None, None, None, noise_like=noise_like)) if one.applies]
 
     assert said(None) == said(LIKE_NOISE) == []
     ((little,), (much,)) = said(0.99 * LIKE_NOISE), said(0.99 * NOT_NOISE)
@@ -123,34 +122,6 @@ def test_outliers_are_no_change(row):
     for rows in (row, [row, 10]):
         spoilt = replace(m, position=plus(m.position, rows, 0.005))
         assert find_change(solve(problem_of(robot, spoilt, "position"))) is None
-
-
-@pytest.mark.slow
-def test_the_last_few_rows_alone_are_outliers_and_no_change():
-    for seed in range(3):
-        robot, m = moved("tool", 41, np.random.default_rng(seed))
-        found = assess(solve(problem_of(robot, m, "pose")))
-        assert found.verdict.change is None
-        assert set(found.fit.goodness.gross.names) <= {"41", "42", "43", "44"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "forgotten", "away"), diagonal(["6R", "scara"], ["frame", "tool"], [1.0, 0.03, 0.003])
-)
-def test_a_frame_or_tool_that_was_forgotten_is_no_change(name, forgotten, away):
-    """From metres, where nothing is linear, down to millimetres."""
-    robot, m = measured(name, np.random.default_rng(2), n=48)
-    if forgotten == "frame":
-        rotation, shift = Rotation.from_rotvec(away * np.array([0.1, -0.2, 0.3])), away * np.array([1.0, 0.5, -0.5])
-        position = rotation.apply(PLACED[0].inv().apply(m.position - PLACED[1])) + shift
-        problem = build_problem(robot, replace(m, position=position), model="position")
-    else:
-        values = robot.nominal
-        values[[robot.index(f"tool.{k}") for k in "xyz"]] += away * np.array([0.1, -0.2, 0.1])
-        known = [p.name for p in robot.parameters if p.estimated and not p.name.startswith("tool")]
-        problem = build_problem(robot.with_values(values).with_estimated(known), m, model="position", frame="unknown")
-    assert find_change(solve(problem)) is None
 
 
 # --- instrument offsets ------------------------------------------------------------------------------------------

@@ -1,13 +1,12 @@
 """What makes a result doubtful: test rows, priors and chi-square, under repetition and through the command line."""
 
-import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import measure, plus, small_arm, true_robot, write_job
+from simulated import measure, plus, small_arm, true_robot
 
 from fg_calib.assessment import assess
 from fg_calib.diagnostics.verdict import check_chi_square
@@ -58,28 +57,6 @@ def test_a_wrong_test_row_is_named(model):
 # --- chi-square -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    ("stated", "code", "said"),
-    [
-        (4.0, 0, "noise specified too large; sigmas are larger than they need be"),
-        (1.0, 0, None),
-        (0.8, 0, "significantly larger than the specified noise"),
-        (0.5, 3, "noise specified too small, unmodelled effects, or outliers"),
-    ],
-)
-def test_noise_stated_wrong_is_a_caution_or_a_finding_by_how_much(fg_calib, tmp_path, stated, code, said):
-    rng = np.random.default_rng(81)
-    robot = small_arm(tolerance=TOLERANCE)
-    m = measure(true_robot(robot, rng), 200, rng)
-    job = write_job(tmp_path, robot, m, model="pose", noise={"position": 1e-3 * stated, "orientation": 2e-4 * stated})
-    ended = fg_calib("calibrate", job, "--json")
-    result = json.loads(ended.out)
-    assert ended.code == code
-    texts = result["findings"] if code else result["cautions"]
-    assert [text for text in texts if "chi-square" in text and said in text] if said else not texts
-
-
 def chi_square(reduced, p_value=0.5, dof=40):
     return ChiSquare(reduced * dof, dof, float(dof), (0.5, 2.0), p_value)
 
@@ -109,7 +86,7 @@ def chi_square(reduced, p_value=0.5, dof=40):
     ],
 )
 def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severity, words):
-    found = check_chi_square(chi2, **settings)
+    found = [one for one in check_chi_square(chi2, **settings) if one.applies]
     assert [one.severity for one in found] == ([] if severity is None else [severity])
     assert all(words in one.text for one in found)
     assert all(("by as much" in one.text) == ("by as much" in words) for one in found)
