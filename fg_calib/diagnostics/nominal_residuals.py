@@ -41,7 +41,7 @@ from fg_calib.graph import (
     tables_of,
     whitening_of,
 )
-from fg_calib.inputs import Floats, InputError, Model, Options, Pairing, ProblemError, SolverError
+from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
 from fg_calib.measurements import INSTRUMENTS, Table, residuals
 from fg_calib.measurements.kinds import Instrument
 from fg_calib.parallel import one_blas_thread
@@ -272,10 +272,7 @@ MAX_SCREENED = 5000
 """Rows of a table up to which all are screened; of more, so many that are evenly spaced."""
 
 DISAGREES = 5.0
-"""Distance over the typical one from which a measurement disagrees; half of it where there is less than expected."""
-
-MIN_TYPICAL, MIN_MEASUREMENTS = 1e-2, 20
-"""Least typical distance, for below it residuals are rounding, and measurements from which a median is typical."""
+"""Distance from which a measurement disagrees, over the median one or the expected one, whichever is larger."""
 
 ROUNDS, HALF_WEIGHT = 4, 2.4
 """Fits with weights by the distances before, and the distance over the typical one of a weight of one half."""
@@ -366,10 +363,8 @@ def _sampled(table: Table) -> Table:
     m = m.select(evenly(m.n_configurations, MAX_SCREENED))
     if not table.uses_pairs:
         return replace(table, measurements=m)
-    sees = INSTRUMENTS[str(table.model)]
-    models: tuple[Model, ...] = ("orientation", "position", "pose")
-    seen = 2 * (sees.sees_position and m.position is not None) + (sees.sees_orientation and m.rotation is not None)
-    return replace(table, measurements=replace(m, labels={}), model=models[seen - 1], frame="unknown")
+    model = ("orientation", "position", "pose")[2 * (m.position is not None) + (m.rotation is not None) - 1]
+    return replace(table, measurements=replace(m, labels={}), model=model, frame="unknown")
 
 
 _Rows = list[tuple[RowNoise, Floats, Floats, Floats]]
@@ -383,9 +378,8 @@ def _distances(problem: Problem, parameters: Floats, robot: Robot) -> _Rows:
         n_rows = used.sum(axis=1)
         r = np.where(used, noise.residual(), 0.0)
         z = np.linalg.norm(whitening_of(total, used) @ r[:, :, None], axis=(1, 2))
-        size = np.median(z[n_rows > 0] / np.sqrt(special.chdtri(n_rows[n_rows > 0], 0.5))) if n_rows.any() else 1.0
-        size = max(size, MIN_TYPICAL if np.sum(n_rows > 0) >= MIN_MEASUREMENTS else 1.0)
-        typical = np.clip(1.0, size, 2.0 * size)  # farther, where prior sigmas allow more than there is
+        expected = np.sqrt(special.chdtri(np.maximum(n_rows, 1), 0.5))
+        typical = max(1.0, float(np.median((z / expected)[n_rows > 0]))) if n_rows.any() else 1.0
         share = np.einsum("nii->n", noise.total) / np.einsum("nii->n", total)
         found.append((noise, total, z / np.sqrt(np.maximum(n_rows, 1)) / typical, share))
     return found
