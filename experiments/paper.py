@@ -169,8 +169,8 @@ def position_errors(estimated: Robot, true: Robot, readings: Floats) -> Row:
     """Maximum, mean and RMS position error in the base frame, and the last two after the best rigid fit, [m]."""
     found = real_errors(estimated, true, readings)
     return {
-        **{key: getattr(found.base, key) for key in ("max", "mean", "rms")},
-        **{f"fitted {key}": getattr(found.fitted, key) for key in ("mean", "rms")},
+        **{key: getattr(found.base_frame, key) for key in ("max", "mean", "rms")},
+        **{f"fitted {key}": getattr(found.best_rigid_fit, key) for key in ("mean", "rms")},
     }
 
 

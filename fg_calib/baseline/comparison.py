@@ -17,7 +17,6 @@ there are none. Where the truth is known (a simulation) real errors are compared
 References:
     Jia, Wang, Chen, Sun (2019), Error Modeling in Distance and Rotation for Self-Calibration of Space Robots on
     Orbit. International Journal of Aerospace Engineering.
-    Umeyama (1991), Least-squares estimation of transformation parameters between two point patterns. IEEE PAMI 13(4).
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
@@ -38,8 +38,8 @@ from fg_calib.prediction import PoseRms, errors_at, judged_configurations, pose_
 from fg_calib.robot import Robot, build_chain, forward, rotation_vector
 from fg_calib.statistics.residual_table import residual_table
 
-ResidualRms = dict[str, dict[str, dict[str, float]]]
-"""RMS by split, kind, and before or after: see `residual_table.ResidualTable.rms`."""
+ResidualRms = dict[str, dict[str, float]]
+"""RMS by split and kind."""
 
 ESTIMATORS: Mapping[str, str] = {
     "graph": "the factor graph, as the job says",
@@ -72,13 +72,13 @@ class RealErrors(Brief):
     """Errors of an arm whose truth is known.
 
     Attributes:
-        base: In the robot's base frame.
-        fitted: After the rotation and shift that bring the estimated points nearest to the true ones: for what
+        base_frame: In the robot's base frame.
+        best_rigid_fit: After the rotation and shift that bring the estimated points nearest to the true ones: for what
             works relative to what was seen. None for fewer than three configurations.
     """
 
-    base: PoseError
-    fitted: PoseError | None
+    base_frame: PoseError
+    best_rigid_fit: PoseError | None
 
 
 @dataclass(frozen=True)
@@ -93,10 +93,10 @@ class Estimate(Brief):
         message: Why it stopped, or why it could not run.
         iterations: Steps taken.
         seconds: Time of the fit itself.
-        residual_rms: RMS of the residuals by split and kind, before and after, of the rows that the job's graph uses.
-        predicted_rms: RMS distance between estimated and true tool point that its covariance predicts, in the base
-            frame, [m]; None where the covariance does not tell. Parameters that it did not estimate count as known.
-        predicted_fitted_rms: The same after the best rigid fit, [m].
+        residual_rms: RMS of the residuals by split and kind, of the rows that the job's graph uses.
+        predicted_position_rms: RMS distance between estimated and true tool point that its covariance predicts, in the
+            base frame, [m]; None where it does not say. Parameters that it did not estimate count as known.
+        predicted_position_rms_fitted: The same after the best rigid fit, [m].
         errors: Real errors; None where the truth is not known.
     """
 
@@ -108,9 +108,19 @@ class Estimate(Brief):
     iterations: int = 0
     seconds: float = 0.0
     residual_rms: ResidualRms | None = None
-    predicted_rms: float | None = None
-    predicted_fitted_rms: float | None = None
+    predicted_position_rms: float | None = None
+    predicted_position_rms_fitted: float | None = None
     errors: RealErrors | None = None
+
+    @property
+    def ran(self) -> bool:
+        """Whether the estimator could run."""
+        return self.robot is not None
+
+    @property
+    def n_estimated(self) -> int:
+        """Number of parameters that it estimated."""
+        return len(self.sigma)
 
 
 @dataclass(frozen=True)
@@ -121,6 +131,7 @@ class Comparison(Brief):
         job: The job.
         estimates: One of each estimator, in the order of `ESTIMATORS`; the job's own graph first.
         errors_before: Real errors of the nominal arm, its tool fitted where that is unknown; None without the truth.
+        rms_before: RMS of the residuals of the nominal arm.
         judged_on: `test`, or `train` where there are no test rows.
         n_judged: Number of configurations judged on.
         findings: Why the graph's result is not to be trusted; empty if it is.
@@ -130,6 +141,7 @@ class Comparison(Brief):
     job: Job
     estimates: tuple[Estimate, ...]
     errors_before: RealErrors | None
+    rms_before: ResidualRms
     judged_on: Literal["test", "train"]
     n_judged: int
     findings: tuple[str, ...]
@@ -165,6 +177,10 @@ def compare(job: Job) -> Comparison:
     def errors(robot: Robot) -> RealErrors | None:
         return None if job.truth is None else real_errors(robot, job.truth, readings)
 
+    def rms(fit: Solution | LeastSquares, when: str) -> ResidualRms:
+        found = residual_table(replace(solution, parameters=fit.parameters)).rms()
+        return {split: {kind: both[when] for kind, both in kinds.items()} for split, kinds in found.items()}
+
     def judged(name: str, fit: Solution | LeastSquares, assessed: Assessment | None = None) -> Estimate:
         """An estimate on the same rows and configurations, by the same formulas."""
         if isinstance(fit, LeastSquares):
@@ -178,9 +194,9 @@ def compare(job: Job) -> Comparison:
             name=name,
             robot=robot,
             sigma=sigma,
-            residual_rms=residual_table(replace(solution, parameters=fit.parameters)).rms(),
-            predicted_rms=predicted[0].position,
-            predicted_fitted_rms=predicted[1].position,
+            residual_rms=rms(fit, "after"),
+            predicted_position_rms=predicted[0].position,
+            predicted_position_rms_fitted=predicted[1].position,
             errors=errors(robot),
             **{key: getattr(fit, key) for key in ("converged", "message", "iterations", "seconds")},
         )
@@ -196,6 +212,7 @@ def compare(job: Job) -> Comparison:
         job=job,
         estimates=(judged("graph", solution, assessed), *map(without_priors, list(ESTIMATORS)[1:])),
         errors_before=errors(job.robot.with_values(solution.before[solution.problem.variables.robot_span])),
+        rms_before=rms(solution, "before"),
         judged_on=judged_on,
         n_judged=len(readings),
         findings=assessed.verdict.errors,
@@ -234,6 +251,5 @@ def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:
     base, fitted = error(at.position, truth.position, np.eye(3)), None
     if len(readings) >= 3:
         points, onto = (p - p.mean(axis=0) for p in (at.position, truth.position))
-        U, _, Vt = np.linalg.svd(onto.T @ points)  # Umeyama, without scale
-        fitted = error(points, onto, U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt)
+        fitted = error(points, onto, Rotation.align_vectors(onto, points)[0].as_matrix())
     return RealErrors(base, fitted)

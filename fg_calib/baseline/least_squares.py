@@ -9,9 +9,8 @@ Without weights, the paper's own estimator: Jia et al. (2019), Eq. (54) and (55)
 With weights, `scipy.optimize.least_squares` on the same rows, whitened by their noise. Nothing here knows GTSAM,
 priors, damping or observability: of the graph's mathematics only `residuals` is shared.
 
-An unknown measurement frame takes six more unknowns: world_T_base = start * Txyz Rz(yaw) Ry(pitch) Rx(roll), a
-correction of the frame that the fit starts from. It starts at zero, where its angles are far from singular. Landmarks
-that are not known are unknowns as well; a landmark with a prior is a measurement of its place.
+An unknown measurement frame takes six more unknowns: world_T_base = Txyz Rz(yaw) Ry(pitch) Rx(roll), singular at a
+pitch of 90 degrees. Landmarks that are not known are unknowns as well; one with a prior is a measurement of its place.
 
 Note:
     Every measured train row takes part, but for distances of exactly 0 and angles of exactly 0 or pi at the start,
@@ -30,25 +29,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
 from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check_names, checked
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import (
-    AXIS_OF_KIND,
-    FRAME_KINDS,
-    Chain,
-    Element,
-    Parameter,
-    Robot,
-    build_chain,
-    names_of,
-    rotation_of,
-    yaw_pitch_roll,
-)
+from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Chain, Element, Parameter, Robot, build_chain, names_of
 
 RCOND = 1e-10
 """Singular values of J below this part of the largest count as zero in J^+."""
@@ -139,17 +127,14 @@ def fit_least_squares(
         raise InputError("names", "nothing to estimate", "at least one parameter")
     system = _System(robot, data, [i for i, p in enumerate(robot.parameters) if p.name in wanted], start)
     fit, weights = system.solve(weighted)
-    m = len(system.chosen)
-    r, J = system.evaluate(fit.x, weights)
+    m, (r, J), parameters = len(wanted), system.evaluate(fit.x, weights), system.parameters(fit.x)
     return LeastSquares(
-        robot=robot.with_values(system.values(fit.x)),
-        names=tuple(robot.parameters[i].name for i in system.chosen),
-        parameters=system.parameters(fit.x),
+        robot=robot.with_values(parameters[: len(robot.parameters)]),
+        names=tuple(p.name for p in robot.parameters if p.name in wanted),
+        parameters=parameters,
         covariance=claimed_covariance(r, J, weighted)[:m, :m],
         n_rows=len(r),
-        converged=fit.converged,
-        message=fit.message,
-        iterations=fit.iterations,
+        **{key: getattr(fit, key) for key in ("converged", "message", "iterations")},
         seconds=time.perf_counter() - clock,
     )
 
@@ -195,20 +180,11 @@ def scipy_fit(evaluate: Evaluate, x: Floats) -> Fit:
     def jacobian(x: Floats) -> Floats:
         return evaluate(x)[1]
 
-    method: Literal["lm", "trf"] = "lm" if len(residual(x)) >= len(x) else "trf"
-    exact = 1e-15  # near the least that MINPACK takes
+    method = "lm" if len(residual(x)) >= len(x) else "trf"
+    ends = {"ftol": 1e-15, "xtol": _SMALL_STEP, "gtol": 1e-15, "max_nfev": _STEPS}  # near the least that MINPACK takes
+    options: dict[str, Any] = {"method": method, "x_scale": "jac", **ends}
     try:
-        found = optimize.least_squares(
-            residual,
-            x,
-            jacobian,
-            method=method,
-            x_scale="jac",
-            ftol=exact,
-            xtol=_SMALL_STEP,
-            gtol=exact,
-            max_nfev=_STEPS,
-        )
+        found = optimize.least_squares(residual, x, jacobian, **options)
     except (ValueError, np.linalg.LinAlgError) as error:
         return Fit(x, False, f"no step possible: {error}", 0)
     message = " ".join(str(found.message).split()).rstrip(".")
@@ -276,11 +252,9 @@ class _Rows:
             J = J[:, :, : ends * len(sigma_joint)] * np.tile(sigma_joint, ends)
             S = S + J @ np.swapaxes(J, 1, 2)
         S = np.where(self.use[:, :, None] & self.use[:, None, :], S, np.eye(self.block.residual_dim))
-        try:
-            W: Floats = np.tril(np.linalg.inv(np.linalg.cholesky(S)))
-        except np.linalg.LinAlgError:
-            raise InputError("noise", "a row without any", "noise in every row, to weight by") from None
-        return W
+        if np.any(np.diagonal(S, axis1=1, axis2=2) <= 0.0):
+            raise InputError("noise", "a row without any", "noise in every row, to weight by")
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(S)))
 
 
 def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
@@ -297,8 +271,9 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
         if s.formed:  # each pair as if it were alone
             pairs = usable_pairs(data.tables[s.table], ("distance" in s.kind.names, "angle" in s.kind.names))
             of_pairs = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
-            columns = [np.nan_to_num(of_pairs[part.quantity][s.number], nan=1.0) for part in s.kind.parts]
-            sigma = np.stack(columns, axis=1)
+            sigma = np.nan_to_num(
+                np.stack([of_pairs[part.quantity][s.number] for part in s.kind.parts], axis=1), nan=1.0
+            )
         covariance = sigma[train][:, :, None] ** 2 * np.eye(h)
         if s.covariance is not None and not s.formed:
             covariance = s.covariance[train]
@@ -307,13 +282,11 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
 
 
 class _System:
-    """Rows as a function of the unknowns: parameters, a correction of each unknown frame, landmarks' coordinates."""
+    """Rows as a function of the unknowns: parameters, unknown frames, landmarks' coordinates."""
 
     def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None) -> None:
-        self.chosen, self._sigma_joint = chosen, data.sigma_joint
-        unknown = np.array([table.unknown_frame for table in data.tables])
-        self._frame_of = np.where(unknown, np.cumsum(unknown) - 1, -1).tolist()
-        estimated = data.estimated()
+        self._sigma_joint, unknown = data.sigma_joint, np.array([table.unknown_frame for table in data.tables])
+        estimated, n, n_frames = data.estimated(), len(robot.parameters), int(unknown.sum())
         places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.unknowns.sizes]).tolist())]
         self._coordinates: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
         self._priors = [
@@ -321,61 +294,48 @@ class _System:
             for place, sigma, of in zip(places, data.unknowns.tolerances, estimated, strict=True)
             if of and sigma is not None
         ]
-        self._estimated = np.concatenate(
-            [np.zeros(0, np.int64), *(p for p, of in zip(places, estimated, strict=True) if of)]
-        )
-        n, m, n_frames = len(robot.parameters), len(chosen), int(unknown.sum())
-        edges = [n, n + 6 * max(1, n_frames)]
-        if start is None:
-            start = np.concatenate([robot.nominal, np.zeros(6 * max(1, n_frames)), self._coordinates[self._estimated]])
-        if start.shape != (edges[1] + len(self._estimated),) or not np.isfinite(start).all():
-            raise InputError(
-                "start", f"shape {start.shape}, or a value that is not finite", "values as `Problem.start`"
-            )
-        self._values, frames, landmarks = np.split(start, edges)
-        self._frames = frames.reshape(-1, 6)[:n_frames]
-        self._coordinates[self._estimated] = landmarks
-        self.n_core = m + 6 * n_frames
-        self._first = np.concatenate([self._values[chosen], np.zeros(6 * n_frames), landmarks])
+        free = (place for place, of in zip(places, estimated, strict=True) if of)
+        self._estimated = np.concatenate([np.zeros(0, np.int64), *free])
+        self._n, self._edge = n, n + 6 * max(1, n_frames)
+        own = np.concatenate([robot.nominal, np.zeros(self._edge - n), self._coordinates[self._estimated]])
+        start = own if start is None else start
+        if start.shape != own.shape or not np.isfinite(start).all():
+            raise InputError("start", f"shape {start.shape}", "finite values as `Problem.start`")
+        self._start, self.n_core = start, len(chosen) + 6 * n_frames
+        frames = np.arange(n, n + 6 * n_frames)
+        self._index = np.concatenate([chosen, frames, np.arange(self._edge, len(start))]).astype(np.int64)
         self._column = np.full(len(self._coordinates), -1, dtype=np.int64)  # -1: a known coordinate
-        self._column[self._estimated] = self.n_core + np.arange(len(landmarks))
+        self._column[self._estimated] = self.n_core + np.arange(len(self._estimated))
+        self._frame_of = np.where(unknown, n + 6 * (np.cumsum(unknown) - 1), -1).tolist()
         self._chains = []
         for frame in self._frame_of:
-            extended = _with_frame(robot.with_values(self._values), np.zeros(6) if frame < 0 else self._frames[frame])
             columns = {c: k for k, c in enumerate(chosen)}
-            columns |= {n + k: m + 6 * frame + k for k in range(6) if frame >= 0}
-            self._chains.append(replace(build_chain(extended, columns), n_columns=self.n_core))
-        rows = (r.differentiable(self._chain(r.table, self._first)) for r in _train_rows(robot, data))
+            columns |= {n + k: len(chosen) + frame - n + k for k in range(6) if frame >= 0}
+            self._chains.append(replace(build_chain(_with_frame(robot), columns), n_columns=self.n_core))
+        first = start[self._index]
+        rows = (r.differentiable(self._chain(r.table, first)) for r in _train_rows(robot, data))
         self._rows = [r for r in rows if r.use.any()]
         if not self._rows:
             models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
             raise InputError(data.source, "no row left to fit", f"train rows for model {models}")
 
-    def values(self, x: Floats) -> Floats:
-        """The robot's parameters at the unknowns x."""
-        values = self._values.copy()
-        values[self.chosen] = x[: len(self.chosen)]
-        return values
-
     def parameters(self, x: Floats) -> Floats:
         """Values of the robot, the frames and the landmarks at the unknowns x: see `LeastSquares.parameters`."""
-        frames = np.zeros((max(1, len(self._frames)), 6))
-        corrections = x[len(self.chosen) : self.n_core].reshape(-1, 6)
-        for out, start, correction in zip(frames, self._frames, corrections, strict=False):
-            R = rotation_of(*start[3:])
-            out[:3], out[3:] = start[:3] + R @ correction[:3], yaw_pitch_roll(R @ rotation_of(*correction[3:]))
-        return np.concatenate([self.values(x), frames.ravel(), x[self.n_core :]])
+        out = self._start.copy()
+        out[self._index] = x
+        return out
 
     def _chain(self, table: int, x: Floats) -> Chain:
         """The arm in a table's measurement frame at the unknowns x."""
-        frame = len(self.chosen) + 6 * self._frame_of[table]
-        correction = np.zeros(6) if self._frame_of[table] < 0 else x[frame : frame + 6]
-        return self._chains[table].at(np.concatenate([self.values(x), correction]))
+        values, frame = self.parameters(x), self._frame_of[table]
+        return self._chains[table].at(
+            np.append(values[: self._n], values[frame : frame + 6] if frame >= 0 else np.zeros(6))
+        )
 
     def _landmarks(self, x: Floats) -> Floats:
         """Coordinates of all landmarks at the unknowns x."""
         out = self._coordinates.copy()
-        out[self._estimated] = x[self.n_core :]
+        out[self._estimated] = self.parameters(x)[self._edge :]
         return out
 
     def evaluate(self, x: Floats, weights: Weights | None) -> tuple[Floats, Floats]:
@@ -406,8 +366,8 @@ class _System:
     def solve(self, weighted: bool) -> tuple[Fit, Weights | None]:
         """The fit and its weights: those at the estimate, where joint noise makes them depend on it."""
         if not weighted:
-            return gauss_newton(partial(self.evaluate, weights=None), self._first), None
-        x, iterations, moved = self._first, 0, np.inf
+            return gauss_newton(partial(self.evaluate, weights=None), self._start[self._index]), None
+        x, iterations, moved = self._start[self._index], 0, np.inf
         for _ in range(_ROUNDS):
             weights = self._weights(x)
             fit = scipy_fit(partial(self.evaluate, weights=weights), x)
@@ -417,10 +377,9 @@ class _System:
         return Fit(x, False, f"not converged: new weights still move it by {moved:.1e}", iterations), weights
 
 
-def _with_frame(robot: Robot, world_T_base: Floats) -> Robot:
-    """The robot after a frame and a correction of it, whose six parameters come last."""
+def _with_frame(robot: Robot) -> Robot:
+    """The robot after a frame, whose six parameters come last."""
     n = len(robot.parameters)
-    fixed = [Element(AXIS_OF_KIND[kind], float(v)) for kind, v in zip(FRAME_KINDS, world_T_base, strict=True)]
-    free = [Element(AXIS_OF_KIND[kind], parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
-    correction = (Parameter(f"frame.{kind}", kind, 0, 0.0) for kind in FRAME_KINDS)
-    return replace(robot, parameters=(*robot.parameters, *correction), elements=(*fixed, *free, *robot.elements))
+    frame = [Element(AXIS_OF_KIND[kind], parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
+    parameters = (Parameter(f"frame.{kind}", kind, 0, 0.0) for kind in FRAME_KINDS)
+    return replace(robot, parameters=(*robot.parameters, *parameters), elements=(*frame, *robot.elements))

@@ -73,9 +73,9 @@ def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> 
     from fg_calib.report import line, report, section, table_of
 
     topics, n = {"joints": _topic(joints), "poses": _topic(poses)}, len(stops.ids)
-    streams = [(what, t["topic"], t["type"], t["messages"], f"{1.0 / t['period']:.4g}") for what, t in topics.items()]
+    streams = [(what, t["topic"], t["type"], t["messages"], 1.0 / t["period"]) for what, t in topics.items()]
     units = {"position": "mm", "joint": "mrad or mm"}
-    scatter, rough = [], []
+    columns, scatter, rough = ("", "of one|>", "of the mean|>", "correlated over|>"), [], []
     for what, s in stops.scatter.items():
         cells = (f"{v * 1e3:.3g} {units.get(what, 'mrad')}" for v in (s.single, s.mean))
         scatter.append((what, *cells, f"{s.correlation_samples:.3g} samples"))
@@ -83,10 +83,10 @@ def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> 
             rough.append(f"noise of {what} is slower than the stops are long: its sigmas are rough")
     return report(
         line(f"{name}: {n + len(stops.skipped)} stops found, {n} used, {len(stops.skipped)} skipped", "bold"),
-        table_of(("", "topic", "type", "messages", "Hz"), streams, left="lll"),
+        table_of(("", "topic", "type", "messages|d", "Hz|.4g"), streams),
         *(f"{t['topic']}: {note}" for t in topics.values() for note in t["notes"]),
         *section("Clocks", *_clocks(stops)),
-        *section("Scatter during stops", table_of(("", "of one", "of the mean", "correlated over"), scatter), *rough),
+        *section("Scatter during stops", table_of(columns, scatter), *rough),
         *section("Skipped", *(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
     )
 

@@ -59,7 +59,7 @@ def _report(tables: BoardTables) -> RenderableType:
     import numpy as np
 
     from fg_calib.importers import INTRINSICS
-    from fg_calib.report import figure, line, report, section, table_of
+    from fg_calib.report import line, report, section, table_of
 
     fit, board = tables.fit, tables.fit.board
     n_images = len(fit.views) + len(fit.without_pose) + len(tables.without)
@@ -69,18 +69,19 @@ def _report(tables: BoardTables) -> RenderableType:
     for view in fit.views:
         turn, shift = (np.sqrt(np.linalg.eigvalsh(C)[-1]) for C in (view.covariance[:3, :3], view.covariance[3:, 3:]))
         remark = ", ".join(["two poses"] * view.ambiguous + ["large residuals"] * view.poor)
-        residuals = f"{view.rms:.3f}", f"{view.sigma:.3f}", f"{1e3 * np.linalg.norm(view.position):.1f}"
-        images.append((view.name, len(view.corners), *residuals, figure(shift, "m"), figure(turn, "rad"), remark))
+        values = view.rms, view.sigma, float(np.linalg.norm(view.position)), shift, turn
+        images.append((view.name, len(view.corners), *values, remark))
     for name, sigma in (fit.camera_sigma or {}).items():
         unit, decimals = ("px", 3) if name in INTRINSICS[:4] else ("", 6)
         camera.append((name, f"{getattr(fit.camera, name):.{decimals}f}", f"{sigma:.{decimals}f}", unit))
-    headings = ("Image", "corners", "RMS px", "sigma px", "distance mm", "sigma mm", "sigma deg", "")
+    pose = ("distance mm|m:.1f", "sigma mm|m", "sigma deg|rad")
+    columns = ("Image", "corners|d", "RMS px|.3f", "sigma px|.3f", *pose, "")
     return report(
         line(f"{board.type} {size}: {seen}"),
         *(line(f"DOUBTFUL: {finding}", "bold red") for finding in fit.findings),
         line(f"RMS of residuals {fit.rms:.3f} px, sigma of a corner {fit.sigma:.3f} px"),
-        table_of(headings, images, left="lrrrrrrl"),
-        *section("Camera (1 sigma)", table_of(("", "estimate", "sigma", ""), camera, left="lrrl")),
+        table_of(columns, images),
+        *section("Camera (1 sigma)", table_of(("", "estimate|>", "sigma|>", ""), camera)),
         *section("Notes", *_notes(tables)),
     )
 

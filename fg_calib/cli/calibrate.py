@@ -106,15 +106,16 @@ def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
     """Many jobs for the terminal: a line of each, then how many are good; `seconds` is the duration of all together."""
     from rich.console import Group
 
-    from fg_calib.report import SHOWN, figure, in_order, line, table_of
+    from fg_calib.report import in_order, line, table_of, unit_shown
 
     units = {kind: unit for job in jobs for kind, unit in job.units.items()}
     kinds, rows = in_order(units), []
     for job in jobs:
-        values = [figure(job.rms.get(kind), units[kind], none="") for kind in kinds]
-        chi2, took = ("" if value is None else f"{value:.3g}" for value in (job.reduced_chi2, job.seconds))
-        rows.append((job.name, job.verdict, job.rows, *values, chi2, took, "; ".join(job.reasons[:1])))
-    headings = ("job", "verdict", "rows", *(f"{kind} {SHOWN[units[kind]][1]}" for kind in kinds))
-    table = table_of((*headings, "chi2/dof", "s", "reason"), rows, left=f"lll{'r' * (len(kinds) + 2)}l", wrap=True)
+        values = [job.rms.get(kind) for kind in kinds]
+        rows.append(
+            (job.name, job.verdict, job.rows, *values, job.reduced_chi2, job.seconds, "; ".join(job.reasons[:1]))
+        )
+    columns = [f"{kind} {unit_shown(units[kind])}|{units[kind]}| " for kind in kinds]
+    table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows, wrap=True)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())
     return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))

@@ -36,7 +36,7 @@ def predict(
     show_result(
         as_json,
         lambda: prediction_document(found, arm.result, ids),
-        lambda: build_prediction_report(found, arm.result, arm.robot, ids, length),
+        lambda: build_prediction_report(found, arm.result, arm.robot, ids),
     )
     if out is not None:
         say(f"wrote the prediction to {out}")

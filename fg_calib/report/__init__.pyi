@@ -1,16 +1,20 @@
-from .compare import build_history, comparison_document, format_comparison, history_document, write_comparison
+from .compare import (
+    build_check_report,
+    build_history,
+    check_document,
+    comparison_document,
+    history_document,
+    write_comparison,
+)
 from .design import build_design_report, design_document, write_design
 from .html import build_page, draw_figures, parameter_table_html
 from .inspect import (
     build_identifiability_report,
     build_inspection_report,
-    format_identifiability,
-    format_inspection,
     inspection_document,
     observability_document,
     write_observability,
 )
-from .monitor import build_check_report, check_document
 from .predict import (
     build_correction_report,
     build_prediction_report,
@@ -20,11 +24,10 @@ from .predict import (
     write_commands,
     write_prediction,
 )
-from .tables import SHOWN, WIDTH, figure, in_order, line, plain, report, section, shortened, table_of, width_for
+from .tables import WIDTH, in_order, line, plain, report, section, shortened, table_of, unit_shown, width_for
 from .text import ReportData, build_report, format_result, judged, notes_of, summary
 
 __all__ = [
-    "SHOWN",
     "WIDTH",
     "ReportData",
     "build_check_report",
@@ -41,10 +44,6 @@ __all__ = [
     "correction_document",
     "design_document",
     "draw_figures",
-    "figure",
-    "format_comparison",
-    "format_identifiability",
-    "format_inspection",
     "format_result",
     "history_document",
     "in_order",
@@ -62,6 +61,7 @@ __all__ = [
     "shortened",
     "summary",
     "table_of",
+    "unit_shown",
     "width_for",
     "write_commands",
     "write_comparison",

@@ -208,11 +208,6 @@ def _labels(scale: Scale, powers: bool = False) -> list[tuple[float, str]]:
     return [(value, f"1e{value:.3g}" if powers else word.replace("-", "\N{MINUS SIGN}")) for value, word in labels]
 
 
-def colour(share: float) -> str:
-    """The colour of a share of the ramp, 0 to 1."""
-    return RAMP[int(np.clip(share * len(RAMP), 0, len(RAMP) - 1))]
-
-
 def short(name: str, most: int = 14) -> str:
     """A name in few characters: its end distinguishes it from others, such as `.x`."""
     return name if len(name) <= most else f"{name[: most - 8]}…{name[-7:]}"

@@ -1,100 +1,79 @@
-"""Several results compared: estimators on one job, two calibrations, the runs of a calibration, many jobs."""
+"""What is compared: estimators on one job, two calibrations, the runs of a calibration, a calibration with new rows."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Group
+from rich.table import Table
 from rich.text import Text
 
 from fg_calib import __version__
-from fg_calib.baseline import ESTIMATORS, Comparison, Estimate, RealErrors
+from fg_calib.baseline import ESTIMATORS, Comparison, Estimate
 from fg_calib.diagnostics import probability
-from fg_calib.inputs import InputError, checked
+from fg_calib.inputs import LIMITED, InputError, checked
 from fg_calib.io import Result, Run, fill_folder, write_text
+from fg_calib.monitoring import Check, Explanation
 from fg_calib.report import tables
-from fg_calib.report.tables import figure, in_words, line, quantities, section, table_of
+from fg_calib.report.tables import Content, figure, in_words, line, section, table_of
 from fg_calib.report.text import summary
 
-HEADINGS = {"graph": "graph", "graph-keep": "graph kept", "gauss-newton": "plain GN", "scipy": "scipy"}
-"""Headings of the estimators."""
-
-POSE_ERRORS = {
-    "max": ("position, max", "m"),
-    "mean": ("position, mean", "m"),
-    "rms": ("position, RMS", "m"),
-    "orientation_rms": ("orientation, RMS", "rad"),
-}
-"""Name and unit of each field of `PoseError`."""
+ERRORS = {"max": "m", "mean": "m", "rms": "m", "orientation_rms": "rad"}
+PREDICTED = {"predicted_position_rms": "m", "predicted_position_rms_fitted": "m"}
+EFFORT = {"n_estimated": "", "iterations": "", "seconds": "s"}
+"""Units of quantities of an estimate in the document."""
 
 INDEPENDENT = (
     "The sigma of a change assumes independent calibrations; with common priors or measurements it is too small."
 )
 
 
-@checked
-def format_comparison(comparison: Comparison, width: int = tables.WIDTH) -> str:
-    """`build_comparison_report` as plain text."""
-    return tables.plain_text(build_comparison_report(comparison), width)
-
-
 def build_comparison_report(comparison: Comparison) -> Group:
     """Estimators compared: errors, residuals, effort, then the parameters of each."""
-    job, names = comparison.job, [HEADINGS[e.name] for e in comparison.estimates]
+    job = comparison.job
     judged = f"judged at {comparison.n_judged} {comparison.judged_on} configurations"
     nominal = ("  nominal", "the arm before the calibration, tool and measurement frame fitted where unknown")
-    estimators = [(f"  {HEADINGS[e.name]}", f"{ESTIMATORS[e.name]}; {e.message}") for e in comparison.estimates]
-    headings = ("", "", *["truth"] * (job.truth is not None), *names)
+    estimators = [(f"  {e.name}", f"{ESTIMATORS[e.name]}; {e.message}") for e in comparison.estimates]
+    truth, values = ["truth|>"] * (job.truth is not None), [f"{e.name}|>" for e in comparison.estimates]
     return tables.report(
         line(f"{job.robot.name}: {job.model}, {judged}"),
         *(line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings),
         line(""),
-        table_of(("", "", "nominal", *names), _accuracy(comparison), left="ll"),
-        *section("Corrections (± sigma)", table_of(headings, _corrections(comparison), left="ll", wrap=True)),
-        *section("Estimators", table_of(("", ""), [nominal, *estimators], left="ll", wrap=True)),
+        table_of(("", "|unit", "nominal|>", *values), _quantities(comparison)),
+        *section(
+            "Corrections (± sigma)", table_of(("", "|unit", *truth, *values), _corrections(comparison), wrap=True)
+        ),
+        *section("Estimators", table_of(("", ""), [nominal, *estimators], wrap=True)),
         *section("Notes", *_comparison_notes(comparison)),
     )
 
 
-def _accuracy(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
+def _quantities(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
     """Errors, residuals and effort of each estimator, a quantity a row, under headings."""
-    estimates = comparison.estimates
-
-    def heading(text: str) -> Sequence[str | Text]:
-        return line(text, "bold"), *[""] * (len(estimates) + 2)
-
-    def row(label: str, unit: str, values: Iterable[float | None]) -> tuple[str, ...]:
-        return (f"  {label}", tables.unit_shown(unit), *(_large(v, unit) for v in values))
-
-    errors = [comparison.errors_before, *(e.errors for e in estimates)]
-    for key, words in (("base", "in the base frame"), ("fitted", "after the best rigid fit")):
-        chosen = [getattr(e, key, None) for e in errors]
-        if any(chosen):
-            yield heading(f"Real error {words}")
-            for field, (label, unit) in POSE_ERRORS.items():
-                yield row(label, unit, [getattr(e, field, None) for e in chosen])
-    yield heading("Error predicted by its sigmas")
-    yield row("position, RMS", "m", [None, *(e.predicted_rms for e in estimates)])
-    yield row("after best rigid fit", "m", [None, *(e.predicted_fitted_rms for e in estimates)])
-    for split, before in (estimates[0].residual_rms or {}).items():
-        if before:
-            yield heading(f"Residuals, {split} rows (RMS)")
-        for kind in tables.in_order(before):
-            after = [None if e.residual_rms is None else e.residual_rms[split][kind]["after"] for e in estimates]
-            yield row(kind, comparison.units[kind], [before[kind]["before"], *after])
-    yield heading("Effort")
-    efforts = {
-        "parameters": ("", [f"{len(e.sigma)}" for e in estimates]),
-        "iterations": ("", [f"{e.iterations}" for e in estimates]),
-        "time": ("ms", [f"{e.seconds * 1e3:.1f}" for e in estimates]),
-    }
-    for label, (unit, values) in efforts.items():
-        yield f"  {label}", unit, "-", *("-" if e.robot is None else v for e, v in zip(estimates, values, strict=True))
-    yield "  converged", "", "-", *("yes" if e.converged else "NO" for e in estimates)
+    document, kinds = comparison_document(comparison), comparison.units
+    estimates = [document["nominal"], *(e if e["ran"] else {} for e in document["estimates"])]
+    groups: list[tuple[str, tuple[str, ...], Mapping[str, str]]] = [
+        ("Real error in the base frame", ("errors", "base_frame"), ERRORS),
+        ("Real error after the best rigid fit", ("errors", "best_rigid_fit"), ERRORS),
+        ("Error predicted by its sigmas", (), PREDICTED),
+        *((f"Residuals, {split} rows (RMS)", ("residual_rms", split), kinds) for split in ("train", "test")),
+        ("Effort", (), EFFORT),
+    ]
+    for title, path, quantities in groups:
+        found = [reduce(lambda of, key: (of or {}).get(key), path, e) or {} for e in estimates]
+        values = {key: [of.get(key) for of in found] for key in quantities}
+        known = {key: row for key, row in values.items() if any(value is not None for value in row)}
+        if known:
+            yield line(title, "bold"), *[""] * (len(estimates) + 1)
+        for key, row in known.items():
+            unit = quantities[key]
+            yield f"  {key.replace('_', ' ')}", unit, *(_large(value, unit) for value in row)
+    yield "  converged", "", "-", *("yes" if e.converged else "NO" for e in comparison.estimates)
 
 
 def _corrections(comparison: Comparison) -> Iterator[tuple[str, ...]]:
@@ -106,16 +85,18 @@ def _corrections(comparison: Comparison) -> Iterator[tuple[str, ...]]:
             if e.robot is None or p.name not in e.sigma:
                 cells.append("-" if e.robot is None else "fixed")
             else:
-                sigma = _large(e.sigma[p.name], p.unit, none="unknown")
+                sigma = _large(e.sigma[p.name], p.unit, unknown="unknown")
                 cells.append(f"{_large(comparison.correction(e.robot, p.name), p.unit, '+')} ±{sigma}")
-        yield p.name, tables.unit_shown(p.unit), *cells
+        yield p.name, p.unit, *cells
 
 
-def _large(value: float | None, unit: str, sign: str = "", none: str = "-") -> str:
-    """A value with a decimal less than usual, or in powers of ten where an estimate diverged."""
-    _, _, decimals = tables.SHOWN.get(unit, (1.0, unit, 6))
+def _large(value: float | None, unit: str, sign: str = "", unknown: str = "-") -> str:
+    """A value with a decimal less than usual, or in powers of ten where an estimate diverged; a count as it is."""
+    if isinstance(value, int):
+        return str(value)
+    decimals = tables.SHOWN.get(unit, (1.0, unit, 6))[2]
     large = value is not None and abs(value) * tables.factor(unit) >= 1e5
-    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{decimals - 1}f", none)
+    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{decimals - 1}f", unknown)
 
 
 def _comparison_notes(comparison: Comparison) -> Iterator[str]:
@@ -143,11 +124,11 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
                                          "held"}]}],
           "inputs": {path: sha256} }
 
-    with errors = {"base_frame": figures, "best_rigid_fit": figures | null} and figures = {"max", "mean", "rms",
+    with errors = {"base_frame": values, "best_rigid_fit": values | null} and values = {"max", "mean", "rms",
     "orientation_rms"}. Parameters are those that the job estimates; those that an estimator held at nominal are not
     thereby known, so their sigma is None. "parameters" is empty where it did not run.
     """
-    job, first = comparison.job, comparison.estimates[0]
+    job = comparison.job
     pairs = next((table for table in job.tables if table.uses_pairs), None)
     measured = pairs is not None and pairs.measurements.pairs is not None
     document: dict[str, Any] = tables.plain(
@@ -160,7 +141,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
             "pairing": "measured" if measured else None if pairs is None else str(pairs.pairing),
             **{key: getattr(comparison, key) for key in ("judged_on", "n_judged", "trustworthy", "findings")},
             "truth_known": job.truth is not None,
-            "nominal": {"residual_rms": _rms(first, "before"), "errors": _errors(comparison.errors_before)},
+            "nominal": {"residual_rms": comparison.rms_before, "errors": comparison.errors_before},
             "estimates": [_estimate(comparison, e) for e in comparison.estimates],
             "inputs": job.inputs,
         }
@@ -184,30 +165,12 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
         for i, p in enumerate(comparison.job.robot.parameters)
         if robot is not None and p.estimated
     ]
+    keys = ("name", "ran", "converged", "message", "iterations", "seconds", "n_estimated", "residual_rms", "errors")
     return {
-        **{key: getattr(e, key) for key in ("name", "converged", "message", "iterations", "seconds")},
+        **{key: getattr(e, key) for key in (*keys, *PREDICTED)},
         "description": ESTIMATORS[e.name],
-        "ran": robot is not None,
-        "n_estimated": len(e.sigma),
-        "residual_rms": _rms(e, "after"),
-        "predicted_position_rms": e.predicted_rms,
-        "predicted_position_rms_fitted": e.predicted_fitted_rms,
-        "errors": _errors(e.errors),
         "parameters": parameters,
     }
-
-
-def _rms(estimate: Estimate, when: str) -> dict[str, dict[str, float | None]] | None:
-    """RMS by split and kind."""
-    rms = estimate.residual_rms
-    if rms is None:
-        return None
-    kinds = dict.fromkeys((*tables.USUAL_KINDS[:4], *rms["train"], *rms["test"]))
-    return {split: {kind: rms[split].get(kind, {}).get(when) for kind in kinds} for split in ("train", "test")}
-
-
-def _errors(errors: RealErrors | None) -> dict[str, Any] | None:
-    return None if errors is None else {"base_frame": errors.base, "best_rigid_fit": errors.fitted}
 
 
 @checked
@@ -260,23 +223,17 @@ def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -
         for split in ("test", "train")
         for kind in dict.fromkeys((*old.rms_after(split), *new.rms_after(split)))
     ]
-    rows = []
-    for one in changes(old, new):
-        unit = one["unit"]
-        change, z = figure(one["change"], unit, "+"), figure(one["in_sigma"], "", "+z.1f", none="")
-        rows.append((one["name"], *quantities(unit, one["old"], one["new"]), change, figure(one["sigma"], unit), z))
-    titles = (line(f"{name}  {folder}", "bold") for name, folder in zip(("OLD", "NEW"), folders, strict=True))
-    first, second = titles
-    headings = ("", "", "old", "new", "change", "sigma of it", "in sigma")
+    rows = [tuple(one.values()) for one in changes(old, new)]
+    columns = ("", "|unit", "old|q", "new|q", "change|q:+", "sigma of it|q", "in sigma|+z.1f")
     return tables.report(
-        first,
+        line(f"OLD  {folders[0]}", "bold"),
         *summary(old),
         line(""),
-        second,
+        line(f"NEW  {folders[1]}", "bold"),
         *summary(new),
         line(""),
-        *section("Residuals after the calibration (RMS)", table_of(("", "rows", "old", "new"), rms, left="ll")),
-        *section("Parameters", table_of(headings, rows, left="ll"), INDEPENDENT),
+        *section("Residuals after the calibration (RMS)", table_of(("", "rows", "old|>", "new|>"), rms)),
+        *section("Parameters", table_of(columns, rows), INDEPENDENT),
     )
 
 
@@ -301,12 +258,119 @@ def build_history(robot: str, runs: Sequence[Run]) -> Group:
     """The runs of a calibration for the terminal."""
     rows = []
     for run, one in zip(runs, history_document(robot, runs)["runs"], strict=True):
-        p, moved = "" if run.p_value is None else probability(run.p_value), one["moved"]
-        most = ("", "", "")
-        if moved:
-            change = in_words(moved["change"], moved["unit"], "+")
-            most = moved["name"], change, figure(moved["in_sigma"], "", ".1f")
-        rows.append((run.date[:10], run.n_residuals, f"{run.chi2:.6g}", run.dof, p, run.verdict, *most))
-    headings = ("date", "residuals", "chi-square", "of", "p-value", "", "changed most", "by", "in sigma")
+        moved = one["moved"] or {"name": "", "unit": "", "change": "", "in_sigma": ""}
+        rows.append((run.date[:10], run.n_residuals, run.chi2, run.dof, run.p_value, run.verdict, *moved.values()))
+    fit = ("date", "residuals|d", "chi-square|.6g", "of|d", "p-value|p", "")
+    columns = (*fit, "changed most", "|unit", "by|q:+", "in sigma|.1f|unknown")
     title = line(f"{robot}: {len(runs)} run{'s' * (len(runs) > 1)}", "bold")
-    return tables.report(title, *section("Runs", table_of(headings, rows, left="lrrrrllrr")))
+    return tables.report(title, *section("Runs", table_of(columns, rows)))
+
+
+WORDS = {"pass": ("PASS", "bold green"), "fail": ("FAIL", "bold red")}
+"""Word and style of each verdict."""
+
+KINDS = {
+    "zero": "zero of a joint",
+    "zeros": "zeros of two joints",
+    "tool": "the tool",
+    "frame": "the measurement frame, or the base",
+    "row": "gross errors of one configuration",
+    "parameter": "",
+}
+"""What each kind of explanation changes."""
+
+NO_ADVICE = (
+    "no configurations are advised: random ones cannot be measured like these rows (pairs, contacts, fixed lengths), or"
+    " do not distinguish these changes; another instrument may"
+)
+
+
+def named(parameters: Sequence[str]) -> str:
+    """A change by its name: for several parameters together `theta2 + theta3`."""
+    return " + ".join(parameters)
+
+
+def check_document(found: Check) -> dict[str, Any]:
+    """A check for programs, in [m] and [rad]."""
+    document: dict[str, Any] = {"schema": "fg-calib/check/1", **tables.plain(found)}
+    for e in document["explanations"]:
+        for key in ("told_apart_from", "not_told_apart_from"):
+            e[key] = [named(names) for names in e[key]]
+    if document["advice"] is not None:
+        document["advice"]["between"] = [named(names) for names in document["advice"]["between"]]
+    return document
+
+
+def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
+    """A check for the terminal.
+
+    Args:
+        found: The check.
+        joint_units: `rad` or `m` of each joint.
+    """
+    p = "" if found.p_value is None else f", p-value {probability(found.p_value)}"
+    chi2 = f"chi-square {found.chi2:.5g} with {found.dof} degrees of freedom{p}, {found.n} measurements"
+    sizes = [
+        f"{name} {'none' if size is None else in_words(size, unit, '.2g')}"
+        for (name, size), unit in zip(found.detectable.items(), joint_units, strict=True)
+    ]
+    evaluated = found.verdict != "not_evaluated"
+    return tables.report(
+        line(*WORDS.get(found.verdict, ("NOT EVALUATED", "bold yellow"))),
+        *(*found.reasons, *found.cautions, chi2),
+        *section("Errors of the calibrated arm (RMS)", _rms_errors(found)),
+        *section("Joint offset changes that these rows show in 9 of 10 cases", *[", ".join(sizes)] * evaluated),
+        *section("What changed", _explanations(found.explanations), *_conclusions(found)),
+        *section("What to measure", *_advice(found, joint_units)),
+    )
+
+
+def _rms_errors(found: Check) -> Table:
+    units = {kind: LIMITED.get(kind) or ("px" if kind == "pixel" else "m") for kind in found.rms}
+    rows = [(kind, units[kind], rms, found.noise[kind], found.limits.get(kind)) for kind, rms in found.rms.items()]
+    return table_of(("", "|unit", "error|q| ", "specified noise|q| ", "limit|q| "), rows)
+
+
+def _explanations(explanations: Sequence[Explanation]) -> Table:
+    rows = []
+    for e in explanations:
+        word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "is not: distinguishable"
+        several = list(zip(e.change, e.sigma, e.units, strict=True)) if len(e.change) < 3 else []
+        change = ", ".join(f"{figure(c, unit, '+')} {tables.unit_shown(unit)}" for c, _, unit in several)
+        sigma = ", ".join(figure(s, unit) for _, s, unit in several)
+        rows.append((named(e.parameters), KINDS[e.kind], change, sigma, e.chi2_drop, e.p_value, word))
+    columns = ("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", "")
+    return table_of(columns, rows, wrap=True)
+
+
+def _conclusions(found: Check) -> Iterator[str]:
+    likely = [e for e in found.explanations if e.likely]
+    if likely and likely[0].same:
+        same = ", ".join(likely[0].same)
+        yield f"{likely[0].parameters[0]} is equivalent to {same} for every position of the tool"
+    if len(likely) > 1:
+        yield f"not distinguishable by these rows: {', '.join(named(e.parameters) for e in likely)}"
+        yield "do not deploy any of these changes yet"
+        yield from [NO_ADVICE] * (found.advice is None)
+    elif likely and found.verdict == "fail":
+        update = (
+            f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check again"
+        )
+        remain = "do not deploy: residuals above noise remain after the most likely change"
+        yield update if found.deploy else remain
+
+
+def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
+    advice = found.advice
+    if advice is None:
+        return []
+    rows = [(*q, apart, sigma) for q, apart, sigma in zip(advice.readings, advice.apart, advice.sigma, strict=True)]
+    joints = [f"q{i} [{tables.unit_shown(unit)}]|{unit}:.2f" for i, unit in enumerate(joint_units, start=1)]
+    said = (
+        "measured like the rest, in the same table, these distinguish the changes"
+        if advice.enough
+        else "not even these distinguish all of them: measure more, spread over the whole workspace"
+    )
+    a, b = map(named, advice.between)
+    least = f"{said} ({advice.needed:.1f} sigma are needed; least apart are {a} and {b})"
+    return [table_of((*joints, "apart [mm]|m:.3f", "together [sigma]|.1f"), rows), least]

@@ -23,9 +23,9 @@ from fg_calib.observability import missing_motions
 from fg_calib.prediction import PoseRms
 from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
-from fg_calib.report.tables import figure, in_words, line, section, table_of
+from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
-from fg_calib.simulation import RandomReadings, instrument_keys, is_filled_in, table_columns, to_fill_in
+from fg_calib.simulation import instrument_keys, is_filled_in, table_columns, to_fill_in
 
 SCHEMA = "fg-calib/design/1"
 
@@ -71,12 +71,13 @@ def build_design_report(design: Design) -> Group:
         (f"{p.n}", *map(_size, (p.designed, p.random[1])), " to ".join(map(_size, (p.random[0], p.random[2]))))
         for p in design.curve
     ]
-    headings = ("poses", "designed mm", "random mm", "80 % of random")
     return tables.report(
         line(_headline(design), "bold"),
         *section("Expected", *_expected(design)),
-        *section("Poses and accuracy", table_of(headings, curve, left="r")),
-        *section("Which pairs", table_of(("pairs", "expected mm", ""), pairs, left="lrl")),
+        *section(
+            "Poses and accuracy", table_of(("poses|>", "designed mm|>", "random mm|>", "80 % of random|>"), curve)
+        ),
+        *section("Which pairs", table_of(("pairs", "expected mm|>", ""), pairs)),
         *section("Where to measure", _poses(design)),
         *section("Notes", *_notes(design)),
     )
@@ -104,13 +105,12 @@ def _expected(design: Design) -> Iterator[str]:
 
 
 def _poses(design: Design) -> Shown:
-    joints, with_table = design.pool.robot.joints, bool(np.any(design.group != ""))
-    rows = []
-    for name, group, q in list(zip(design.ids, design.group, design.readings, strict=True))[:MAX_POSES_LISTED]:
-        shown = (figure(v, joint.unit, "z.1f") for v, joint in zip(q, joints, strict=True))
-        rows.append((name, *shown, *[group or "all others"] * with_table))
-    names = [f"{joint.name} {tables.unit_shown(joint.unit)}" for joint in joints]
-    return table_of(("pose", *names, *["table"] * with_table), rows, left=f"l{'r' * len(names)}l")
+    with_table, shown = bool(np.any(design.group != "")), slice(MAX_POSES_LISTED)
+    rows = [
+        (name, *q, *[group or "all others"] * with_table)
+        for name, q, group in zip(design.ids[shown], design.readings[shown], design.group[shown], strict=True)
+    ]
+    return table_of(("pose", *tables.joint_columns(design.pool.robot, ":z.1f"), *["table"] * with_table), rows)
 
 
 def _notes(design: Design) -> Iterator[str]:
@@ -119,27 +119,22 @@ def _notes(design: Design) -> Iterator[str]:
     for name in sorted(set(design.pool.group.tolist()).difference(design.group.tolist(), [""])):
         yield f"{name}: none of its own poses was chosen, and it gets no table"
     yield from map(str, missing_motions(design.pool.robot))
-    scenario = design.pool.scenario
-    free = scenario is not None and isinstance(scenario.configurations, RandomReadings)
-    if design.pool.before is not None and free and not scenario.configurations.keep_out:  # type: ignore[union-attr]
-        yield "a job has no obstacles and no lines of sight: --candidates SCENARIO takes those of a scenario"
     travel = math.degrees(design.travel), math.degrees(design.travel_before)
     yield f"joint travel along the poses {travel[0]:.0f} deg, {travel[1]:.0f} unordered"
     if design.n > MAX_POSES_LISTED:
         yield f"{design.n - MAX_POSES_LISTED} more poses: --out writes them all"
-    best = min(design.pairings, key=lambda name: design.pairings[name], default="")
-    if best and design.pairings[best] < 0.95 * (design.expected.position or math.inf):
+    position, best = design.expected.position, min(design.pairings, key=lambda name: design.pairings[name], default="")
+    if best and design.pairings[best] < 0.95 * (position or math.inf):
         yield f"pairing: {best} in the job is more accurate with the same measurements"
     if lost := len(design.observability.lost):
         yield f"not identifiable: {lost} directions; fg-calib observe says which and why"
-    if design.expected.position is None:
+    if position is None:
         yield "the error over the task depends on what the measurements do not determine"
     if design.target is not None and not design.reached:
         yield "more poses (--n, --candidates), lower noise, other measurements or a wider range of poses would reach it"
     if design.asked is not None and design.n < design.asked:
         yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
-    after = math.inf if design.after_fit is None else design.after_fit.position or math.inf
-    if design.after_fit is not None and after < 0.5 * (design.expected.position or 0.0):
+    if design.after_fit is not None and (design.after_fit.position or math.inf) < 0.5 * (position or 0.0):
         best_fit = f"after the best rigid fit {_pose(design.after_fit)}"
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
 
@@ -168,24 +163,17 @@ def draw_design(design: Design) -> Chart:
     Args:
         design: The design.
     """
-    n = np.array([float(p.n) for p in design.curve])
-    designed = np.log10(_shown([p.designed for p in design.curve]))
-    low, middle, high = np.log10(_shown([p.random for p in design.curve])).T
-    target = np.nan if design.target is None else np.log10(design.target * 1e3)
+    errors = np.array([(p.designed, *p.random) for p in design.curve]).T
+    n, target = np.array([float(p.n) for p in design.curve]), np.log10((design.target or np.nan) * 1e3)
+    designed, low, middle, high = np.log10(np.where(errors < UNKNOWN_ABOVE, 1e3 * errors, np.nan))
     names = "poses", "expected RMS error over the task [mm]"
     plot = Plot(limits_of(n), limits_of(designed, low, high, target), names, powers=True)
-    if np.isfinite(target):
+    if design.target is not None:
         plot.level(float(target))
     for values, kind in ((low, "b"), (high, "b"), (middle, "large b"), (designed, "large a")):
         plot.dots(n, values, kind)
     caption = f"{design.pool.robot.name}: expected error by the number of poses; blue designed, orange random"
     return plot.chart(f"{caption} (half, and 80 % of them)")
-
-
-def _shown(errors: Sequence[object]) -> Floats:
-    """Errors [mm] for a picture, NaN where they are unknown."""
-    found: Floats = np.array(errors, dtype=np.float64)
-    return np.where(found < UNKNOWN_ABOVE, 1e3 * found, np.nan)
 
 
 def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,33 +39,28 @@ MIN_WIDTH_M = 1e-3
 
 
 def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
-    """All figures of a calibration by name; those that its tables lack are left out."""
+    """All figures of a calibration by name, in the order of the page; none where its tables lack them."""
     space = None if data.result.evaluated_only else data.workspace
-    slices = [] if space is None else error_slices(space.errors.position, space.expected[:, 0], space.measured)
-    every: dict[str, Sequence[Chart]] = {
+    return {
         "accuracy": [accuracy_bars(data)],
-        "joints": error_over_joints(data),
         "parameters": parameter_whiskers(data),
-        "correlations": correlation_matrix(data),
         "residuals": residual_charts(data),
-        "workspace": slices,
+        "joints": error_over_joints(data),
+        "correlations": correlation_matrix(data),
+        "workspace": error_slices(space.errors.position, space.expected[:, 0], space.measured) if space else [],
     }
-    return {name: of_name for name, of_name in every.items() if of_name}
 
 
 def accuracy_bars(data: ReportData) -> Chart:
-    """RMS residuals before and after, by kind."""
-    bars = [
-        (f"{kind} {when}", value, value / (max(rms.before or 0.0, rms.after or 0.0) or 1.0), data.result.unit_of(kind))
-        for kind, rms in data.result.residual_rms[data.split].items()
-        if rms is not None
-        for when, value in (("before", rms.before), ("after", rms.after))
-        if value is not None
-    ]
-    plot = Plot((0.0, 1.3), [name for name, *_ in bars] or [""], ("of the larger of both", ""))
-    for k, (name, value, share, unit) in enumerate(bars):
-        plot.box((0.0, share), (k - 0.4, k + 0.4), class_="after" if name.endswith("after") else "before")
-        plot.words(share, k, in_words(value, unit))
+    """RMS residuals before and after, by kind, as shares of the larger of both."""
+    kinds = {kind: rms for kind, rms in data.result.residual_rms[data.split].items() if rms is not None}
+    both = [(kind, when) for kind in kinds for when in ("before", "after")]
+    bars = [(f"{kind} {when}", kind, getattr(kinds[kind], when) or 0.0) for kind, when in both]
+    plot = Plot((0.0, 1.3), [name for name, _, _ in bars] or [""], ("of the larger of both", ""))
+    for k, (name, kind, value) in enumerate(bars):
+        share = value / (max(other for _, of, other in bars if of == kind) or 1.0)
+        plot.box((0.0, share), (k - 0.4, k + 0.4), class_=name.rsplit(" ", 1)[1])
+        plot.words(share, k, in_words(value, data.result.unit_of(kind)))
     return plot.chart(f"RMS residuals of {data.split} rows before and after the calibration")
 
 
@@ -207,33 +203,33 @@ def error_slices(position: Floats, error: Floats, measured: Floats) -> list[Char
     width = max(float((high - low).max()), MIN_WIDTH_M)
     half = SLAB * width / 2.0
     low, high = (0.5 * (low + high) + sign * 0.52 * width for sign in (-1.0, 1.0))  # all axes on one scale
-    ends = np.nanquantile(error, [0.05, 0.95]) * 1e3
+    first, last = np.nanquantile(error, [0.05, 0.95]) * 1e3
+    edges = np.linspace(first, max(last, first + 1e-9), len(charts.RAMP) + 1)
     found = []
     for across, up, through in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
         inside, near = (np.abs(p[:, through] - middle[through]) < half for p in (position, measured))
         names = f"{'xyz'[across]} [m]", f"{'xyz'[up]} [m]"
         square = charts.WIDTH - charts.LEFT - charts.RIGHT + charts.TOP + charts.BOTTOM
         plot = Plot((low[across], high[across]), (low[up], high[up]), names, height=square)
-        _draw_cells(plot, position[inside][:, [across, up]], error[inside] * 1e3, ends)
+        _draw_cells(plot, position[inside][:, [across, up]], error[inside] * 1e3, edges)
         for kind in ("halo", "measured"):
             plot.dots(measured[near, across], measured[near, up], kind)
         where = f"{'xyz'[through]} = {middle[through]:.3g} m, within {half:.2g} m"
         found.append(plot.chart(f"Expected error at {where}; dots: measured"))
-    edges = np.linspace(ends[0], ends[1], len(charts.RAMP) + 1)
-    legend = Plot((edges[0], edges[-1] or 1.0), [""], ("[mm]", ""))
-    for colour, low_edge, high_edge in zip(charts.RAMP, edges[:-1], edges[1:], strict=True):
-        legend.box((low_edge, high_edge), (-0.5, 0.5), fill=colour)
+    legend = Plot((edges[0], edges[-1]), [""], ("[mm]", ""))
+    for colour, ends in zip(charts.RAMP, pairwise(edges.tolist()), strict=True):
+        legend.box(ends, (-0.5, 0.5), fill=colour)
     return [*found, legend.chart("Colours of the expected error of the tool's position (RMS)")]
 
 
-def _draw_cells(plot: Plot, at: Floats, error: Floats, ends: Floats) -> None:
+def _draw_cells(plot: Plot, at: Floats, error: Floats, edges: Floats) -> None:
     """A coloured cell at each place that configurations reach, by the RMS of their errors."""
     at, error = at[np.isfinite(error)], error[np.isfinite(error)]
     x, y = (np.linspace(s.low, s.high, CELLS + 1) for s in (plot.x, plot.y))
     n, squares = (np.histogram2d(at[:, 0], at[:, 1], [x, y], weights=w)[0] for w in (np.ones(len(at)), error**2))
     for i, j in np.argwhere(n > 0).tolist():
-        share = (np.sqrt(squares[i, j] / n[i, j]) - ends[0]) / (ends[1] - ends[0] or 1.0)
-        plot.box((x[i], x[i + 1]), (y[j], y[j + 1]), fill=charts.colour(float(share)))
+        colour = charts.RAMP[int(np.searchsorted(edges[1:-1], np.sqrt(squares[i, j] / n[i, j])))]
+        plot.box((x[i], x[i + 1]), (y[j], y[j + 1]), fill=colour)
 
 
 def draw_observability(found: Identifiability) -> dict[str, Sequence[Chart]]:

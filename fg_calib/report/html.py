@@ -18,30 +18,22 @@ from fg_calib.report.tables import POSE_KINDS, Section, in_words, section, short
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+WORKSPACE = "Expected error over the workspace"
+
 MAX_ROWS = 40
 """Suspicious rows that the page lists; the table of residuals has all."""
 
-FIGURES = {
-    "accuracy": text.RESIDUALS,
-    "parameters": text.PARAMETERS,
-    "residuals": "Studentised residuals",
-    "joints": "Error over joint space",
-    "correlations": "Correlations",
-    "workspace": "Expected error over the workspace",
-}
-"""The section of each figure: one of the report, or one of the page alone after them."""
-
 EXPLANATIONS = {
-    "accuracy": "Residuals before and after the calibration contain the noise of the measurements.",
-    "parameters": "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the prior"
-    " sigma. Orange: the uncertainty is unknown.",
-    "residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1 in 370 is"
-    " beyond 3.",
-    "joints": "Each dot is a configuration. A trend shows an unmodelled effect of that joint.",
-    "correlations": "Strong colours: errors of the two parameters go together.",
-    "workspace": "RMS error of the tool's position expected from the covariance. Unmodelled effects are not included.",
+    text.RESIDUALS: "Residuals before and after the calibration contain the noise of the measurements.",
+    text.PARAMETERS: "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the"
+    " prior sigma. Orange: the uncertainty is unknown.",
+    "Studentised residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1"
+    " in 370 is beyond 3.",
+    "Error over joint space": "Each dot is a configuration. A trend shows an unmodelled effect of that joint.",
+    "Correlations": "Strong colours: errors of the two parameters go together.",
+    WORKSPACE: "RMS error of the tool's position expected from the covariance. Unmodelled effects are not included.",
 }
-"""How to read each figure."""
+"""How to read the figures of each section: of the report, or of the page alone after them."""
 
 
 @cache
@@ -65,30 +57,26 @@ def build_page(data: text.ReportData) -> str:
     """The page of a calibration, as HTML."""
     result, charts, space = data.result, figures_of(data), data.workspace
     sections = sorted(text.build_sections(data, MAX_ROWS), key=lambda one: one.title != text.NOTES)
+    figures = dict(zip(EXPLANATIONS, zip(EXPLANATIONS.values(), charts.values(), strict=True), strict=True))
     known = {one.title for one in sections}
-    for name, title in FIGURES.items():
-        if name in charts and title not in known:
-            sections.append(Section(title))
-            if name == "workspace" and space is not None:
-                sections[-1:] = section(title, size_table(space), *percentages(space))
+    sections += [Section(title) for title, (_, drawn) in figures.items() if drawn and title not in known]
+    if charts["workspace"] and space is not None:
+        sections[-1:] = section(WORKSPACE, size_table(space), *percentages(space))
     files = {"configurations": data.configurations, "residuals": data.residuals}
-    return (
-        _environment()
-        .get_template("page.html")
-        .render(
-            result=result,
-            n_configurations=0 if data.configurations is None else len(data.configurations),
-            sections=sections,
-            figures={FIGURES[name]: (EXPLANATIONS[name], of_name) for name, of_name in charts.items()},
-            missing=[name for name, table in files.items() if table is None],
-            arm=arm_scene(data),
-            ramp=RAMP,
-            verdict=text.verdict_word(result),
-            limits=[] if result.acceptance is None else text.judged(result.acceptance.judgements),
-            tiles=list(_tiles(data)),
-            command=_command(result),
-            options=list(_options(result)),
-        )
+    template = _environment().get_template("page.html")
+    return template.render(
+        result=result,
+        n_configurations=0 if data.configurations is None else len(data.configurations),
+        sections=sections,
+        figures={title: of for title, of in figures.items() if of[1]},
+        missing=[name for name, table in files.items() if table is None],
+        arm=arm_scene(data),
+        ramp=RAMP,
+        verdict=text.verdict_word(result),
+        limits=[] if result.acceptance is None else text.judged(result.acceptance.judgements),
+        tiles=list(_tiles(data)),
+        command=_command(result),
+        options=list(_options(result)),
     )
 
 
@@ -100,7 +88,7 @@ def parameter_table_html(result: Result) -> str:
 
 def draw_figures(data: text.ReportData) -> dict[str, str]:
     """The figures of the page as SVG files: text by name."""
-    return {f"{name}.svg": standalone(charts) for name, charts in figures_of(data).items()}
+    return {f"{name}.svg": standalone(charts) for name, charts in figures_of(data).items() if charts}
 
 
 def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:

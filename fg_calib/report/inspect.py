@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
-from rich.text import Text
 
 from fg_calib import __version__
-from fg_calib.diagnostics import MAX_ROWS, NEAR_SIGMAS, Disagreements, Inspection, SetupCheck
+from fg_calib.diagnostics import MAX_ROWS, NEAR_SIGMAS, Disagreements, Inspection
 from fg_calib.inputs import checked
 from fg_calib.io import Observability as Document
 from fg_calib.io import fill_folder, write_text
@@ -23,7 +22,7 @@ from fg_calib.observability import CORRELATED, Identifiability, Observability
 from fg_calib.report import tables
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import draw_observability
-from fg_calib.report.tables import Section, line, quantities, section, table_of
+from fg_calib.report.tables import Content, Section, line, section, table_of
 from fg_calib.report.text import expected_tool_error
 
 FILES = {
@@ -31,6 +30,10 @@ FILES = {
     **dict.fromkeys(("singular_values.svg", "groups.svg"), b"<svg"),
 }
 """The files that `write_observability` may write, and how each begins."""
+
+
+NOT_FAR = "as noise and priors allow", "larger than predicted, but not by far"
+"""What is said of residuals that noise and priors explain, and of larger ones."""
 
 
 @checked
@@ -55,70 +58,40 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
     fill_folder(Path(folder), write, FILES)
 
 
-@checked
-def format_identifiability(found: Identifiability, width: int = tables.WIDTH) -> str:
-    """`build_identifiability_report` as plain text."""
-    return tables.plain_text(build_identifiability_report(found), width)
-
-
 def build_identifiability_report(found: Identifiability) -> Group:
     """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
     where = "random configurations" if found.kind == "structural" else "configurations"
     model = f"{found.model}, as poses of the board" if found.model == "pixels" else found.model
-    known = f"With {', '.join(found.fixed)} known, as the robot's file says"
+    known = line(f"With {', '.join(found.fixed)} known, as the robot's file says", "bold")
     return tables.report(
         line(f"{found.robot}: {model}, {found.kind}, {found.n_configurations} {where}", "bold"),
         *(line(f"NOT MODELLED: {m}", "bold red") for m in found.missing),
         *_classes(found),
-        *([] if found.with_fixed_known is None else [line(""), line(known, "bold"), *_classes(found.with_fixed_known)]),
+        *([] if found.with_fixed_known is None else [line(""), known, *_classes(found.with_fixed_known)]),
     )
 
 
-def _classes(found: Identifiability) -> list[Table | Text | Section]:
-    o = found.observability
-    classes = {
-        "Independent": o.named("independent"),
-        "Relative": [f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations],
-        "Ineffective": o.named("ineffective"),
-        "Kept": o.kept,
-    }
-    rows = [(name, ", ".join(members) or "None") for name, members in classes.items()]
-    table = table_of(("Identifiability", "Kinematic parameters"), rows, left="ll", wrap=True)
+def _classes(found: Identifiability) -> Iterator[Content | Section]:
+    o, practical = found.observability, found.kind == "practical"
     glossary = "independent: identifiable alone; relative: only in combination; ineffective: not identifiable"
     kept, dropped = o.singular_values[: o.rank], o.singular_values[o.rank :]
-    gap = [line(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}")] if len(dropped) else []
-    values = [line(" ".join(f"{v:.3g}" for v in kept) or "none"), *gap]
-    practical = found.kind == "practical"
-    return [
-        *(line(f"rank {o.rank} of {len(o.names)} ({glossary})"), line(""), table),
-        *section("Null-space directions", tables.lost_directions(found.lost)),
-        *section("Singular values" + " (signal-to-noise ratios)" * practical, *values),
-        *(_practical(o) if practical else []),
-    ]
-
-
-def _practical(o: Observability) -> list[Section]:
-    """What is known of these configurations alone: indices, weak directions, sigmas."""
-    indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
-    combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
-    rows = []
-    for name, sigma in o.sigma.items():
-        unit, shown = quantities(tables.unit_of(name), sigma)
-        rows.append((name, shown, unit, combined.get(name, "")))
-    correlated = [(f"{a}, {b}:", f"{rho:+.3f}") for a, b, rho in o.correlations]
-    sigmas = table_of(("", "sigma", "", "stands for"), rows, left="lrll")
-    return [
-        *section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}")),
-        *section(f"Weak directions ({tables.WEAK})", tables.weak_directions(o)),
-        *section("Sigma of the kept parameters, the others at nominal", sigmas),
-        *section(f"Correlations above {CORRELATED:g}", table_of(("", ""), correlated)),
-    ]
-
-
-@checked
-def format_inspection(found: Inspection, job: Job, width: int = tables.WIDTH) -> str:
-    """`build_inspection_report` as plain text."""
-    return tables.plain_text(build_inspection_report(found, job), width)
+    values = [line(" ".join(f"{v:.3g}" for v in kept) or "none")]
+    if len(dropped):
+        values.append(line(f"gap of {o.gap:.1e}, then {len(dropped)} of at most {dropped[0]:.1e}"))
+    relations = [f"[{' '.join(relation)}]" for group in o.relative for relation in group.relations]
+    yield from (line(f"rank {o.rank} of {len(o.names)} ({glossary})"), line(""), _class_table(o, relations))
+    yield from section("Null-space directions", tables.lost_directions(found.lost))
+    yield from section("Singular values" + " (signal-to-noise ratios)" * practical, *values)
+    if practical:
+        indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
+        combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
+        rows = [(name, sigma, tables.unit_of(name), combined.get(name, "")) for name, sigma in o.sigma.items()]
+        sigmas = table_of(("", "sigma|q", "|unit", "stands for"), rows)
+        correlated = table_of(("", "|+.3f"), [(f"{a}, {b}:", rho) for a, b, rho in o.correlations])
+        yield from section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))
+        yield from section(f"Weak directions ({tables.WEAK})", tables.weak_directions(o))
+        yield from section("Sigma of the kept parameters, the others at nominal", sigmas)
+        yield from section(f"Correlations above {CORRELATED:g}", correlated)
 
 
 def build_inspection_report(found: Inspection, job: Job) -> Group:
@@ -131,6 +104,7 @@ def build_inspection_report(found: Inspection, job: Job) -> Group:
     o = found.identifiability.observability
     counts = f"{found.n_residuals} residuals and {found.n_priors} priors on {found.n_unknowns} unknowns"
     nominal = f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
+    groups = [f"[{' '.join(group.parameters)}]" for group in o.relative]
     determined = f"What these rows can determine: {o.rank} of {len(o.names)} parameters"
     return tables.report(
         line(f"{found.robot}: {'; '.join(words)}"),
@@ -141,7 +115,7 @@ def build_inspection_report(found: Inspection, job: Job) -> Group:
         *section("Joint readings", _joints(found)),
         *section(nominal, _residuals(found)),
         *section("Rows that disagree with the nominal arm", *_disagreements(found.disagreements)),
-        *section(determined, line(f"{counts}: {found.dof} degrees of freedom"), _determined(o)),
+        *section(determined, line(f"{counts}: {found.dof} degrees of freedom"), _class_table(o, groups)),
         *section("Not identifiable from these rows", tables.lost_directions(found.identifiability.lost)),
         *section(tables.WEAKLY, tables.weak_directions(o)),
         *expected_tool_error(found.expected_error),
@@ -153,79 +127,68 @@ def _tables(found: Inspection) -> Table:
     """Counts of each table, without empty columns."""
     columns: dict[str, list[Any]] = {
         "": [t.name for t in found.tables],
-        "rows": [t.n_rows for t in found.tables],
-        "configurations": [t.n_configurations for t in found.tables],
-        "test rows": [t.n_test or "" for t in found.tables],
-        "train pairs": [t.n_pairs or "" for t in found.tables],
-        "test pairs": [t.n_test_pairs or "" for t in found.tables],
-        "repeats": [t.n_repeats or "" for t in found.tables],
+        "rows|d": [t.n_rows for t in found.tables],
+        "configurations|d": [t.n_configurations for t in found.tables],
+        "test rows|>": [t.n_test or "" for t in found.tables],
+        "train pairs|>": [t.n_pairs or "" for t in found.tables],
+        "test pairs|>": [t.n_test_pairs or "" for t in found.tables],
+        "repeats|>": [t.n_repeats or "" for t in found.tables],
         "of": [", ".join(f"{n} {what}" for what, n in t.labels.items()) for t in found.tables],
         "residuals to fit": [", ".join(f"{n} {kind}" for kind, n in t.n_residuals.items()) for t in found.tables],
     }
-    there = {heading: cells for heading, cells in columns.items() if any(cells)}
-    left = "".join("l" if heading in ("", "of", "residuals to fit") else "r" for heading in there)
-    return table_of(there, zip(*there.values(), strict=True), left=left, wrap=True)
+    filled = {heading: cells for heading, cells in columns.items() if any(cells)}
+    return table_of(filled, zip(*filled.values(), strict=True), wrap=True)
 
 
 def _excluded_pairs(found: Inspection) -> Iterator[str]:
     for t in found.tables:
         if t.n_near_singular:
-            yield (
-                f"{t.name}: {t.n_near_singular} of {t.n_pairs} train pairs are within {NEAR_SIGMAS:g} sigma of 0 or 180"
-                " degrees, where norms are not differentiable: they tell little"
+            near = (
+                f"{t.n_near_singular} of {t.n_pairs} train pairs are within {NEAR_SIGMAS:g} sigma of 0 or 180 degrees"
             )
-    for reason, n in found.n_excluded.items():
-        yield f"{n} train pairs are excluded: {reason.replace('_', ' ')}"
+            yield f"{t.name}: {near}, where norms are not differentiable: they tell little"
+    yield from (f"{n} train pairs are excluded: {reason.replace('_', ' ')}" for reason, n in found.n_excluded.items())
 
 
 def _joints(found: Inspection) -> Table:
     rows = []
     for joint in found.joints:
-        unit, least, most, low, high = quantities(
-            joint.unit, joint.least, joint.most, *joint.limits, form="z.1f", none="-"
-        )
         used = "" if joint.share is None else f"{100.0 * joint.share:.0f} %"
-        outside = f"outside in {joint.n_outside} configurations" if joint.n_outside else ""
-        rows.append((joint.name, least, most, unit, low, high, used, outside or "hardly moves" * joint.still))
-    return table_of(("", "from", "to", "", "limits", "", "used", ""), rows, left="lrrlrrrl")
+        outside = f"outside in {joint.n_outside} configurations" if joint.n_outside else "hardly moves" * joint.still
+        rows.append((joint.name, joint.least, joint.most, joint.unit, *joint.limits, used, outside))
+    columns = ("", "from|q:z.1f", "to|q:z.1f", "|unit", "limits|q:.1f|-", "|q:.1f|-", "used|>", "")
+    return table_of(columns, rows)
 
 
 def _residuals(found: Inspection) -> Table:
     """Typical residuals before the calibration compared with the ones that noise and priors predict."""
     rows = []
     for check in found.setups:
+        of = f" of {check.table}" * bool(check.table)
+        most, words = (1.0, ("", "far too large")) if check.far else (2.0, NOT_FAR)
         for one in check.residuals:
-            values = quantities(one.unit, one.size, one.expected, form=".3g")
-            name = f"{one.kind} of {check.table}" if check.table else one.kind
-            rows.append((name, *values, f"{one.excess:.3g}", _judged(check, one.excess)))
-    return table_of(("", "", "observed", "predicted", "ratio", ""), rows, left="llrrrl")
+            judged = words[one.excess > most]
+            rows.append((f"{one.kind}{of}", one.unit, one.size, one.expected, one.excess, judged))
+    return table_of(("", "|unit", "observed|q:.3g", "predicted|q:.3g", "ratio|.3g", ""), rows)
 
 
-def _judged(check: SetupCheck, excess: float) -> str:
-    if check.far:
-        return "far too large" if excess > 1.0 else ""
-    return "as noise and priors allow" if excess <= 2.0 else "larger than predicted, but not by far"
-
-
-def _disagreements(found: Disagreements, most: int = 5) -> list[Table | str]:
+def _disagreements(found: Disagreements, most: int = 5) -> list[Content]:
     """Rows that disagree with the nominal arm, the farthest first."""
-    rows = []
-    for one in found.found[:most]:
-        unit, *values = quantities(one.unit, one.size, one.expected, form=".3g")
-        rows.append(("-".join(one.ends), one.table, one.of, one.kind, *values, unit, "test" * one.test))
+    rows = [
+        ("-".join(one.ends), one.table, one.of, one.kind, one.size, one.expected, one.unit, "test" * one.test)
+        for one in found.found[:most]
+    ]
     more = [f"and {len(found.found) - most} more"] if len(found.found) > most else []
     compared = [f"{found.n} of {found.of} were compared"] if rows and found.n < found.of else []
-    return [table_of(("", "table", "of", "", "off by", "expected", "", ""), rows, left="llllrrll"), *more, *compared]
+    columns = ("", "table", "of", "", "off by|q:.3g", "expected|q:.3g", "|unit", "")
+    return [table_of(columns, rows), *more, *compared]
 
 
-def _determined(o: Observability) -> Table:
+def _class_table(o: Observability, relative: Sequence[str]) -> Table:
     """Classes of the parameters."""
-    classes = {
-        "independent": ", ".join(o.named("independent")) or "none",
-        "only in combination": ", ".join(f"[{' '.join(group.parameters)}]" for group in o.relative),
-        "not identifiable": ", ".join(o.named("ineffective")),
-    }
-    return table_of(("", ""), [row for row in classes.items() if row[1]], left="ll", wrap=True)
+    classes = {"Independent": o.named("independent"), "Relative": relative, "Ineffective": o.named("ineffective")}
+    rows = [(name, ", ".join(members) or "None") for name, members in (classes | {"Kept": o.kept}).items()]
+    return table_of(("Identifiability", "Kinematic parameters"), rows, wrap=True)
 
 
 @checked
@@ -242,24 +205,20 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
       "inputs": {path: sha256} }
     """
+    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "disagreements", "expected_error")
     counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
-    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "expected_error", *counts)
-    keys_of_residuals = ("kind", "unit", "size", "expected", "excess", "n")
     document: dict[str, Any] = tables.plain(
         {
             "schema": "fg-calib/inspection/1",
             "version": __version__,
-            **{key: getattr(found, key) for key in keys},
-            "joints": [tables.plain(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
+            **{key: getattr(found, key) for key in (*keys, *counts)},
+            "joints": [vars(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
             "residuals": [
-                {"table": check.table, **{key: getattr(one, key) for key in keys_of_residuals}}
-                for check in found.setups
-                for one in check.residuals
+                {"table": of.table, "excess": one.excess, **vars(one)} for of in found.setups for one in of.residuals
             ],
             "explanations": [
-                {"table": check.table, "mistakes": one.mistakes} for check in found.setups for one in check.explanations
+                {"table": of.table, "mistakes": one.mistakes} for of in found.setups for one in of.explanations
             ],
-            "disagreements": found.disagreements,
             "observability": observability_document(found.identifiability),
             "inputs": job.inputs,
         }

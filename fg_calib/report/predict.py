@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,21 +12,22 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
-from fg_calib.inputs import Floats, LengthUnit
+from fg_calib.inputs import Floats
 from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
-from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, WorstConfiguration, summed_up
+from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import error_slices
-from fg_calib.report.tables import POSE_KINDS, figure, in_words, line, quantities, section, table_of
+from fg_calib.report.tables import POSE_KINDS, Content, figure, in_words, line, section, table_of
 from fg_calib.report.text import verdict_word
 from fg_calib.robot import Robot
+
+SI = Units()
 
 MAX_LISTED = 20
 """Configurations, or targets, that a report lists; the tables have all."""
 
 FRAMES = {"base": "in the base frame", "fitted": "after the best rigid fit"}
-SIZES = {"rms": "RMS", "median": "median", "p95": "95 % below", "largest": "largest"}
 
 ERRORS = {
     "uncorrected": "with the joint positions of the nominal arm",
@@ -54,7 +54,7 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
     sizes = {**_frames(errors), "total": found.with_joint_noise}
     of_worst: dict[str, Any] | None = None
     if worst is not None:
-        of_worst = _configuration(worst.errors, 0, "" if worst.row is None else names[worst.row], near=not worst.far)
+        of_worst = _configuration(worst.errors, 0, "" if worst.row is None else names[worst.row], worst.far)
         of_worst |= {"axes": worst.axes, "sigma": worst.sigma, "responsible": _shares(worst.responsible, result)}
     document: dict[str, Any] = tables.plain(
         {
@@ -74,7 +74,7 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
             "worst": of_worst,
             "responsible": _shares(found.responsible, result),
             "configurations": [
-                _configuration(errors, k, name, near=not found.far[k]) for k, name in enumerate(names) if found.given
+                _configuration(errors, k, names[k], found.far[k]) for k in range(len(names) * found.given)
             ],
         }
     )
@@ -90,11 +90,10 @@ def _frames(errors: ToolErrors) -> Mapping[str, Floats | None]:
     return {"base": errors.base, "fitted": errors.fitted, "joint_noise": errors.joint_noise}
 
 
-def _configuration(errors: ToolErrors, k: int, name: str, *, near: bool) -> dict[str, Any]:
-    kinds = {
-        key: None if of is None else dict(zip(POSE_KINDS, of[k], strict=True)) for key, of in _frames(errors).items()
-    }
-    return {"id": name, "readings": errors.readings[k], "position": errors.position[k], **kinds, "near": near}
+def _configuration(errors: ToolErrors, k: int, name: str, far: bool) -> dict[str, Any]:
+    known = {key: of for key, of in _frames(errors).items() if of is not None}
+    kinds = {"joint_noise": None} | {key: dict(zip(POSE_KINDS, of[k], strict=True)) for key, of in known.items()}
+    return {"id": name, "readings": errors.readings[k], "position": errors.position[k], **kinds, "near": not far}
 
 
 def _shares(found: Sequence[Responsible], result: Result) -> list[dict[str, Any]]:
@@ -107,12 +106,7 @@ FILES = {"predict.json": b'{\n "schema": "fg-calib/predict/', "predict.csv": b"i
 
 
 def write_prediction(
-    folder: Path,
-    found: PredictedErrors,
-    result: Result,
-    robot: Robot,
-    ids: Sequence[str] = (),
-    units: Units | None = None,
+    folder: Path, found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = (), units: Units = SI
 ) -> None:
     """Write `predict.json` and `predict.csv` into a folder, all or none; over the workspace also its picture.
 
@@ -122,12 +116,12 @@ def write_prediction(
         result: The result of the calibration.
         robot: The calibrated robot.
         ids: Names of the configurations, where they were given.
-        units: Of joint values and positions in the table, m and rad if None; errors are in mm and deg.
+        units: Of joint values and positions in the table; errors are in mm and deg.
 
     Raises:
         InputError: The folder cannot be written.
     """
-    errors, units = found.errors, units or Units()
+    errors = found.errors
     readings = errors.readings / [units.factor(joint.unit) for joint in robot.joints]
     columns: dict[str, Any] = {
         "id": np.array(_names(found, ids), dtype=np.str_),
@@ -148,9 +142,7 @@ def write_prediction(
     fill_folder(folder, write, FILES)
 
 
-def build_prediction_report(
-    found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = (), length: LengthUnit = "m"
-) -> Group:
+def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = ()) -> Group:
     """A prediction for the terminal.
 
     Args:
@@ -158,26 +150,20 @@ def build_prediction_report(
         result: The result of the calibration.
         robot: The calibrated robot.
         ids: Names of the configurations, where they were given.
-        length: Unit of positions; errors are in mm.
     """
-    n, worst = len(found.errors.readings), found.worst
+    n, names = len(found.errors.readings), _names(found, ids)
     where = f"at {n} configurations" if found.given else "over the workspace"
     in_part = ", as far as it is known" * bool(found.unknown)
-    share = "the mean square falls by that share where the parameter alone is known exactly"
-    listed = [_configurations(found, robot, _names(found, ids))] if found.given else []
-    more = [f"and {n - MAX_LISTED} more: --out writes them all"] if found.given and n > MAX_LISTED else []
+    listed: list[Content] = [_configurations(found, robot, names)] if found.given else []
+    listed += [f"and {n - MAX_LISTED} more: --out writes them all"] if found.given and n > MAX_LISTED else []
     return tables.report(
         line(f"{result.robot}: expected error of the tool {where}", "bold"),
         line(f"the calibration was {verdict_word(result)}", "bold red" if result.findings else "bold green"),
-        *result.findings,
-        *result.reservations,
+        *(*result.findings, *result.reservations),
         *section("Expected error, by the covariance of the calibration", size_table(found), *percentages(found)),
-        *section(
-            f"Where it is largest{in_part}",
-            *([] if worst is None else _worst_in_words(worst, robot, _names(found, ids), length)),
-        ),
-        *(section("Parameters that it comes from", _responsible(found, result), share) if found.responsible else []),
-        *section("Configurations", *listed, *more),
+        *section(f"Where it is largest{in_part}", *_worst_in_words(found, robot, names)),
+        *section("Parameters that it comes from", _responsible(found, result)),
+        *section("Configurations", *listed),
         *section("Notes", *_prediction_notes(found, robot)),
     )
 
@@ -187,12 +173,13 @@ def size_table(found: PredictedErrors) -> Table:
     order = ("fitted", "base") if found.fitted else ("base", "fitted")
     errors: dict[str, Floats | None] = {FRAMES[name]: found.errors.of(name == "fitted") for name in order}
     errors[f"{FRAMES[order[0]]}, with joint noise"] = found.with_joint_noise
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for frame, of in errors.items():
-        for column, (kind, unit) in zip(() if of is None else of.T, POSE_KINDS.items(), strict=False):
-            sizes = summed_up(column)
-            rows.append((frame if kind == "position" else "", *quantities(unit, *(sizes[key] for key in SIZES))))
-    return table_of(("", "", *SIZES.values()), rows, left="ll", wrap=True)
+        sizes = [] if of is None else [summed_up(column) for column in of.T]
+        rows += [
+            (name, unit, *size.values()) for name, unit, size in zip((frame, ""), ("m", "rad"), sizes, strict=False)
+        ]
+    return table_of(("", "|unit", "RMS|q", "median|q", "95 % below|q", "largest|q"), rows, wrap=True)
 
 
 def percentages(found: PredictedErrors) -> Iterator[str]:
@@ -212,13 +199,14 @@ def _percent(share: float) -> str:
     return limits.get(f"{100.0 * share:.0f}", f"{100.0 * share:.0f} %")
 
 
-def _worst_in_words(worst: WorstConfiguration, robot: Robot, names: Sequence[str], length: LengthUnit) -> Iterator[str]:
-    unit = Units(length).factor("m")
-    decimals = max(0, 4 + round(math.log10(unit)))
-    x, y, z = (f"{v / unit:.{decimals}f}" for v in worst.errors.position[0])
+def _worst_in_words(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Iterator[str]:
+    worst = found.worst
+    if worst is None:
+        return
+    x, y, z = (f"{v:.4f}" for v in worst.errors.position[0])
     at = "" if worst.row is None else f"{names[worst.row]}: "
-    size = figure(float(np.linalg.norm(worst.sigma)), "m")
-    yield f"{at}{size} mm with the tool at x {x}, y {y}, z {z} {length} from the base"
+    size = in_words(float(np.linalg.norm(worst.sigma)), "m", ".4f")
+    yield f"{at}{size} with the tool at x {x}, y {y}, z {z} m from the base"
     readings = zip(robot.joints, worst.errors.readings[0], strict=True)
     joints = (f"{joint.name} {in_words(q, joint.unit, '.2f')}" for joint, q in readings)
     yield f"joints: {', '.join(joints)}"
@@ -234,32 +222,19 @@ def _worst_in_words(worst: WorstConfiguration, robot: Robot, names: Sequence[str
 def _responsible(found: PredictedErrors, result: Result) -> Table:
     """The shares of parameters over all configurations and at the worst."""
     classes = {p.name: p.identifiability for p in result.parameters}
-    every, worst = (
-        {p.name: f"{100.0 * p.share:.0f} %" for p in of}
-        for of in (found.responsible, found.worst.responsible if found.worst is not None else ())
-    )
-    rows = [(name, every.get(name, "-"), worst.get(name, "-"), classes[name]) for name in every | worst]
-    return table_of(("", "of all", "where largest", "class"), rows, left="lrrl")
+    worst = () if found.worst is None else found.worst.responsible
+    every, there = ({p.name: p.share for p in of} for of in (found.responsible, worst))
+    rows = [(name, every.get(name), there.get(name), classes[name]) for name in every | there]
+    return table_of(("known, reduces the square", "of all|.0%", "where largest|.0%", "class"), rows)
 
 
 def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Table:
     """The worst of the given configurations, in their order."""
     error = np.where(np.isnan(found.expected[:, 0]), np.inf, found.expected[:, 0])
-    rows = []
-    for k in np.sort(np.argsort(-error, kind="stable")[:MAX_LISTED]).tolist():
-        errors = [figure(v, unit) for v, unit in zip(found.expected[k], POSE_KINDS.values(), strict=True)]
-        rows.append(
-            (names[k], *_readings(robot, found.errors.readings[k], ".2f"), *errors, "no" if found.far[k] else "yes")
-        )
-    return table_of(("", *_joint_headings(robot), "mm", "deg", "near"), rows, wrap=True)
-
-
-def _joint_headings(robot: Robot) -> list[str]:
-    return [f"{joint.name} {tables.unit_shown(joint.unit)}" for joint in robot.joints]
-
-
-def _readings(robot: Robot, readings: Floats, form: str = "") -> list[str]:
-    return [figure(q, joint.unit, form) for q, joint in zip(readings, robot.joints, strict=True)]
+    shown = np.sort(np.argsort(-error, kind="stable")[:MAX_LISTED]).tolist()
+    near = np.where(found.far, "no", "yes").tolist()
+    rows = [(names[k], *found.errors.readings[k], *found.expected[k], near[k]) for k in shown]
+    return table_of(("", *tables.joint_columns(robot, ":.2f"), "mm|m", "deg|rad", "near|>"), rows, wrap=True)
 
 
 def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
@@ -293,14 +268,11 @@ def correction_document(name: str, ids: Sequence[str], correction: Correction) -
         ids: The targets' names.
         correction: The commands.
     """
+    keys = ("reached", "readings", "nominal_readings", "position")
     quaternion, errors = _quaternions(correction), _errors(correction)
     targets = [
-        {
-            "id": target,
-            **{key: getattr(correction, key)[i] for key in ("reached", "readings", "nominal_readings", "position")},
-            "quaternion_xyzw": quaternion[i],
-            **{of: {kind: values[i] for kind, values in kinds.items()} for of, kinds in errors.items()},
-        }
+        {"id": target, **{key: getattr(correction, key)[i] for key in keys}, "quaternion_xyzw": quaternion[i]}
+        | {of: {kind: values[i] for kind, values in kinds.items()} for of, kinds in errors.items()}
         for i, target in enumerate(ids)
     ]
     counts = {"n_targets": len(ids), "n_reached": int(correction.reached.sum())}
@@ -330,25 +302,21 @@ def build_correction_report(ids: Sequence[str], correction: Correction, robot: R
 
 
 def _target_errors(correction: Correction) -> Table:
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for of, kinds in _errors(correction).items():
         for kind, values in kinds.items():
             known = values[np.isfinite(values)]
             sizes = (np.sqrt(np.mean(known**2)), known.max()) if len(known) else (None, None)
-            unit, *shown = quantities(POSE_KINDS[kind], *sizes, none="-")
-            rows.append((ERRORS[of] if kind == "position" else "", *shown, unit))
-    fitted = figure(correction.expected_fitted, "m", none="-")
-    rows.append(("the same after the best rigid fit of all targets", fitted, "", "mm"))
-    return table_of(("error at the targets", "RMS", "largest", ""), rows, left="lrrl", wrap=True)
+            rows.append((ERRORS[of] if kind == "position" else "", *sizes, POSE_KINDS[kind]))
+    rows.append(("the same after the best rigid fit of all targets", correction.expected_fitted, "", "m"))
+    return table_of(("error at the targets", "RMS|q|-", "largest|q|-", "|unit"), rows, wrap=True)
 
 
 def _commands(ids: Sequence[str], correction: Correction, robot: Robot, chosen: Sequence[int]) -> Table:
     """Joint positions and errors of some targets."""
-    after, rows = np.hypot(correction.missed[:, 0], correction.expected[:, 0]), []
-    for i in chosen:
-        errors = (figure(e, "m", none="-") for e in (correction.uncorrected[i, 0], after[i]))
-        rows.append((ids[i], *_readings(robot, correction.readings[i]), *errors))
-    return table_of(("target", *_joint_headings(robot), "before mm", "after mm"), rows, wrap=True)
+    before, after = correction.uncorrected[:, 0], np.hypot(correction.missed[:, 0], correction.expected[:, 0])
+    rows = [(ids[i], *correction.readings[i], before[i], after[i]) for i in chosen]
+    return table_of(("target", *tables.joint_columns(robot), "before mm|m|-", "after mm|m|-"), rows, wrap=True)
 
 
 def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[str]:
@@ -356,20 +324,16 @@ def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[st
         "Give the controller the joint positions; or, where it only takes poses, the poses that --out writes, with its"
         " nominal model, base and tool unchanged."
     )
-
-    def named(rows: Any) -> str:
-        return tables.shortened([ids[i] for i in np.flatnonzero(rows).tolist()], 5)
-
-    rotated = ~correction.reached & (correction.missed[:, 0] < 1e-9)
-    if rotated.any():
-        yield f"Reached with the point alone, the tool rotated as near as the arm can: {named(rotated)}."
-    if (~correction.reached & ~rotated).any():
-        yield f"Out of reach within the joint limits: {named(~correction.reached & ~rotated)}."
-    if correction.far.any():
-        yield (
-            "A joint changes by more than a calibration alone explains, near a singularity or on another branch: "
-            f"{named(correction.far)}. Look at these before you run them."
-        )
+    point = correction.missed[:, 0] < 1e-9
+    doubts = {
+        "Reached with the point alone, the tool rotated as near as the arm can": ~correction.reached & point,
+        "Out of reach within the joint limits": ~correction.reached & ~point,
+        "Look at these before you run them: a joint changes by more than a calibration alone explains (near a"
+        " singularity, or on another branch)": correction.far,
+    }
+    for words, rows in doubts.items():
+        if rows.any():
+            yield f"{words}: {tables.shortened([ids[i] for i in np.flatnonzero(rows).tolist()], 5)}."
     if np.isnan(correction.expected).any():
         yield "The expected error is unknown where it depends on what the calibration did not determine."
 

@@ -6,7 +6,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic_core import to_json
@@ -15,9 +15,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from fg_calib.diagnostics import probability
 from fg_calib.inputs import check_number, escaped
 from fg_calib.observability import LostDirection, Observability
-from fg_calib.robot import AXIS_OF_KIND, Axis
+from fg_calib.robot import AXIS_OF_KIND, Axis, Robot
 
 WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"
 WEAKLY = f"Weakly determined ({WEAK})"
@@ -26,7 +27,7 @@ WEAKLY = f"Weakly determined ({WEAK})"
 WIDTH = 100
 """Columns of a report that is not printed to a terminal."""
 
-SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5), "px": (1.0, "px", 3)}
+SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5), "px": (1.0, "px", 3), "s": (1e3, "ms", 2)}
 """Factor, unit and decimals in which a quantity is shown."""
 
 POSE_KINDS = {"position": "m", "orientation": "rad"}
@@ -111,24 +112,49 @@ def report(*parts: Section | Content) -> Group:
     return Group(*(part if isinstance(part, Section) else _part(part) for part in parts))
 
 
-def table_of(headings: Iterable[str], rows: Iterable[Iterable[object]], *, left: str = "", wrap: bool = False) -> Table:
+def table_of(columns: Iterable[str], rows: Iterable[Sequence[Any]], *, wrap: bool = False) -> Table:
     """A table without a frame, for the terminal and the page.
 
     Args:
-        headings: Of the columns; without any text there is no heading row.
-        rows: Cells.
-        left: The justification of each column: `l` for left, else right; the first is always left, others that are
-            not named are right.
+        columns: Of each column `heading|form|unknown`: how its values are shown, and what stands for one that is not
+            known. The form is
+
+            - nothing: text, to the left; `>`: text, to the right;
+            - `unit`: the unit in which quantities of the row are shown, from `m`, `rad` or `px`;
+            - `q`: a quantity in the unit of its row; `q:+.3g`: with a sign, in three digits; `m`, `rad`, `px`: likewise
+              in that unit;
+            - `p`: a probability; any other: a number in that format.
+
+            Without any heading there is no heading row.
+        rows: Values; text stands for itself in every column.
         wrap: Whether cells wrap at spaces where the terminal is narrow.
     """
-    titles = list(headings)
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="italic", show_header=any(titles))
-    for k, title in enumerate(titles):
-        is_left = k == 0 or left[k : k + 1] == "l"
-        table.add_column(line(title), justify="left" if is_left else "right", no_wrap=not wrap, overflow="fold")
+    parts = [tuple(f"{column}||".split("|")[:3]) for column in columns]
+    show_header = any(heading for heading, _, _ in parts)
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="italic", show_header=show_header)
+    for heading, form, _ in parts:
+        justify: Literal["left", "right"] = "left" if form in ("", "unit") else "right"
+        table.add_column(line(heading), justify=justify, no_wrap=not wrap, overflow="fold")
+    at = next((k for k, (_, form, _) in enumerate(parts) if form == "unit"), 0)
     for row in rows:
-        table.add_row(*(cell if isinstance(cell, Text) else line(str(cell)) for cell in row))
+        cells = zip(row, parts, strict=True)
+        table.add_row(*(_cell(value, form, unknown, str(row[at])) for value, (_, form, unknown) in cells))
     return table
+
+
+def _cell(value: Any, form: str, unknown: str, unit: str) -> Text:
+    kind, _, digits = form.partition(":")
+    if isinstance(value, Text):
+        return value
+    if form == "unit":
+        return line(unit_shown(value))
+    if isinstance(value, str) or form in ("", ">"):
+        return line(str(value))
+    if kind == "q" or kind in SHOWN:
+        return line(figure(value, unit if kind == "q" else kind, digits, unknown or "unknown"))
+    if value is None or not np.isfinite(value):
+        return line(unknown or "-")
+    return line(probability(value) if form == "p" else f"{value:{form}}")
 
 
 def factor(unit: str) -> float:
@@ -141,24 +167,19 @@ def unit_shown(unit: str) -> str:
     return SHOWN.get(unit, (1.0, unit, 6))[1]
 
 
-def figure(value: float | None, unit: str, form: str = "", none: str = "unknown") -> str:
+def figure(value: float | None, unit: str, form: str = "", unknown: str = "unknown") -> str:
     """A value in the unit that is shown, without the unit's name.
 
     Args:
         value: The value, [m], [rad] or [px]; None or not finite if it is unknown.
         unit: Its unit.
         form: `+` for a sign, and digits such as `.3g` instead of the decimals of the unit.
-        none: What an unknown value is shown as.
+        unknown: What an unknown value is shown as.
     """
     if value is None or not np.isfinite(value):
-        return none
-    factor, _, decimals = SHOWN.get(unit, (1.0, unit, 6))
-    return f"{value * factor:{form if '.' in form else f'{form}z.{decimals}f'}}"
-
-
-def quantities(unit: str, *values: float | None, form: str = "", none: str = "unknown") -> tuple[str, ...]:
-    """Cells: the unit that is shown, and values in it."""
-    return unit_shown(unit), *(figure(value, unit, form, none) for value in values)
+        return unknown
+    decimals = SHOWN.get(unit, (1.0, unit, 6))[2]
+    return f"{value * factor(unit):{form if '.' in form else f'{form}z.{decimals}f'}}"
 
 
 def in_words(value: float | None, unit: str, form: str = ".3g") -> str:
@@ -178,14 +199,20 @@ def lost_directions(lost: Sequence[LostDirection]) -> Table:
     for direction in lost:
         by_reason.setdefault(direction.reason, []).append(format_relation(direction.relation))
     rows = [(", ".join(relations), reason) for reason, relations in by_reason.items()]
-    return table_of(("", "because"), rows, left="ll", wrap=True)
+    return table_of(("", "because"), rows, wrap=True)
+
+
+def format_sum(factors: Mapping[str, float]) -> str:
+    """`d5 + d3 - d4`, `a7 + 0.5 beta5`: parameters, each with its factor."""
+    sizes = {name: "" if abs(f) == 1.0 else f"{abs(f):.4g} " for name, f in factors.items()}
+    terms = (f"{'-' if f < 0.0 else '+'} {sizes[name]}{name}" for name, f in factors.items())
+    return " ".join(terms).removeprefix("+ ")
 
 
 def format_relation(relation: Mapping[str, float]) -> str:
     """`d3 - d4` where sizes are equal, else `d6 by +0.5 m with alpha7 by +1 rad`."""
-    names, values = list(relation), list(relation.values())
-    if all(abs(v) == 1.0 for v in values):
-        return names[0] + "".join(f" {'+' if v > 0 else '-'} {n}" for n, v in zip(names[1:], values[1:], strict=True))
+    if all(abs(v) == 1.0 for v in relation.values()):
+        return format_sum(relation)
     large = {n: v for n, v in relation.items() if abs(v) >= 0.01}  # the largest is 1
     text = " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in large.items())
     n_small = len(relation) - len(large)
@@ -206,7 +233,13 @@ def weak_directions(observability: Observability, most: int = 5) -> Table:
         rows.append((f"{1.0 / weak.signal_to_noise:.3g}" if weak.signal_to_noise > 0.0 else "unknown", members))
     more = len(observability.weak) - most
     rows += [("", f"and {more} more")] if more > 0 else []
-    return table_of(("sigma / prior", "largest members"), rows, left="ll", wrap=True)
+    return table_of(("sigma / prior", "largest members"), rows, wrap=True)
+
+
+def joint_columns(robot: Robot, form: str = "") -> list[str]:
+    """Columns of joint readings for `table_of`."""
+    names = ((joint.name.replace("|", "/"), joint.unit) for joint in robot.joints)
+    return [f"{name} {unit_shown(unit)}|{unit}{form}" for name, unit in names]
 
 
 def plain(document: Any) -> Any:

@@ -5,7 +5,7 @@ It is made of a typed result and its tables, so that a loaded calibration prints
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rich.console import Group
 from rich.table import Table
-from rich.text import Text
 
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
@@ -23,17 +22,9 @@ from fg_calib.io import Result, key_of
 from fg_calib.measurements import LANDMARKS
 from fg_calib.prediction import ExpectedError, PredictedErrors, ToolPoseUncertainty, predict_errors
 from fg_calib.report import tables
-from fg_calib.report.tables import Section, figure, in_order, in_words, line, quantities, section, shortened, table_of
+from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
 from fg_calib.robot import Robot
-from fg_calib.statistics import (
-    OUTLIER_WEIGHT,
-    PREDICTION_VERDICTS,
-    VERDICTS,
-    Judgement,
-    KindFit,
-    ParameterEstimate,
-    TangentCovariance,
-)
+from fg_calib.statistics import OUTLIER_WEIGHT, PREDICTION_VERDICTS, VERDICTS, Judgement, KindFit, TangentCovariance
 
 if TYPE_CHECKING:
     import polars as pl
@@ -121,18 +112,18 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
     result = found.result
     joint_noise = ", with joint noise" if np.any(result.sigma_joint > 0.0) else ""
     notes = [*(text for text in result.cautions if result.findings or text not in result.reservations), *result.notes]
-    parameters = parameter_table(result) if result.estimated or not result.evaluated_only else ""
     return [
         *section("Fit statistics", _statistics(result)),
         *section(f"Goodness of fit (1 sigma of a row{joint_noise})", *_goodness(result, found.robot)),
-        *_prediction(result),
+        *section("Prediction of the test rows", *_prediction(result)),
         *_cross_validation(result),
         *expected_tool_error(result.expected_error),
         *section(RESIDUALS, _residuals(result)),
-        *section(PARAMETERS, *([parameters] if parameters else [])),
+        *section(PARAMETERS, parameter_table(result)),
         *section("Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)", _tolerances(result)),
         *section("Combinations that the kept parameters stand for", _combinations(result)),
-        *_suspicious_rows(found.residuals, most),
+        *section("Suspicious rows", *_suspicious_rows(found.residuals, "train", most)),
+        *section("Suspicious test rows", *_suspicious_rows(found.residuals, "test", most)),
         *section("Suspicious configurations", *_suspicious_configurations(result)),
         *_joint_values(found),
         *_frames(result),
@@ -164,7 +155,7 @@ def judged(judgements: Iterable[Judgement]) -> list[str]:
     return lines
 
 
-def _verdict(result: Result) -> Iterator[Text | str]:
+def _verdict(result: Result) -> Iterator[Content]:
     several = len(result.tables) > 1
     measured = "; ".join(f"{label} ({words})" if several else words for label, words in result.tables)
     joints = ", joint positions estimated" if result.joint_values is not None else ""
@@ -200,43 +191,31 @@ def _statistics(result: Result) -> Table:
         "reduced chi-square": reduced,
         "solver": f"{solver.iterations} iterations, {solver.seconds:.2f} s, {cost}",
     }
-    return table_of(("", ""), [row for row in rows.items() if row[1]], left="ll")
+    return table_of(("", ""), [row for row in rows.items() if row[1]])
 
 
 def _named(result: Result, fit: KindFit) -> str:
     return fit.kind if len(result.tables) == 1 else f"{fit.kind} of {result.tables[fit.table][0]}"
 
 
-def _p_value(p: float | None) -> str:
-    return "-" if p is None else probability(p)
-
-
-def _goodness(result: Result, robot: Robot) -> list[Table | str]:
+def _goodness(result: Result, robot: Robot) -> list[Content]:
     """Specified and estimated noise by kind, and what their ratio means."""
-    factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[str, ...]]()
+    factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[Any, ...]]()
     for fit in fits:
         specified, ratio, words = fit.stated_sigma_rms, fit.seen_over_stated, VERDICTS[fit.verdict]
         if factors is not None:
             specified, ratio, words = fit.own_sigma_rms, fit.own_factor, _estimated_noise(result, key_of(fit, fits))
-        sigmas = quantities(fit.unit, specified, ratio * specified, none="-")
-        rows.append((_named(result, fit), *sigmas, _ratio(ratio), _p_value(fit.p_value), words))
+        rows.append((_named(result, fit), fit.unit, specified, ratio * specified, ratio, fit.p_value, words))
     joint = (factors or {}).get("joint")
     for unit in dict.fromkeys(one.unit for one in robot.joints) if joint is not None else ():
         sigma = result.sigma_joint[[one.unit == unit for one in robot.joints]]
         rms = np.sqrt(np.mean(sigma[sigma > 0.0] ** 2)) if np.any(sigma > 0.0) else np.nan
-        words = _estimated_noise(result, "joint")
-        rows.append(("joint readings", *quantities(unit, rms / (joint or 1.0), rms), f"{joint:.3f}", "-", words))
-    headings = ("", "", "specified", "observed" if factors is None else "estimated", "ratio", "p-value", "")
+        rows.append(("joint readings", unit, rms / (joint or 1.0), rms, joint, None, _estimated_noise(result, "joint")))
+    estimated = "observed" if factors is None else "estimated"
+    columns = ("", "|unit", "specified|q|-", f"{estimated}|q|-", "ratio|.3f", "p-value|p", "")
     level = f"no row (|studentised residual| above {result.suspect_level:.2f}) and no configuration is suspicious"
     none = not result.suspect_configurations and not any(fit.n_beyond for fit in fits)
-    return [
-        table_of(headings, rows, left="llrrrrl", wrap=True),
-        *([level] if none and np.isfinite(result.suspect_level) else []),
-    ]
-
-
-def _ratio(value: float) -> str:
-    return f"{value:.3f}" if np.isfinite(value) else "-"
+    return [table_of(columns, rows, wrap=True), *([level] if none and np.isfinite(result.suspect_level) else [])]
 
 
 def _estimated_noise(result: Result, key: str) -> str:
@@ -245,20 +224,27 @@ def _estimated_noise(result: Result, key: str) -> str:
     return "estimated" if result.solver.converged else "not settled: the estimate has not converged"
 
 
-def _prediction(result: Result) -> list[Section]:
+def _prediction(result: Result) -> Iterator[Content]:
     """How well the test rows are predicted, by kind."""
-    fit, rows, notes = result.test, [], []
-    if fit is None:
-        return []
-    for kind in fit.kinds:
-        cells = f"{kind.n}", f"{kind.chi2:.4g}", f"{kind.expected:.4g}", _ratio(kind.seen_over_stated / kind.factor)
-        rows.append((_named(result, kind), *cells, _p_value(kind.p_value), PREDICTION_VERDICTS[kind.verdict]))
+    if (fit := result.test) is None:
+        return
+    rows = [
+        (
+            _named(result, k),
+            k.n,
+            k.chi2,
+            k.expected,
+            k.seen_over_stated / k.factor,
+            k.p_value,
+            PREDICTION_VERDICTS[k.verdict],
+        )
+        for k in fit.kinds
+    ]
+    yield table_of(("", "rows|d", "chi-square|.4g", "expected|.4g", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
     if fit.n_outliers:
-        notes.append(f"{fit.n_outliers} of {fit.n_measurements} measurements do not count: outliers by the loss")
+        yield f"{fit.n_outliers} of {fit.n_measurements} measurements do not count: outliers by the loss"
     if fit.n_unknown:
-        notes.append(f"{fit.n_unknown} rows are not judged: they depend on what is not determined")
-    headings = ("", "rows", "chi-square", "expected", "ratio", "p-value", "")
-    return section("Prediction of the test rows", table_of(headings, rows, left="lrrrrrl", wrap=True), *notes)
+        yield f"{fit.n_unknown} rows are not judged: they depend on what is not determined"
 
 
 def _cross_validation(result: Result) -> list[Section]:
@@ -266,11 +252,8 @@ def _cross_validation(result: Result) -> list[Section]:
     found = result.folds
     if found is None:
         return []
-    rows = []
-    for kind in in_order(found.kinds):
-        held = found.kinds[kind]
-        unit, *values = quantities(result.unit_of(kind), held.before, held.after, held.noise, form=".4f")
-        rows.append((kind, unit, f"{held.n}", *values))
+    kinds = {kind: found.kinds[kind] for kind in in_order(found.kinds)}
+    rows = [(kind, result.unit_of(kind), held.n, held.before, held.after, held.noise) for kind, held in kinds.items()]
     lines, (ratio, wide) = [], found.beyond({p.name: p.sigma for p in result.estimated})
     if ratio:
         median = f"{np.median(list(ratio.values())):.2f}" + " (pairs: expect 1.4 to 1.7)" * found.of_pairs
@@ -281,20 +264,19 @@ def _cross_validation(result: Result) -> list[Section]:
     if found.not_converged:
         lines.append(f"{found.not_converged} of {found.n} calibrations did not converge")
     title = f"Cross-validation ({found.n} folds of configurations, each predicted without it; RMS)"
-    return section(title, table_of(("", "", "held out", "before", "after", "specified noise"), rows, left="ll"), *lines)
+    columns = ("", "|unit", "held out|d", "before|q:.4f", "after|q:.4f", "specified noise|q:.4f")
+    return section(title, table_of(columns, rows), *lines)
 
 
 def expected_tool_error(expected: ExpectedError | None) -> list[Section]:
     """The section on the expected error of the tool, by the covariance; none for an evaluation."""
     if expected is None:
         return []
-    rows = [
-        (kind, *quantities(unit, *(getattr(rms, kind) for rms in (expected.base, expected.fitted))))
-        for kind, unit in tables.POSE_KINDS.items()
-    ]
+    kinds, both = tables.POSE_KINDS, (expected.base, expected.fitted)
+    rows = [(kind, unit, *(getattr(rms, kind) for rms in both)) for kind, unit in kinds.items()]
     which = "" if expected.n == expected.of else f" of {expected.of}"
     title = f"Expected tool error (RMS at {expected.n}{which} {expected.at} configurations)"
-    return section(title, table_of(("", "", "in the base frame", "after the best rigid fit"), rows, left="ll"))
+    return section(title, table_of(("", "|unit", "in the base frame|q", "after the best rigid fit|q"), rows))
 
 
 def _residuals(result: Result) -> Table:
@@ -305,22 +287,22 @@ def _residuals(result: Result) -> Table:
             both = [result.residual_rms[split].get(name) for split in ("train", "test")]
             values = (getattr(rms, when, None) for rms in both for when in ("before", "after"))
             if any(both):
-                rows.append((name, *quantities(result.unit_of(kind), *values, form=".4f", none="-")))
-    return table_of(("", "", "train before", "after", "test before", "after"), rows, left="ll")
+                rows.append((name, result.unit_of(kind), *values))
+    headings = ("train before", "after", "test before", "after")
+    return table_of(("", "|unit", *(f"{heading}|q:.4f|-" for heading in headings)), rows)
 
 
 def parameter_table(result: Result) -> Table:
     """Every parameter; base and tool fixed at zero are left out, and all fixed ones of an evaluation."""
-    rows: list[tuple[str, ...]] = []
+    rows: list[tuple[Any, ...]] = []
     for p in result.parameters:
-        unit, estimate, sigma, nominal = quantities(p.unit, p.estimate, p.sigma, p.nominal)
         if p.identifiability != "fixed":
-            more = figure(p.correction, p.unit, "+"), nominal, figure(p.prior_sigma, p.unit, none="")
-            rows.append((p.name, estimate, sigma, unit, *more, p.identifiability))
+            more = p.correction, p.nominal, "" if p.prior_sigma is None else p.prior_sigma
+            rows.append((p.name, p.estimate, p.sigma, p.unit, *more, p.identifiability))
         elif not result.evaluated_only and (p.nominal != 0.0 or not p.name.startswith(("base.", "tool."))):
-            rows.append((p.name, estimate, "", unit, "", "", "", "fixed"))
-    headings = ("", "estimate", "± sigma", "", "correction", "nominal", "prior", "class")
-    return table_of(headings, rows, left="lrrlrrrl")
+            rows.append((p.name, p.estimate, "", p.unit, "", "", "", "fixed"))
+    columns = ("", "estimate|q", "± sigma|q", "|unit", "correction|q:+", "nominal|q", "prior|q", "class")
+    return table_of(columns, rows)
 
 
 def _tolerances(result: Result) -> Table:
@@ -328,58 +310,42 @@ def _tolerances(result: Result) -> Table:
     sigma_of, rows = {p.name: (p.unit, p.prior_sigma) for p in result.parameters}, []
     for one in result.tolerance_scales or ():
         (unit, sigma), *others = {sigma_of[name] for name in one.parameters}
-        same = not others and sigma is not None
-        shown, specified, estimated = quantities(unit, *((sigma or 0.0) / s for s in (one.scale, 1.0)), form=".3g")
-        cells = (specified, estimated, shown) if same else ("", "", "")
-        ratios = f"{one.scale:.3g}", f"{one.low:.2g}", f"{one.high:.2g}", f"{one.seen:.1f} of {len(one.parameters)}"
-        rows.append((one.group, *cells, *ratios))
-    headings = ("", "specified", "estimated", "", "ratio", "from", "to", "corrections that count")
-    return table_of(headings, rows, left="rrrl")
+        sigmas = ("", "", "") if others or sigma is None else (sigma / one.scale, sigma, unit)
+        count = f"{one.seen:.1f} of {len(one.parameters)}"
+        rows.append((one.group, *sigmas, one.scale, one.low, one.high, count))
+    columns = ("", "specified|q:.3g", "estimated|q:.3g", "|unit", "ratio|.3g", "from|.2g", "to|.2g")
+    return table_of((*columns, "corrections that count|>"), rows)
 
 
 def _combinations(result: Result) -> Table:
-    rows = []
-    for p in result.parameters:
-        unit, sigma = quantities(p.unit, p.sigma_of_combination)
-        if p.stands_for:
-            rows.append((p.name, sigma, unit, format_combination(p.stands_for)))
-    return table_of(("", "sigma", "", "of the sum"), rows, left="lrll", wrap=True)
+    rows = [
+        (p.name, p.sigma_of_combination, p.unit, tables.format_sum(p.stands_for))
+        for p in result.parameters
+        if p.stands_for
+    ]
+    return table_of(("", "sigma|q", "|unit", "of the sum"), rows, wrap=True)
 
 
-def format_combination(factors: Mapping[str, float]) -> str:
-    """`d5 + d3 + d4`, `a7 + 0.5 beta5`: errors of the parameters, each with its factor."""
-    sizes = {name: "" if abs(f) == 1.0 else f"{abs(f):.4g} " for name, f in factors.items()}
-    terms = (f"{'-' if f < 0.0 else '+'} {sizes[name]}{name}" for name, f in factors.items())
-    return " ".join(terms).removeprefix("+ ")
+def _suspicious_rows(residuals: pl.DataFrame | None, split: str, most: int) -> list[Content]:
+    """The rows of a split that are larger than noise, the worst first; none if they were not saved."""
+    if residuals is None:
+        return []
+    suspects = residuals.filter(residuals["suspect"] & (residuals["split"] == split))
+    suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
+    more = [name for name in ("table", "of") if name in suspects.columns]
+    columns = ["a", "b", "kind", *more, "residual", "unit", "studentised", "flag"]
+    rows = [["" if value is None else value for value in row] for row in suspects.select(columns).head(most).rows()]
+    headings = ("a", "b", "", *more, "residual|q:+", "|unit", "in its sigma|+.1f", "")
+    left = [f"and {len(suspects) - most} more"] if len(suspects) > most else []
+    return [table_of(headings, rows), *left]
 
 
-def _suspicious_rows(residuals: pl.DataFrame | None, most: int) -> list[Section]:
-    """The fitted rows that are larger than noise, then the test rows, the worst first; none if they were not saved."""
-    sections: list[Section] = []
-    for split, word in (("train", ""), ("test", "test ")):
-        if residuals is None:
-            break
-        suspects = residuals.filter(residuals["suspect"] & (residuals["split"] == split))
-        suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
-        more = [name for name in ("table", "of") if name in suspects.columns]
-        rows: list[tuple[Any, ...]] = []
-        for row in suspects.head(most).fill_null("").iter_rows(named=True):
-            residual = figure(row["residual"], row["unit"], "+"), tables.unit_shown(row["unit"])
-            names = row["a"], row["b"], row["kind"], *(row[name] for name in more)
-            rows.append((*names, *residual, f"{row['studentised']:+.1f}", row["flag"]))
-        if len(suspects) > most:
-            rows.append(("", "", f"and {len(suspects) - most} more", *[""] * (4 + len(more))))
-        headings = ("a", "b", "", *more, "residual", "", "in its sigma", "")
-        sections += section(f"Suspicious {word}rows", table_of(headings, rows, left=f"lll{'l' * len(more)}rlrl"))
-    return sections
-
-
-def _suspicious_configurations(result: Result, most: int = 8) -> list[Table | str]:
+def _suspicious_configurations(result: Result, most: int = 8) -> list[Content]:
     """The configurations whose residuals together are larger than noise."""
     found = result.suspect_configurations
-    rows = [(c.id, c.n, f"{c.chi2:.4g}", f"{c.expected:.4g}") for c in found[:most]]
+    rows = [(c.id, c.n, c.chi2, c.expected) for c in found[:most]]
     more = [f"and {shortened([c.id for c in found[most:]], 8)}"] if len(found) > most else []
-    return [table_of(("", "rows", "chi-square", "expected"), rows), *more]
+    return [table_of(("", "rows|d", "chi-square|.4g", "expected|.4g"), rows), *more]
 
 
 def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
@@ -389,22 +355,18 @@ def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
         return []
     units = [found.robot.joints[j].unit for j in values.joints]
     sigma = "specified" if (found.result.noise_factors or {}).get("joint", 1.0) == 1.0 else "estimated"
-    rows, wrong = [], []
-    for k, (name, unit) in enumerate(zip(values.names, units, strict=True)):
-        shown, size = quantities(unit, values.sigma[k])
-        rows.append((name, size, shown, f"{values.mean[k]:+z.3f}", _ratio(values.scatter[k])))
-    for i, k in values.suspects[:most]:
-        at = int(values.configurations[i])
-        name = str(at) if configurations is None else configurations["id"][at]
-        shown, error = quantities(units[k], values.error[i, k], form="+")
-        wrong.append((name, values.names[k], error, shown, f"{values.studentised[i, k]:+.1f}"))
-    if len(values.suspects) > most:
-        wrong.append(("", f"and {len(values.suspects) - most} more", "", "", ""))
-    title = f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})"
-    return [
-        *section(title, table_of(("", sigma, "", f"mean error / {sigma}", "scatter"), rows, left="lrl")),
-        *section("Suspicious joint readings", table_of(("", "", "error", "", "in its sigma"), wrong, left="llrl")),
+    rows = list(zip(values.names, values.sigma, units, values.mean, values.scatter, strict=True))
+    at = [int(values.configurations[i]) for i, _ in values.suspects[:most]]
+    names = at if configurations is None else configurations["id"].gather(at).to_list()
+    wrong = [
+        (str(name), values.names[k], values.error[i, k], units[k], values.studentised[i, k])
+        for name, (i, k) in zip(names, values.suspects, strict=False)
     ]
+    more = [f"and {len(values.suspects) - most} more"] if len(values.suspects) > most else []
+    title = f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})"
+    columns = ("", f"{sigma}|q", "|unit", f"mean error / {sigma}|+z.3f", "scatter|.3f")
+    suspicious = table_of(("", "", "error|q:+", "|unit", "in its sigma|+.1f"), wrong)
+    return [*section(title, table_of(columns, rows)), *section("Suspicious joint readings", suspicious, *more)]
 
 
 def _landmarks(result: Result, most: int = 8) -> list[Section]:
@@ -415,10 +377,9 @@ def _landmarks(result: Result, most: int = 8) -> list[Section]:
         for p in chosen[:most]:
             units = ["" if kind == "unknown" else unit for unit in p.units]
             sigma = _vector(p.sigma, *units) if p.sigma.any() else "known"
-            rows.append((p.name, f"{p.n}", _vector(p.xyz, *units), "±", sigma))
-        if len(chosen) > most:
-            rows.append((f"and {len(chosen) - most} more", "", "", "", ""))
-        sections += section(title, table_of(("", "rows", "estimate", "", "sigma"), rows, left="lrrlr"))
+            rows.append((p.name, p.n, _vector(p.xyz, *units), "±", sigma))
+        more = [f"and {len(chosen) - most} more"] if len(chosen) > most else []
+        sections += section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows), *more)
     return sections
 
 
@@ -433,57 +394,47 @@ def _frames(result: Result) -> list[Section]:
             ("quaternion xyzw", "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist()), ""),
             ("± about its axes", _vector(frame.sigma[:3], *["rad"] * 3), "deg"),
         ]
-        sections += section(f"Measurement frame (world_T_base{which})", table_of(("", "", ""), rows, left="lrl"))
+        sections += section(f"Measurement frame (world_T_base{which})", table_of(("", "|>", ""), rows))
     return sections
 
 
 def _vector(values: Floats, *units: str) -> str:
-    return "  ".join(figure(v, unit) for v, unit in zip(values.tolist(), units, strict=True))
+    return "  ".join(map(figure, values.tolist(), units))
 
 
-def summary(result: Result, most: int = 3) -> list[str]:
+def summary(result: Result, most: int = 4) -> list[str]:
     """Robot, verdict, counts and residuals in at most ten lines.
 
     Args:
         result: The result.
-        most: How many errors or warnings are shown.
+        most: How many lines of the verdict are shown.
     """
-    texts = [f"DOUBTFUL: {finding}" for finding in result.findings]
-    texts = texts or [f"{verdict_word(result)}: {result.solver.message}", *result.reservations]
-    more = [f"... and {len(texts) - most} more findings"] if len(texts) > most else []
+    title, *verdict = map(str, _verdict(result))
+    more = [f"... and {len(verdict) - most} more findings"] if len(verdict) > most else []
     chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
     known = sum(p.sigma is not None for p in result.estimated)
     lines = [
-        f"{result.robot}: {'; '.join(words for _, words in result.tables)}",
-        *([] if result.acceptance is None else judged(result.acceptance.judgements)),
-        *texts[:most],
-        *more,
+        *(title, *verdict[:most], *more),
         f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",
         f"{len(result.estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
-        *_rms_lines(result),
     ]
-    return [str(line(text if len(text) <= tables.WIDTH else f"{text[: tables.WIDTH - 4]} ...")) for text in lines]
-
-
-def _rms_lines(result: Result) -> Iterator[str]:
     for split, kinds in result.residual_rms.items():
-        found = [
-            f"{kind} {in_words(rms.before, result.unit_of(kind))} -> {in_words(rms.after, result.unit_of(kind))}"
+        units = {kind: result.unit_of(kind) for kind, rms in kinds.items() if rms is not None}
+        both = (
+            f"{kind} {in_words(rms.before, units[kind])} -> {in_words(rms.after, units[kind])}"
             for kind, rms in kinds.items()
             if rms is not None
-        ]
-        if found:
-            yield f"{split} residuals, RMS: {', '.join(found)}"
+        )
+        lines += [f"{split} residuals, RMS: {', '.join(both)}"] if units else []
+    return [str(line(text if len(text) <= tables.WIDTH else f"{text[: tables.WIDTH - 4]} ...")) for text in lines]
 
 
 def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
     """What a reader of the report should know besides, a sentence each."""
-    problem, goodness = solution.problem, assessed.fit.goodness
+    problem, weights, series = solution.problem, solution.problem.state.weights, solution.problem.data.series
     for reason, count in problem.n_excluded.items():
         if count:
             yield f"{count} train rows are excluded: {reason.replace('_', ' ')}"
-    if same := problem.data.n_train(lambda kind: kind.is_contact and kind.ends == 2):
-        yield f"{same} train pairs touch one point twice: three coordinates each instead of a distance"
     for table in problem.data.tables:
         if not table.uses_pairs and table.measurements.pairs is not None:
             yield f"{table.measurements.pairs.source} is not used: model {table.model} is of poses, not of pairs"
@@ -492,69 +443,46 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
         chi2 = 2.0 * sum(factor.error(values) for factor in problem.added)
         yield f"{len(problem.added)} added factors with {problem.n_added} rows: chi-square {chi2:.6g}"
     if problem.formed and problem.missing_correlation and problem.n_pairs >= problem.n_configurations:
-        yield (
-            f"{problem.n_pairs} pairs are formed from {problem.n_configurations} poses and counted as independent: the"
-            " sigmas are too small where there are many more pairs than poses"
-        )
+        formed = f"{problem.n_pairs} pairs are formed from {problem.n_configurations} poses"
+        yield f"{formed} and counted as independent: with many more pairs than poses the sigmas are too small"
     yield from _noise_notes(solution, assessed)
-    weights, series = problem.state.weights, problem.data.series
     if weights is not None:
         n = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))
-        yield (
-            f"loss {problem.options.loss}: {n} of {sum(len(s.train) for s in series)} measurements lost more than half"
-            " their weight and do not count in chi-square"
-        )
+        lost = f"{n} of {sum(len(s.train) for s in series)} measurements lost more than half their weight"
+        yield f"loss {problem.options.loss}: {lost} and do not count in chi-square"
     yield from _undetermined(solution, assessed)
-    for frame in sorted({p.name.split(".")[0] for p in assessed.estimates.parameters if _is_rotation(p)}):
-        yield f"{frame} is pitched near 90 degrees: corrections of its angles are rotations about its own axes"
     if not assessed.fit.residuals.split.any():
         yield "no test rows: the prediction of new configurations was not checked"
-    if goodness.suspects.size and weights is None:
+    if assessed.fit.goodness.suspects.size and weights is None:
         yield "suspicious rows may be weighted down by a robust loss: loss in the job"
 
 
 def _noise_notes(solution: Solution, assessed: Assessment) -> Iterator[str]:
     """What the ratio of observed to specified noise means, and how to estimate the noise."""
-    estimated, joint_noise = solution.estimated_noise, bool(np.any(solution.problem.data.sigma_joint > 0.0))
-    verdicts = {fit.verdict for fit in assessed.fit.goodness.kinds}
+    estimated, verdicts = solution.estimated_noise, {fit.verdict for fit in assessed.fit.goodness.kinds}
     if estimated and solution.converged:
         kinds = " and ".join(dict.fromkeys(kind for _, kind in estimated))
-        yield (
-            f"{kinds} noise was estimated from these residuals: chi-square does not test it, and {len(estimated)}"
-            " degrees of freedom are used for it"
-        )
+        used = f"{len(estimated)} degrees of freedom are used for it"
+        yield f"{kinds} noise was estimated from these residuals: chi-square does not test it, and {used}"
     elif estimated is None and verdicts & {"too large", "too small", "both"} and assessed.noise_may_be_estimated:
-        if joint_noise and "too large" in verdicts:
-            yield (
-                "the specified joint noise may be too large (one value a joint: noise: {joint: [...]}); estimate: true"
-                " separates it from that of the measurements where possible"
-            )
-        else:
-            yield "to use the observed noise instead of the specified one: estimate: true in noise of the job"
-
-
-def _is_rotation(p: ParameterEstimate) -> bool:
-    """Whether a correction is about a frame's own axis, not the difference of an angle (see `corrections_of`)."""
-    off = p.estimate - p.nominal - p.correction
-    return p.unit == "rad" and abs(np.remainder(off + np.pi, 2.0 * np.pi) - np.pi) > UNMOVED
+        yield "to use the observed noise instead of the specified one: estimate: true in noise of the job"
 
 
 def _undetermined(solution: Solution, assessed: Assessment) -> Iterator[str]:
     """What fixes the parameters that the data alone do not determine."""
-    estimated, keep = set(assessed.names), solution.problem.options.gauge == "keep"
-    fixed: dict[str, list[ParameterEstimate]] = {}
+    estimated, fixed = set(assessed.names), dict[str, list[str]]()
     for p in assessed.estimates.parameters:
         if p.identifiability in ("relative", "ineffective"):
             if p.name in estimated and p.prior_sigma is not None:
-                what = "not identifiable from these data, fixed by their priors: {}"
+                what = "not identifiable from these data, fixed by their priors"
             elif abs(p.correction) <= UNMOVED:
-                what = "not identifiable from these data, kept at nominal: {}"
-            elif keep:
-                what = "standing for combinations with parameters that stay at nominal: {}"
+                what = "not identifiable from these data, kept at nominal"
+            elif solution.problem.options.gauge == "keep":
+                what = "standing for combinations with parameters that stay at nominal"
             elif p.sigma is not None:
-                what = "not identifiable from these data, fixed by priors of parameters in combination with them: {}"
+                what = "not identifiable from these data, fixed by priors of parameters in combination with them"
             else:
-                what = "fixed by nothing, moved from nominal by steps of minimum norm: {}"
-            fixed.setdefault(what, []).append(p)
-    for what, parameters in fixed.items():
-        yield what.format(shortened([p.name for p in parameters], 12))
+                what = "fixed by nothing, moved from nominal by steps of minimum norm"
+            fixed.setdefault(what, []).append(p.name)
+    for what, names in fixed.items():
+        yield f"{what}: {shortened(names, 12)}"

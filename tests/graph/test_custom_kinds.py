@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from custom_kinds import ANCHORS, SIGMA, AnchorDistance, lengths_to_anchors
-from reported import format_report, result_document
+from reported import format_comparison, format_report, result_document
 from simulated import measure
 
 from fg_calib import Calibration, calibrate
@@ -20,7 +20,6 @@ from fg_calib.measurements.kinds import Kind, Rows
 from fg_calib.measurements.kinds.pair import Distance
 from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.observability.reasons import NOT_EXCITED
-from fg_calib.report.compare import format_comparison
 from fg_calib.robot.kinematics import pose
 
 

@@ -111,9 +111,9 @@ def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
     real = real_errors(robot.with_values(values), robot, readings)
     bound = Bound(robot, names, np.outer(error, error), np.outer(error, error), len(names))
     # Errors of 1e-5: what is not linear is of that size.
-    assert bound.position(readings) == pytest.approx(real.base.rms, rel=1e-4)
-    assert bound.position(readings, fitted=True) == pytest.approx(real.fitted.rms, rel=1e-4)
-    assert real.fitted.rms < 0.95 * real.base.rms
+    assert bound.position(readings) == pytest.approx(real.base_frame.rms, rel=1e-4)
+    assert bound.position(readings, fitted=True) == pytest.approx(real.best_rigid_fit.rms, rel=1e-4)
+    assert real.best_rigid_fit.rms < 0.95 * real.base_frame.rms
 
 
 def test_an_error_of_unknown_size_that_stays_is_an_error():
