@@ -34,7 +34,7 @@ def board(
         say("error: one of --camera and --estimate-camera is needed, and only one")
         raise typer.Exit(2)
     from fg_calib import importers
-    from fg_calib.io import Units, read_bytes, read_camera, read_camera_of_images, require_writable
+    from fg_calib.io import Units, read_bytes, read_camera, require_writable
 
     importers.load_opencv()
     require_writable(out)
@@ -44,7 +44,7 @@ def board(
     if camera is not None:
         read_camera(camera)  # before the images, which take their time
     found = importers.read_corners(files, target)
-    given = None if camera is None else read_camera_of_images(camera, found.size)
+    given = None if camera is None else read_camera(camera, found.size)
     fit = importers.fit_board(target, found.images, found.size, given)
     content = None if camera is None else read_bytes(camera)
     tables = importers.BoardTables(fit, found.without, readings, Units(length, angle), content)

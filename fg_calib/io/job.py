@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, astuple, fields, replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,17 +14,13 @@ from pydantic import BeforeValidator, Field, StrictBool, create_model
 from fg_calib.inputs import (
     LIMITED,
     POSE_MODELS,
-    EncoderNoise,
     FrameKnowledge,
-    Gauge,
     InputError,
     Limits,
-    Loss,
     Model,
     Options,
-    PairErrors,
     Pairing,
-    SharedScale,
+    Strategy,
     check_names,
     checked,
     did_you_mean,
@@ -46,6 +42,7 @@ from fg_calib.io.yaml import (
     refuse_unknown_keys,
     shown,
     validate,
+    within,
 )
 from fg_calib.job import Job
 from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
@@ -67,7 +64,11 @@ _Noise = create_model("_Noise", __base__=Schema, joint=(Any, 0.0), estimate=(Str
 
 
 class _JointNoises(Schema):
-    joint: Annotated[tuple[NotNegative, ...], BeforeValidator(lambda one: one if isinstance(one, list) else (one,))]
+    joint: tuple[NotNegative, ...]
+
+
+class _Fixed(Schema):
+    fixed: StrictBool
 
 
 class _RandomPairing(Schema):
@@ -94,67 +95,67 @@ class _Point(Schema):
 
 
 class _Tolerances(Schema):
-    estimate: SharedScale | None = None
+    estimate: Any = None
     targets: Positive | None = None
     anchors: Positive | None = None
 
 
-class _Entry(Schema):
-    """An entry of a list of tables; what it leaves out is as the job says."""
+class _TableKeys(Schema):
+    """Keys of a table; at the top of a job they are the defaults of all its tables."""
 
-    table: FilePath
-    pairs: FilePath | None = None
-    model: Model | None = None
-    pairing: Any = None
-    frame: FrameKnowledge | None = None
-    units: UnitsOfFile | None = None
-    noise: Any = None
-    offset: Literal["estimate"] | None = None
-    camera: Any = None
-    columns: _Columns | None = None
-
-
-class _Job(Schema):
-    robot: Any
-    measurements: Any
     pairs: FilePath | None = None
     model: Model | None = None
     pairing: Any = "star"
     frame: FrameKnowledge = "known"
     units: UnitsOfFile = Units()
     noise: Any = None
-    prior: StrictBool | None = None
-    gauge: Gauge = "prior"
-    prefer: tuple[str, ...] = ()
-    pair_errors: PairErrors = "shared"
-    encoder: EncoderNoise = "propagated"
-    loss: Loss = "none"
-    max_iterations: Annotated[Count, Field(gt=0)] | None = None
+    offset: Literal["estimate"] | None = None
+    camera: Any = None
+    columns: _Columns | None = None
+
+
+class _Entry(_TableKeys):
+    table: FilePath
+
+
+_CHOICES = ("prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
+"""Keys of a job that `Options` checks as they stand."""
+
+_OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
+"""Keys of a job that say nothing of how a table is read."""
+
+
+class _JobKeys(_TableKeys):
+    robot: Any
+    measurements: FilePath | Annotated[list[dict[str, Any]], Field(min_length=1)]
     accept: Any = None
-    folds: Annotated[Count, Field(ge=2)] | None = None
     truth: FilePath | None = None
     targets: Mapping[str, _Point] = Field(default_factory=dict)
     anchors: Mapping[str, _Point] = Field(default_factory=dict)
     tolerance: Annotated[
         _Tolerances, BeforeValidator(lambda one: {"estimate": "kind"} if one == "estimate" else one or {})
     ] = _Tolerances()
-    offset: Literal["estimate"] | None = None
-    camera: Any = None
-    columns: _Columns | None = None
+
+    def options(self, robot: Robot, model: Model, *, estimate_noise: bool = False) -> Options:
+        """The options of a calibration of a robot.
+
+        Raises:
+            InputError: One is not possible.
+        """
+        choices = {key: getattr(self, key) for key in (*_CHOICES, "frame") if key in self.model_fields_set}
+        check_names("prefer", choices.get("prefer", ()), names_of(robot.parameters))
+        return Options.of(
+            **choices,
+            model=model,
+            estimate_noise=estimate_noise,
+            estimate_tolerance=self.tolerance.estimate,
+            pairing=pairing_of(self.pairing),
+            accept=_limits(self.accept, self.units),
+        )
 
 
-class _JobOfOneTable(_Job):
-    model: Model
-
-
-_CHOICES = ("model", "frame", "prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
-"""Keys of a job that are options as they stand."""
-
-_OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
-"""Keys of a job that say nothing of how a table is read."""
-
-_USED_BY: dict[str, tuple[Model, ...]] = {"targets": tuple(POSE_MODELS), "anchors": ("anchor",)}
-"""Models that known points are for."""
+_CHECKED_LATER: dict[str, Any] = dict.fromkeys(_CHOICES, (Any, None))
+_Job = create_model("_Job", __base__=_JobKeys, **_CHECKED_LATER)
 
 
 @checked
@@ -177,21 +178,14 @@ def read_job(path: Path | str) -> Job:
 
 def _read_job(path: Path) -> Job:
     folder, given = path.parent, read_yaml(path)
-    several = isinstance(given.get("measurements"), list)
-    file: _Job = validate(_Job if several else _JobOfOneTable, given, path.name)
+    file = validate(_Job, given, path.name)
     robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
-    check_names(f"{path.name}: prefer", file.prefer, names_of(robot.parameters))
+    tables = _tables(given, file, robot, path)
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    tables = _tables(file, robot, path)
-    alone = tables[0].measurements if not several and tables[0].is_plain else tuple(tables)
+    with within(path.name):
+        options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)
+    alone = tables[0].measurements if isinstance(file.measurements, str) and tables[0].is_plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    options = Options.of(
-        **{key: getattr(file, key) for key in _CHOICES if key in file.model_fields_set} | {"model": tables[0].model},
-        estimate_noise=estimate_noise,
-        estimate_tolerance=file.tolerance.estimate,
-        pairing=pairing_of(file.pairing, f"{path.name}: pairing"),
-        accept=_limits(file.accept, file.units, f"{path.name}: accept"),
-    )
     return Job(path, robot, alone, options, truth, document=_document(given, folder))
 
 
@@ -216,17 +210,17 @@ def units_of(job: Job) -> Units:
 def _document(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """A job's mapping, for reading tables like its own elsewhere: with its cameras in it, and without its robot."""
 
-    def whole(entry: Mapping[str, Any]) -> dict[str, Any]:
+    def with_camera(entry: Mapping[str, Any]) -> dict[str, Any]:
         camera = entry.get("camera")
-        file = camera.get("file") if isinstance(camera, dict) else camera if camera != "fixed" else None
-        if not isinstance(file, str):
+        more = {key: camera[key] for key in camera if key == "fixed"} if isinstance(camera, dict) else {}
+        file = camera.get("file") if isinstance(camera, dict) else camera
+        if not isinstance(file, str) or file == "fixed":
             return dict(entry)
-        more = {"fixed": True} if isinstance(camera, dict) and camera.get("fixed") else {}
         return {**entry, "camera": {**read_yaml(folder / file), **more}}
 
-    found = whole({key: value for key, value in given.items() if key not in _OF_THE_ROBOT})
+    found = with_camera({key: value for key, value in given.items() if key not in _OF_THE_ROBOT})
     if isinstance(found["measurements"], list):
-        found["measurements"] = [whole(entry) for entry in found["measurements"]]
+        found["measurements"] = [with_camera(entry) for entry in found["measurements"]]
     return found
 
 
@@ -262,77 +256,86 @@ def read_table_like(
         raise InputError(path.name, found, "pairs, as its job has them" if pairs is None else "none, as in its job")
     alone = {**entry, "table": str(path.absolute()), "pairs": None if pairs is None else str(pairs.absolute())}
     job = {key: value for key, value in document.items() if key != "pairs"} | {"robot": ".", "measurements": [alone]}
-    (table,) = _tables(validate(_Job, job, path.name), robot, path)
+    (table,) = _tables(job, validate(_Job, job, path.name), robot, path)
     return table
 
 
-def _tables(file: _Job, robot: Robot, path: Path) -> list[Table]:
-    """The tables of a job; what an entry leaves out is as the job says for all."""
-    given, folder = file.measurements, path.parent
-    if not given or not isinstance(given, str | list):
-        raise InputError(f"{path.name}: measurements", f"found {shown(given)}", "a path, or a list of tables")
-    whole = isinstance(given, str)
-    if not whole and file.pairs is not None:
+def _tables(given: Mapping[str, Any], file: Any, robot: Robot, path: Path) -> list[Table]:
+    """The tables of a job; what an entry leaves out is as the job says for all.
+
+    Args:
+        given: The job's mapping.
+        file: The same, checked.
+        robot: The robot.
+        path: The job's file.
+    """
+    entries, places = file.measurements, [path.name]
+    if isinstance(entries, str):
+        entries = [{"table": entries}]
+    elif file.pairs is not None:
         raise InputError(f"{path.name}: pairs", "next to a list of tables", "the key in the table's own entry")
-    entries = [{"table": given, "pairs": file.pairs}] if whole else given
-    places = [path.name if whole else f"{path.name}: measurement {i}" for i in range(1, len(entries) + 1)]
-    read: list[_Entry] = [validate(_Entry, one, place) for one, place in zip(entries, places, strict=True)]
+    else:
+        places = [f"{path.name}: measurement {i}" for i in range(1, len(entries) + 1)]
+    defaults = {key: given[key] for key in _TableKeys.model_fields if key in given}
+    read = [validate(_Entry, defaults | dict(one), place) for one, place in zip(entries, places, strict=True)]
     points: list[str] = []  # of all tables, as pairs may name those of another
     if len(read) > 1 and any(entry.pairs is not None for entry in read):
         for entry in read:
-            points += read_points(folder / entry.table, entry.columns or file.columns)
-    return [_table(*one, file, robot, path, points) for one in zip(read, places, strict=True)]
-
-
-def _table(entry: _Entry, place: str, file: _Job, robot: Robot, path: Path, points: Sequence[str]) -> Table:
-    """The table of an entry."""
-    folder, model, units = path.parent, entry.model or file.model, entry.units or file.units
-    if model is None:
-        raise InputError(place, "missing key 'model'")
+            points += read_points(path.parent / entry.table, entry.columns)
     noise, _ = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    if entry.noise is not None:
-        own, _ = _noise(entry.noise, units, robot, f"{place}: noise")
-        if entry.noise == "estimate" or "estimate" in entry.noise:
-            raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the whole job")
-        noise = noise.updated(**{key: own.get(key) for key in entry.noise})
+    found = []
+    for one, entry, place in zip(entries, read, places, strict=True):
+        if entry.model is None:
+            raise InputError(place, "missing key 'model'")
+        own = noise
+        if "noise" in one:
+            given_noise, estimated = _noise(entry.noise, entry.units, robot, f"{place}: noise")
+            if estimated:
+                raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the job")
+            own = noise.updated(**{key: given_noise.get(key) for key in entry.noise or ()})
+        found.append(_table(entry, file, robot, path, place, own, points))
+    return found
+
+
+def _table(
+    entry: _Entry, file: Any, robot: Robot, path: Path, place: str, noise: Noise, points: Sequence[str]
+) -> Table:
+    """The table of an entry."""
+    folder, model = path.parent, entry.model or ""
     measurements = read_measurements(
         folder / entry.table,
         robot,
         pairs=None if entry.pairs is None else folder / entry.pairs,
-        units=units,
+        units=entry.units,
         noise=noise,
         points=points,
         model=model,
-        columns=entry.columns or file.columns,
+        columns=entry.columns,
     )
-    camera, fixed = camera_in(
-        file.camera if entry.camera in (None, "fixed") else entry.camera, f"{place}: camera", folder
-    )
-    pairing = file.pairing if entry.pairing is None else entry.pairing
+    camera, fixed = camera_in(file.camera if entry.camera == "fixed" else entry.camera, f"{place}: camera", folder)
     return Table(
         measurements,
         model,
-        pairing_of(pairing, f"{place}: pairing"),
-        entry.frame or file.frame,
+        pairing_of(entry.pairing, f"{place}: pairing"),
+        entry.frame,
         known=_known_points(file, model, path.name),
-        offset=model == "anchor" and (entry.offset or file.offset) == "estimate",
+        offset=model == "anchor" and entry.offset == "estimate",
         camera=camera if model == "pixels" else None,
         fixed_camera=model == "pixels" and (fixed or "fixed" in (entry.camera, file.camera)),
     )
 
 
-def _known_points(file: _Job, model: Model, place: str) -> dict[str, KnownPoint]:
+def _known_points(file: Any, model: Model, place: str) -> dict[str, KnownPoint]:
     """Targets or anchors, whatever a model has, that the job says something of."""
     key = "anchors" if model == "anchor" else "targets"
-    if model not in _USED_BY[key]:
+    if model != "anchor" and model not in POSE_MODELS:
         return {}
-    for_all, found = getattr(file.tolerance, key), {}
+    found, shared = {}, getattr(file.tolerance, key)
     for name, point in getattr(file, key).items():
-        sigma, said_by = point.tolerance, f"{place}: {key}: {name}: tolerance"
-        if sigma is None:
-            sigma, said_by = for_all, f"{place}: tolerance: {key}"
-        xyz = np.array([point.x, point.y, point.z]) * file.units.factor("m")
-        found[name] = KnownPoint(xyz, None if sigma is None else file.units.sigma(sigma, "m", said_by))
+        sigma = shared if point.tolerance is None else point.tolerance
+        if sigma is not None:
+            sigma = file.units.sigma(sigma, "m", f"{place}: {key}: {name}: tolerance")
+        found[name] = KnownPoint(np.array([point.x, point.y, point.z]) * file.units.factor("m"), sigma)
     return found
 
 
@@ -349,22 +352,19 @@ def camera_in(given: object, place: str, folder: Path) -> tuple[Camera | None, b
     """
     fixed = False
     if isinstance(given, dict) and "fixed" in given:
-        fixed = given["fixed"]
-        if not isinstance(fixed, bool):
-            raise InputError(f"{place}: fixed", f"found {shown(fixed)}", "true or false")
+        fixed = validate(_Fixed, {"fixed": given["fixed"]}, place).fixed
         given = {key: value for key, value in given.items() if key != "fixed"}
         given = given["file"] if set(given) == {"file"} else given
     if given in (None, "fixed"):
         return None, fixed
-    return (read_camera(folder / given) if isinstance(given, str) else camera_of(given, place)), fixed
+    return (read_camera(folder / given) if isinstance(given, str) else _camera(given, place)), fixed
 
 
-def _limits(given: object, units: Units, place: str) -> Limits:
+def _limits(given: object, units: Units) -> Limits:
     """The errors that the user accepts, in [m] and [rad]."""
-    if not isinstance(given, dict):
-        return Limits.given(None) if given is None else Limits.given(given)  # type: ignore[arg-type] # raises
-    check_names(place, given, list(LIMITED), "limit")
-    return Limits(**{key: quantity(one, LIMITED[key], units, f"{place}: {key}") for key, one in given.items()})
+    if not isinstance(given, dict) or not given.keys() <= LIMITED.keys():
+        return Limits.given(given)  # type: ignore[arg-type] # raises
+    return Limits(**{key: quantity(one, LIMITED[key], units, f"accept: {key}") for key, one in given.items()})
 
 
 def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
@@ -378,10 +378,11 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     Raises:
         InputError: A job with these keys could not be read.
     """
-    file = validate(_JobOfOneTable, {"robot": ".", "measurements": ".", **choices}, place)
-    pairing_of(file.pairing, f"{place}: pairing")
-    _limits(file.accept, file.units, f"{place}: accept")
-    check_names(f"{place}: prefer", file.prefer, names_of(robot.parameters))
+    file = validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
+    if file.model is None:
+        raise InputError(place, "missing key 'model'")
+    with within(place):
+        file.options(robot, file.model)
 
 
 def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
@@ -398,11 +399,7 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
         InputError: It is neither, or does not describe a robot.
     """
     if isinstance(given, dict):
-        if "urdf" in given and "units" not in given:
-            if units != Units() and (given.get("base") or given.get("tool")):
-                _log.warning("%s: base and tool are in %s and %s, as the file's units say", place, *astuple(units))
-            given = {**given, "units": units}
-        return robot_from_mapping(given, place, folder)
+        return robot_from_mapping({"units": units} | given if "urdf" in given else given, place, folder)
     if not isinstance(given, str) or not given:
         raise InputError(place, f"found {shown(given)}", "a path, or the mapping of a robot file")
     return read_robot(folder / given)
@@ -416,39 +413,35 @@ def _truth(path: Path, robot: Robot) -> Robot:
     return truth
 
 
-def pairing_of(given: object, place: str) -> Pairing:
+def pairing_of(given: object, place: str = "pairing") -> Pairing:
     """A pairing: a strategy, or how many random pairs.
 
     Raises:
         InputError: It is neither.
     """
-    match given:
-        case "star" | "chain" | "all":
-            return Pairing(given)
-        case dict():
-            file = validate(_RandomPairing, given, place)
-            return Pairing("random", file.random, file.seed)
-    hint = did_you_mean(given, ("star", "chain", "all"))
-    raise InputError(place, f"found {shown(given)}", "one of star, chain, all, {random: N, seed: S}", hint)
+    if isinstance(given, dict):
+        file = validate(_RandomPairing, given, place)
+        return Pairing("random", file.random, file.seed)
+    possible: tuple[Strategy, ...] = ("star", "chain", "all")
+    strategy = next((one for one in possible if one == given), None)
+    if strategy is None:
+        expected = f"one of {', '.join(possible)}, {{random: N, seed: S}}"
+        raise InputError(place, f"found {shown(given)}", expected, did_you_mean(given, possible))
+    return Pairing(strategy)
 
 
 def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise, bool]:
     """The noise in [m] and [rad], that of the readings joint by joint, and whether it is only where to start."""
-    if given == "estimate":
-        given = {"estimate": True}
-    if given is not None and not isinstance(given, dict):
+    if given is not None and given != "estimate" and not isinstance(given, dict):
         raise InputError(place, f"found {shown(given)}", "a mapping of sigmas, or estimate")
-    file: Any = validate(_Noise, given or {}, place)
-    stated: dict[str, Any] = {
-        key: units.sigma(sigma, unit, f"{place}: {key}") if unit in ("m", "rad") else sigma
-        for key, unit in NOISE_UNITS.items()
-        if (sigma := getattr(file, key)) is not None
-    }
-    noise = Noise(joint=joint_noise(file.joint, units, robot, place)).updated(**stated)
-    if not file.estimate:
-        return noise, False
-    missing = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1] if getattr(noise, f.name) is None}
-    return replace(noise, **missing), True
+    file: Any = validate(_Noise, {"estimate": True} if given == "estimate" else given or {}, place)
+    specified = {key: sigma for key in NOISE_UNITS if (sigma := getattr(file, key)) is not None}
+    sigmas = {key: units.sigma(one, NOISE_UNITS[key], f"{place}: {key}") for key, one in specified.items()}
+    noise = Noise(joint=joint_noise(file.joint, units, robot, place)).updated(**sigmas)
+    if file.estimate:
+        start = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1] if getattr(noise, f.name) is None}
+        noise = replace(noise, **start)
+    return noise, file.estimate
 
 
 def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[float, ...]:
@@ -457,65 +450,52 @@ def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[
     Raises:
         InputError: It is neither.
     """
-    sigmas = validate(_JointNoises, {"joint": given}, place).joint
-    if not isinstance(given, list):
-        sigmas *= robot.n_joints
+    listed = given if isinstance(given, list) else [given]
+    sigmas = validate(_JointNoises, {"joint": listed}, place).joint * (1 if listed is given else robot.n_joints)
     if len(sigmas) != robot.n_joints:
-        raise InputError(f"{place}: joint", f"{len(sigmas)} figures", f"one for all or {robot.n_joints}, one a joint")
+        raise InputError(f"{place}: joint", f"{len(sigmas)} values", f"one for all or {robot.n_joints}, one a joint")
     return tuple(units.sigma(s, j.unit, f"{place}: joint") for s, j in zip(sigmas, robot.joints, strict=True))
 
 
+_PixelCount = Annotated[Count, Field(gt=0)] | None
 _INTRINSICS: dict[str, Any] = {f.name: (Number, ... if f.default is MISSING else f.default) for f in fields(Camera)}
-_PixelCount = Annotated[Count, Field(gt=0)]
-_CameraSigmas = Annotated[dict[str, NotNegative], BeforeValidator(refuse_unknown_keys(*_INTRINSICS))]
-_OF_IMAGES: dict[str, Any] = {"width": (_PixelCount | None, None), "height": (_PixelCount | None, None)}
-_OF_IMAGES |= {"sigma": (_CameraSigmas | None, None)}
-"""What a camera's file may say besides its intrinsics: the size of its images, and how well it is known."""
+_CameraSigmas = Annotated[dict[str, NotNegative] | None, BeforeValidator(refuse_unknown_keys(*_INTRINSICS))]
+_Camera = create_model(
+    "_Camera",
+    __base__=Schema,
+    **_INTRINSICS,
+    width=(_PixelCount, None),
+    height=(_PixelCount, None),
+    sigma=(_CameraSigmas, None),
+)
+"""A camera's file: its intrinsics, the size of its images, and how well it is known."""
 
-_Camera = create_model("_Camera", __base__=Schema, **_INTRINSICS, **_OF_IMAGES)
 
-
-def read_camera(path: Path) -> Camera:
+def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
     """A camera's intrinsics: fx, fy, cx, cy in pixels, and the distortion k1 k2 p1 p2 k3 of OpenCV.
-
-    Raises:
-        InputError: The file is missing or cannot be used.
-    """
-    return camera_of(read_yaml(path), path.name)
-
-
-def read_camera_of_images(path: Path, size: tuple[int, int]) -> Camera:
-    """`read_camera` of images of a size.
 
     Args:
         path: The file.
-        size: Width and height of the images, [px].
+        size: Width and height of the images that it is for, [px].
 
     Raises:
-        InputError: The file cannot be used, or says that it is of images of another size.
+        InputError: The file is missing or cannot be used, or says that it is of images of another size.
     """
     given = read_yaml(path)
-    camera = camera_of(given, path.name)
-    for name, found in zip(("width", "height"), size, strict=True):
-        said = given.get(name)
-        if said is not None and said != found:
+    camera = _camera(given, path.name)
+    for key, center, found in zip(("width", "height"), ("cx", "cy"), size or (), strict=False):
+        if given.get(key) not in (None, found):
             hint = "the intrinsics of other images would have to be scaled"
-            raise InputError(f"{path.name}: {name}", f"found {said}", f"{found} px as the images have", hint)
-    for name, most in zip(("cx", "cy"), size, strict=True):
-        if not 0.0 <= getattr(camera, name) <= most:
-            words = "%s: %s = %g px is outside the images of %d x %d px; is it the camera that took them?"
-            _log.warning(words, path.name, name, getattr(camera, name), *size)
+            raise InputError(f"{path.name}: {key}", f"found {given[key]}", f"{found} px as the images have", hint)
+        if not 0.0 <= getattr(camera, center) <= found:
+            words = "%s: %s = %g px is outside the images of %d px; is it the camera that took them?"
+            _log.warning(words, path.name, center, getattr(camera, center), found)
     return camera
 
 
-def camera_of(given: object, place: str) -> Camera:
-    """A camera from a mapping.
-
-    Raises:
-        InputError: It is no camera.
-    """
+def _camera(given: object, place: str) -> Camera:
     file = validate(_Camera, given, place)
     try:
-        return Camera(**{f.name: getattr(file, f.name) for f in fields(Camera)})
+        return Camera(**{key: getattr(file, key) for key in _INTRINSICS})
     except InputError as error:
         raise InputError(error.place.replace("camera", place, 1), error.found, error.expected) from None

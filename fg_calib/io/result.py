@@ -12,12 +12,12 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy
 from pydantic import (
-    AliasChoices,
     AliasPath,
     BaseModel,
     BeforeValidator,
@@ -30,10 +30,10 @@ from pydantic import (
 from fg_calib import __version__
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import SetupCheck
-from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale
-from fg_calib.inputs import NORM_TOLERANCE, Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
+from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale, Variables
+from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, is_folder, read_text
-from fg_calib.io.yaml import first_misfit
+from fg_calib.io.yaml import first_misfit, shown
 from fg_calib.measurements import Table
 from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
@@ -49,7 +49,6 @@ from fg_calib.statistics import (
     PredictedFit,
     PriorFit,
     ResidualTable,
-    TangentCovariance,
 )
 
 SCHEMA = "fg-calib/result/2"
@@ -85,8 +84,18 @@ class Section(BaseModel):
     """A part of a document; it may be made of any object that has its fields as attributes."""
 
     model_config = ConfigDict(
-        frozen=True, from_attributes=True, populate_by_name=True, protected_namespaces=(), defer_build=True
+        frozen=True,
+        from_attributes=True,
+        populate_by_name=True,
+        protected_namespaces=(),
+        defer_build=True,
+        loc_by_alias=False,
     )
+
+
+def of(path: str, default: Any = ...) -> Any:
+    """A field that is made of an attribute of what was computed, and is a key of its own in a document."""
+    return Field(default, validation_alias=AliasPath(*path.split(".")))
 
 
 class Step(Section):
@@ -123,7 +132,12 @@ class Covariance(Section):
     """Covariance of the errors of parameters, nan where they are not determined."""
 
     names: tuple[str, ...]
-    matrix: Floats
+    matrix: Floats = of("covariance")
+
+
+def _columns_by_variable(given: Any) -> Any:
+    """The names of the columns of each variable, as a document has them."""
+    return {v.symbol: given.names[v.columns] for v in given.items} if isinstance(given, Variables) else given
 
 
 class Posterior(Section):
@@ -133,21 +147,10 @@ class Posterior(Section):
     its own x, y, z axes, then the translation along them.
     """
 
-    variables: dict[str, tuple[str, ...]]
-    covariance: Floats
-    undetermined: Floats
-    undetermined_at_nominal: Floats
-
-    @classmethod
-    def of(cls, covariance: TangentCovariance) -> Posterior:
-        """The posterior of a tangent covariance."""
-        v = covariance.variables
-        return cls(
-            variables={item.symbol: tuple(v.names[item.columns]) for item in v.items},
-            covariance=covariance.tangent,
-            undetermined=covariance.loose,
-            undetermined_at_nominal=covariance.loose_at_nominal,
-        )
+    variables: Annotated[dict[str, tuple[str, ...]], BeforeValidator(_columns_by_variable)]
+    covariance: Floats = of("tangent")
+    undetermined: Floats = of("loose")
+    undetermined_at_nominal: Floats = of("loose_at_nominal")
 
 
 class SuspectConfiguration(Section):
@@ -166,13 +169,13 @@ class Knowledge(Section):
     rows at the nominal arm, which parameters are classed by.
     """
 
-    columns: tuple[str, ...] = Field((), validation_alias=AliasChoices("columns", AliasPath("variables", "names")))
+    columns: tuple[str, ...] = of("variables.names", ())
     unknowns: tuple[tuple[str, str], ...] = ()
     at: Floats
     rows: Floats
     right: Floats
     views: tuple[tuple[Model, FrameKnowledge], ...] = ()
-    parameters: Floats = Field(validation_alias=AliasChoices("parameters", AliasPath("robot", "nominal")))
+    parameters: Floats = of("robot.nominal")
     nominal: Knowledge | None = None
 
 
@@ -234,59 +237,59 @@ class Result(Section):
 
     schema_: Literal["fg-calib/result/2"] = Field(alias="schema", default="fg-calib/result/2")
     version: str = __version__
-    robot: str
+    robot: str = of("problem.robot.name")
     model: str
     frame: str
     pairing: str | None
     pair_errors: str | None = None
-    encoder: str = "propagated"
-    loss: str = "none"
+    encoder: str = of("problem.options.encoder", "propagated")
+    loss: str = of("problem.options.loss", "none")
     tables: tuple[tuple[str, str], ...] = ()
-    n_configurations: int
-    n_pairs: int
-    n_residuals: int
-    n_priors: int = 0
+    n_configurations: int = of("problem.n_configurations")
+    n_pairs: int = of("problem.n_pairs")
+    n_residuals: int = of("problem.n_residuals")
+    n_priors: int = of("problem.n_priors", 0)
     n_unknowns: int = 0
-    n_determined: int = 0
-    n_excluded: dict[str, int]
-    solver: SolverRun
-    trustworthy: bool
-    findings: tuple[str, ...] = ()
-    cautions: tuple[str, ...] = ()
-    reservations: tuple[str, ...] = ()
+    n_determined: int = of("assessed.spread.rank", 0)
+    n_excluded: dict[str, int] = of("problem.n_excluded")
+    solver: SolverRun = of("solution")
+    trustworthy: bool = of("assessed.trustworthy")
+    findings: tuple[str, ...] = of("assessed.verdict.errors", ())
+    cautions: tuple[str, ...] = of("assessed.verdict.cautions", ())
+    reservations: tuple[str, ...] = of("assessed.verdict.warnings", ())
     notes: tuple[str, ...] = ()
-    setup: SetupCheck | None = None
-    probability_of_noise: float | None = None
-    chi2: Figure
-    dof: int
-    reduced_chi2: float | None
-    chi2_p_value: float | None = None
-    chi2_expected: Figure = np.nan
-    chi2_bounds: tuple[Figure, Figure] = (np.nan, np.nan)
+    setup: SetupCheck | None = of("assessed.verdict.setup", None)
+    probability_of_noise: float | None = of("assessed.verdict.noise_like", None)
+    chi2: Figure = of("assessed.fit.chi_square.value")
+    dof: int = of("assessed.fit.chi_square.dof")
+    reduced_chi2: float | None = of("assessed.fit.chi_square.reduced")
+    chi2_p_value: float | None = of("assessed.fit.chi_square.p_value", None)
+    chi2_expected: Figure = of("assessed.fit.chi_square.expected", np.nan)
+    chi2_bounds: tuple[Figure, Figure] = of("assessed.fit.chi_square.bounds", (np.nan, np.nan))
     goodness: dict[str, KindFit] = {}
-    suspect_level: Figure = np.nan
+    suspect_level: Figure = of("assessed.fit.goodness.level", np.nan)
     suspect_configurations: tuple[SuspectConfiguration, ...] = ()
-    evaluated_only: bool = False
-    test: PredictedFit | None = None
-    acceptance: Acceptance | None = None
-    folds: CrossValidation | None = None
-    priors: PriorFit | None = None
-    expected_error: ExpectedError | None = None
-    sigma_joint: Floats = Field(default_factory=lambda: np.zeros(0))
+    evaluated_only: bool = of("problem.evaluated", False)
+    test: PredictedFit | None = of("assessed.fit.goodness.test", None)
+    acceptance: Acceptance | None = of("assessed.acceptance", None)
+    folds: CrossValidation | None = of("assessed.cross_validation", None)
+    priors: PriorFit | None = of("assessed.fit.priors", None)
+    expected_error: ExpectedError | None = of("assessed.expected_error", None)
+    sigma_joint: Floats = of("problem.sigma_joint", np.zeros(0))
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
-    tolerance_scales: tuple[ToleranceScale, ...] | None = None
+    tolerance_scales: tuple[ToleranceScale, ...] | None = of("solution.estimated_tolerances.scales", None)
     residual_rms: dict[str, dict[str, Rms | None]]
-    parameters: tuple[ParameterEstimate, ...]
-    covariance: Covariance
-    posterior: Posterior
+    parameters: tuple[ParameterEstimate, ...] = of("assessed.estimates.parameters")
+    covariance: Covariance = of("assessed")
+    posterior: Posterior = of("assessed.whole")
     links: tuple[str, str] | None = None
-    frame_estimate: FrameEstimate | None
+    frame_estimate: FrameEstimate | None = of("assessed.estimates.frame")
     frames: dict[str, FrameEstimate] = {}
-    joint_values: JointErrors | None = None
-    groups: tuple[LandmarkEstimate, ...] = ()
-    observability: Observability
-    options: Options
+    joint_values: JointErrors | None = of("assessed.estimates.joint_errors", None)
+    groups: tuple[LandmarkEstimate, ...] = of("assessed.estimates.landmarks", ())
+    observability: Observability = of("assessed.identifiability")
+    options: Options = of("problem.options")
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
@@ -317,28 +320,36 @@ class Result(Section):
             history: The runs before it.
             notes: What a reader should know besides, a sentence each.
         """
-        problem, options = solution.problem, solution.problem.options
-        urdf = problem.robot.urdf
-        return cls(
-            **_description(problem),
-            **_fit(solution, assessed),
-            **_verdict(assessed),
-            **_estimates(problem, assessed),
-            **_noise_factors(solution, assessed.fit.goodness.kinds),
-            pair_errors=options.pair_errors if problem.pair_series else None,
-            encoder=options.encoder,
-            loss=options.loss,
-            sigma_joint=problem.sigma_joint,
+        problem = solution.problem
+        data, urdf, frames = problem.data, problem.robot.urdf, problem.variables.frames
+        goodness = assessed.fit.goodness
+        computed = SimpleNamespace(
+            problem=problem,
+            solution=solution,
+            assessed=assessed,
+            model=" + ".join(dict.fromkeys(table.model or "own" for table in data.tables)),
+            frame="unknown" if frames else data.tables[0].frame,
+            pairing=_pairing(problem),
+            pair_errors=problem.options.pair_errors if problem.pair_series else None,
+            tables=tuple((label, in_words(table)) for label, table in zip(data.labels, data.tables, strict=True)),
+            n_unknowns=len(problem.variables.all_scales),
+            goodness={key_of(kind, goodness.kinds): kind for kind in goodness.kinds},
+            suspect_configurations=tuple(
+                {"id": problem.end_names[c.configuration + 1], "n": c.n, "chi2": c.chi2, "expected": c.expected}
+                for c in goodness.configurations
+            ),
+            residual_rms=_residual_rms(assessed.fit.residuals),
+            frames={v.symbol: frame for v, frame in zip(frames, assessed.estimates.frames, strict=True)},
             links=None if urdf is None else (urdf.base_link, urdf.tip_link),
-            observability=assessed.identifiability,
-            options=options,
             versions=versions(),
             inputs=dict(inputs or {}),
             date=date or datetime.now(UTC).isoformat(timespec="seconds"),
             history=history,
             notes=notes,
             carried=_carried(solution, job or {}),
+            **_noise_factors(solution, goodness.kinds),
         )
+        return cls.model_validate(computed)
 
     @property
     def free_of_frame(self) -> bool:
@@ -385,81 +396,6 @@ class Result(Section):
         """The content of `result.json`."""
         document: dict[str, Any] = json.loads(self.model_dump_json(by_alias=True))
         return document
-
-
-def _description(problem: Problem) -> dict[str, Any]:
-    """Robot, tables and counts."""
-    data, frames = problem.data, problem.variables.frames
-    return {
-        "robot": problem.robot.name,
-        "model": " + ".join(dict.fromkeys(table.model or "own" for table in data.tables)),
-        "frame": "unknown" if frames else data.tables[0].frame,
-        "pairing": _pairing(problem),
-        "tables": tuple((label, in_words(table)) for label, table in zip(data.labels, data.tables, strict=True)),
-        "n_configurations": problem.n_configurations,
-        "n_pairs": problem.n_pairs,
-        "n_residuals": problem.n_residuals,
-        "n_priors": problem.n_priors,
-        "n_unknowns": len(problem.variables.all_scales),
-        "n_excluded": problem.n_excluded,
-        "evaluated_only": problem.evaluated,
-    }
-
-
-def _fit(solution: Solution, assessed: Assessment) -> dict[str, Any]:
-    """Solver, chi-square and goodness of fit."""
-    fit, chi2, tolerances = assessed.fit, assessed.fit.chi_square, solution.estimated_tolerances
-    goodness, names = fit.goodness, solution.problem.end_names
-    return {
-        "solver": SolverRun.model_validate(solution),
-        "n_determined": assessed.spread.rank,
-        "chi2": chi2.value,
-        "dof": chi2.dof,
-        "reduced_chi2": chi2.reduced,
-        "chi2_p_value": chi2.p_value,
-        "chi2_expected": chi2.expected,
-        "chi2_bounds": chi2.bounds,
-        "goodness": {key_of(kind, goodness.kinds): kind for kind in goodness.kinds},
-        "suspect_level": goodness.level,
-        "suspect_configurations": tuple(
-            SuspectConfiguration(id=names[c.configuration + 1], n=c.n, chi2=c.chi2, expected=c.expected)
-            for c in goodness.configurations
-        ),
-        "test": goodness.test,
-        "priors": fit.priors,
-        "tolerance_scales": None if tolerances is None else tolerances.scales,
-        "residual_rms": _residual_rms(fit.residuals),
-    }
-
-
-def _verdict(assessed: Assessment) -> dict[str, Any]:
-    """Whether the result is to be trusted and accepted, and by which errors."""
-    verdict = assessed.verdict
-    return {
-        "trustworthy": assessed.trustworthy,
-        "findings": verdict.errors,
-        "cautions": verdict.cautions,
-        "reservations": verdict.warnings,
-        "setup": verdict.setup,
-        "probability_of_noise": verdict.noise_like,
-        "acceptance": assessed.acceptance,
-        "folds": assessed.cross_validation,
-        "expected_error": assessed.expected_error,
-    }
-
-
-def _estimates(problem: Problem, assessed: Assessment) -> dict[str, Any]:
-    """Parameters, frames, landmarks and their covariance."""
-    found = assessed.estimates
-    return {
-        "parameters": found.parameters,
-        "covariance": Covariance(names=assessed.names, matrix=assessed.covariance),
-        "posterior": Posterior.of(assessed.whole),
-        "frame_estimate": found.frame,
-        "frames": {v.symbol: frame for v, frame in zip(problem.variables.frames, found.frames, strict=True)},
-        "joint_values": found.joint_errors,
-        "groups": found.landmarks,
-    }
 
 
 def key_of(fit: KindFit, fits: tuple[KindFit, ...]) -> str:
@@ -566,41 +502,41 @@ def read_result(path: Path | str) -> Result:
         result = Result.model_validate(document)
     except ValidationError as error:
         raise first_misfit(error, str(file)) from None
-    for key, found, expected in _contradictions(result):
-        raise InputError(f"{file}: {key}", found, expected, "was the file changed?")
+    for key, stated, expected in _stated_twice(result):
+        found, other = (np.array(one, dtype=np.float64, ndmin=1) for one in (stated, expected))
+        if found.shape != other.shape or not np.allclose(found, other, 1e-9, 1e-12, equal_nan=True):
+            raise InputError(f"{file}: {key}", f"found {shown(stated)}", shown(expected), "was the file changed?")
     return result
 
 
-def _contradictions(result: Result) -> Iterator[tuple[str, str, str]]:
-    """What in a result contradicts the rest: the key, what was found and what is expected."""
-    names, of = result.covariance.names, {p.name: p for p in result.parameters}
-    matrices = {"covariance": (result.covariance.matrix, len(names))}
-    matrices["posterior: covariance"] = result.posterior.covariance, sum(map(len, result.posterior.variables.values()))
-    for key, (matrix, n) in matrices.items():
-        size = np.nanmin(np.abs(matrix.diagonal()), initial=1.0) if matrix.ndim == 2 else 0.0  # rounding is less
-        with np.errstate(invalid="ignore"):
-            if matrix.size != n * n or (n and matrix.shape != (n, n)):
-                yield key, f"shape {matrix.shape}", f"{n} rows of {n}, one of each name"
-            elif not np.allclose(matrix, matrix.T, 1e-6, 1e-9 * size, equal_nan=True) or (np.diag(matrix) < 0.0).any():
-                yield key, "no covariance", "a symmetric matrix with variances from 0 on"
-    if len(of) < len(result.parameters) or len(set(names)) < len(names) or not of.keys() >= set(names):
-        yield "covariance: names", "a name twice or of no parameter", "different names of parameters"
-    sigmas = dict(zip(names, np.sqrt(result.covariance.matrix.diagonal()).tolist() if names else (), strict=True))
+def _stated_twice(result: Result) -> Iterator[tuple[str, Any, Any]]:
+    """What a result says in two places: the key, what it says there, and what the rest says."""
+    names, known = result.covariance.names, {p.name for p in result.parameters}
+    n_tangent = sum(map(len, result.posterior.variables.values()))
+    for key, M, n in (
+        ("covariance", result.covariance.matrix, len(names)),
+        ("posterior: covariance", result.posterior.covariance, n_tangent),
+    ):
+        yield f"{key}: shape", M.shape if M.size else (0, 0), (n, n)
+        variances = np.diag(M) if n else np.zeros(0)
+        rounding = 1e-9 * np.nanmin(np.abs(variances), initial=1.0)
+        yield f"{key}: symmetric", n == 0 or np.allclose(M, M.T, 1e-6, rounding, equal_nan=True), True
+        yield f"{key}: negative variance", bool((variances < 0.0).any()), False
+    yield "parameters: names", len(known), len(result.parameters)
+    yield "covariance: names", len(known.intersection(names)), len(names)
+    sigmas = dict(zip(names, np.sqrt(np.diag(result.covariance.matrix)) if names else (), strict=True))
     for i, p in enumerate(result.parameters, start=1):
-        if p.sigma is not None and not (p.sigma >= 0.0 and np.isclose(p.sigma, sigmas.get(p.name, 0.0), 1e-9, 0.0)):
-            yield f"parameter {i}: sigma", f"found {p.sigma:g}", f"{sigmas.get(p.name, 0.0):g}, as the covariance says"
-        turns = (p.estimate - p.nominal - p.correction) / (2.0 * np.pi if p.unit == "rad" else np.inf)
-        if not np.isclose(p.estimate - 2.0 * np.pi * np.round(turns), p.nominal + p.correction, 1e-9, 1e-12):
-            yield f"parameter {i}: correction", f"found {p.correction:g}", f"{p.estimate - p.nominal:g}"
-    if result.reduced_chi2 is not None and not np.isclose(result.reduced_chi2 * result.dof, result.chi2, 1e-9, 0.0):
-        yield "reduced_chi2", f"found {result.reduced_chi2:g}", "chi2 / dof"
-    if result.goodness and (n := sum(kind.n for kind in result.goodness.values())) != result.n_residuals:
-        yield "n_residuals", f"found {result.n_residuals}", f"{n}, as goodness says"
-    if result.trustworthy != (result.solver.converged and not result.findings):
-        found = f"{str(result.trustworthy).lower()} with {len(result.findings)} findings"
-        yield "trustworthy", found, "true where the solver converged and nothing was found"
+        correction = p.estimate - p.nominal
+        turns = np.round((correction - p.correction) / (2.0 * np.pi)) if p.unit == "rad" else 0.0
+        yield f"parameter {i}: correction", p.correction, correction - 2.0 * np.pi * turns
+        if p.sigma is not None:
+            yield f"parameter {i}: sigma", p.sigma, sigmas.get(p.name, 0.0)
+    if result.reduced_chi2:
+        yield "chi2 / reduced_chi2", result.chi2 / result.reduced_chi2, result.dof
+    if result.goodness:
+        yield "n_residuals", result.n_residuals, sum(kind.n for kind in result.goodness.values())
+    yield "trustworthy", result.trustworthy, result.solver.converged and not result.findings
     for frame in (*result.frames.values(), *filter(None, [result.frame_estimate])):
-        good = [one.shape for one in (frame.xyz, frame.quaternion_xyzw, frame.sigma)] == [(3,), (4,), (6,)]
-        good = good and np.isclose(np.linalg.norm(frame.quaternion_xyzw), 1.0, atol=NORM_TOLERANCE)
-        if not good or (frame.sigma < 0.0).any():
-            yield "frames", "no frame", "xyz, a quaternion of length 1, and six sigmas from 0 on"
+        yield "frames: shape", [*frame.xyz.shape, *frame.quaternion_xyzw.shape, *frame.sigma.shape], [3, 4, 6]
+        yield "frames: norm of the quaternion", float(np.linalg.norm(frame.quaternion_xyzw)), 1.0
+        yield "frames: negative sigma", bool((frame.sigma < 0.0).any()), False

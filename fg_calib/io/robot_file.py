@@ -69,10 +69,19 @@ class FrameValues(Schema):
         Raises:
             InputError: An angle in rad is one in deg.
         """
-        for kind in ("roll", "pitch", "yaw"):
-            if units.angle == "rad" and abs(value := getattr(self, kind)) > MOST_ANGLE:
-                raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
-        return {kind: getattr(self, kind) * units.factor(_unit_of_kind(kind)) for kind in FRAME_KINDS}
+        return {kind: _si(kind, getattr(self, kind), units, place) for kind in FRAME_KINDS}
+
+
+def _si(kind: str, value: float, units: Units, place: str) -> float:
+    """A value of a kind of parameter in [m] or [rad].
+
+    Raises:
+        InputError: An angle in rad is one in deg.
+    """
+    unit = _unit_of_kind(kind)
+    if units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
+        raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
+    return value * units.factor(unit)
 
 
 class _Robot(Schema):
@@ -104,9 +113,6 @@ class _Robot(Schema):
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
-_Limits = Annotated[list[Bound], Field(min_length=2, max_length=2)]
-
-
 class _Row(Schema):
     type: Literal["revolute", "prismatic"] = meaning("Whether it turns or slides", "revolute")
     name: str | None = meaning("The joint's name, which its column may have; q1 to qn if left out", None)
@@ -115,7 +121,7 @@ class _Row(Schema):
     d: Number | None = meaning("Shift along z; the reading of a slide is added", None)
     theta: Number | None = meaning("Turn about z; the reading of a turning joint is added", None)
     beta: Number = meaning("Turn about y, of the conventions with -hayati", 0.0)
-    limits: _Limits | None = meaning("Lower and upper of its readings; none if left out", None)
+    limits: tuple[Bound, Bound] = meaning("Lower and upper of its readings", (-math.inf, math.inf))
 
 
 class _DhRobot(_Robot):
@@ -189,33 +195,23 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
     builder = RobotBuilder(file.name or "robot", file.convention)
     builder.add_frame("base", file.base.si(file.units, f"{place}: base"), 0, False)
     names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
-    for i, (row, name) in enumerate(zip(file.joints, names, strict=True), start=1):
-        here = f"{place}: joint {i}"
-        if name in names[: i - 1]:
+    for i, (row, name) in enumerate(zip(file.joints, names, strict=True)):
+        here, kinds = f"{place}: joint {i + 1}", CONVENTIONS[file.convention]
+        if name in names[:i]:
             raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
-        values = {}
-        for kind in CONVENTIONS[file.convention]:
-            value = getattr(row, kind)
-            if value is None:
-                raise InputError(here, f"missing key {kind!r}")
-            unit = _unit_of_kind(kind)
-            if file.units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
-                raise InputError(f"{here}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
-            values[kind] = value * file.units.factor(unit)
-        if row.beta != 0.0 and "beta" not in values:
-            raise InputError(
-                f"{here}: beta",
-                f"found {row.beta!r}",
-                f"none: the convention {file.convention} has no beta",
-                f"{file.convention}-hayati has",
-            )
-        lower, upper = row.limits or (-math.inf, math.inf)
+        if row.beta and "beta" not in kinds:
+            found, expected = f"found {row.beta!r}", f"none: the convention {file.convention} has no beta"
+            raise InputError(f"{here}: beta", found, expected, f"{file.convention}-hayati has")
+        if missing := [kind for kind in kinds if getattr(row, kind) is None]:
+            raise InputError(here, f"missing key {missing[0]!r}")
+        lower, upper = row.limits
         if not lower < upper:
             raise InputError(f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
-        joint = Joint(name, prismatic=row.type == "prismatic")
-        factor = file.units.factor(joint.unit)
-        builder.add_convention_joint(Joint(name, joint.prismatic, lower * factor, upper * factor), values)
-    builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(file.joints) + 1, False)
+        factor = file.units.factor("m" if row.type == "prismatic" else "rad")
+        joint = Joint(name, row.type == "prismatic", lower * factor, upper * factor)
+        values = {kind: _si(kind, getattr(row, kind), file.units, here) for kind in kinds}
+        builder.add_convention_joint(joint, values)
+    builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
     return builder.build(place=place, **file.choices(place))
 
 
@@ -254,48 +250,40 @@ def robot_text(
     """
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
-    if robot.urdf is None:
-        _check_writable(robot, place or robot.name)
-    units = units or Units()
+    units, base, tool = units or Units(), robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
     mapping: dict[str, Any] = {"name": robot.name}
     if robot.urdf is None:
-        mapping |= {"convention": robot.convention}
+        mapping |= {"convention": robot.convention, "units": _Flow(asdict(units))}
+        mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
     else:
         mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
-    mapping |= {"units": _Flow(asdict(units))}
-    if robot.urdf is None:
-        mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
-    base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
+        mapping |= {"units": _Flow(asdict(units))}
     for key, owned in (("base", base), ("tool", tool)):
         frame = [robot.parameters[i] for i in owned]
         mapping |= {key: _Flow((p.kind, units.from_si(p.nominal, p.unit)) for p in frame if p.nominal != 0.0)}
-    frames = {*base, *tool}
+    of_frames = [robot.parameters[i] for i in (*base, *tool)]
+    of_joints = [p for p in robot.parameters if p not in of_frames]
     mapping |= {
-        "fixed": _Line(p.name for i, p in enumerate(robot.parameters) if i not in frames and not p.estimated),
-        "estimate": _Line(p.name for i, p in enumerate(robot.parameters) if i in frames and p.estimated),
+        "fixed": tuple(p.name for p in of_joints if not p.estimated),
+        "estimate": tuple(p.name for p in of_frames if p.estimated),
         "tolerance": _Flow(_tolerances(robot, units)),
     }
-    kept = {key: value for key, value in mapping.items() if value or key == "joints"}
-    return str(yaml.dump(kept, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
+    mapping = {key: value for key, value in mapping.items() if value or key == "joints"}
+    if robot.urdf is None:
+        _check_same(robot, robot_from_mapping(mapping, place or robot.name, Path()), place or robot.name)
+    return str(yaml.dump(mapping, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
 
 
-def _check_writable(robot: Robot, place: str) -> None:
-    """Check that a robot is a base, joints of one convention and a tool, which is all that a robot file can hold.
+def _check_same(robot: Robot, written: Robot, place: str) -> None:
+    """Check that what is written is the robot: base, joints of one convention and tool are all that a file can hold.
 
     Raises:
         InputError: It has other elements or parameters.
     """
-    expected = "base, joints of one convention, tool: all that a robot file can say"
-    if robot.convention not in CONVENTIONS:
-        raise InputError(place, f"the robot is of the convention {shown(robot.convention)}", expected)
-    values = [{p.kind: p.nominal for p in robot.parameters if p.owner == i} for i in range(robot.n_joints + 2)]
-    builder = RobotBuilder(robot.name, robot.convention)
-    builder.add_frame("base", values[0], 0, False)
-    for joint, row in zip(robot.joints, values[1:], strict=False):
-        builder.add_convention_joint(joint, row)
-    builder.add_frame("tool", values[-1], robot.n_joints + 1, False)
-    plain = builder.build()
-    if [p.name for p in plain.parameters] != [p.name for p in robot.parameters] or plain.elements != robot.elements:
+    robots = (robot, written)
+    parameters, elements = ([[p.name for p in one.parameters] for one in robots], [len(one.elements) for one in robots])
+    if parameters[0] != parameters[1] or elements[0] != elements[1]:
+        expected = "base, joints of one convention, tool: all that a robot file can say"
         raise InputError(place, "the robot has elements or parameters of its own", expected)
 
 
@@ -340,10 +328,6 @@ class _Flow(dict[str, Any]):
     """A mapping to be written on one line."""
 
 
-class _Line(list[str]):
-    """Names to be written on one line."""
-
-
 class _Dumper(yaml.SafeDumper):
     """The safe dumper, with rows, frames and names on one line."""
 
@@ -352,5 +336,5 @@ _Dumper.add_representer(
     _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
 )
 _Dumper.add_representer(
-    _Line, lambda dumper, names: dumper.represent_sequence("tag:yaml.org,2002:seq", names, flow_style=True)
+    tuple, lambda dumper, names: dumper.represent_sequence("tag:yaml.org,2002:seq", names, flow_style=True)
 )

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, ORDINARY, InputError, checked, did_you_mean, known_names
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names
 from fg_calib.io.atomic import decoded, read_bytes, replacing
-from fg_calib.io.yaml import shown, shown_word
+from fg_calib.io.yaml import shown
 from fg_calib.robot import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
@@ -96,7 +96,8 @@ def read_urdf(
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", frame_values("base", base), 0, False)
     try:
-        tree = _Tree(_read_joints(root, path.name), _read_links(root, path.name), path.name)
+        links = [link.get("name", "") for link in root.findall("link")]
+        tree = _Tree(_read_joints(root, path.name), links, path.name)
         base_link = tree.root() if base_link is None else tree.known(base_link)
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
         n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
@@ -243,58 +244,49 @@ def _parse(data: bytes, place: str) -> tuple[str, Element]:
         raise InputError(place, f"text in {document.encoding}", "text in UTF-8", "save it as UTF-8") from None
 
 
-def _read_links(root: Element, place: str) -> list[str]:
-    links = []
-    for link in root.findall("link"):
-        if not link.get("name"):
-            raise InputError(f"{place}:{link.sourceline}", "a link without a name")
-        links.append(link.get("name", ""))
-    return links
-
-
 def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
     """All joints, each with a name of its own, an origin, a parent and a child."""
     joints: dict[str, _UrdfJoint] = {}
     for joint in root.findall("joint"):
-        name = joint.get("name")
+        name, links = joint.get("name"), []
         here = f"{place}:{joint.sourceline}: joint {name!r}"
         if not name:
             raise InputError(f"{place}:{joint.sourceline}", "a joint without a name")
         if name in joints:
             raise InputError(here, "a second joint of this name", "different names")
-        parent, child = (_link_at(joint, end, here) for end in ("parent", "child"))
-        joints[name] = _UrdfJoint(joint, name, parent, child, _origin(joint, here))
+        for end in ("parent", "child"):
+            links.append(_attribute(joint, end, "link", ""))
+            if not links[-1]:
+                raise InputError(here, f"no <{end}>", f'<{end} link="..."/>')
+        joints[name] = _UrdfJoint(joint, name, links[0], links[1], _origin(joint, here))
     return list(joints.values())
 
 
-def _link_at(joint: Element, end: str, place: str) -> str:
-    """The link that a joint has as `end`: parent or child."""
-    element = joint.find(end)
-    link = None if element is None else element.get("link")
-    if not link:
-        raise InputError(place, f"no <{end}>", f'<{end} link="..."/>')
-    return link
-
-
 def _origin(joint: Element, place: str) -> dict[str, float]:
-    values: dict[str, float] = {}
-    for attribute, kinds in _ORIGIN.items():
-        text = _attribute(joint, "origin", attribute, "0 0 0")
-        figures = _figures(text)
-        if len(figures) != len(kinds) or not np.isfinite(figures).all():
-            raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", "three finite numbers")
-        if max(map(abs, figures)) > MOST_SIZE:
-            raise InputError(f"{place}: origin {attribute}", f"found {shown(text)}", ORDINARY)
-        if attribute == "rpy" and max(map(abs, figures)) > MOST_ANGLE:
-            raise InputError(f"{place}: origin rpy", f"found {shown(text)}", IN_RAD, "are they in deg?")
-        values |= zip(kinds, figures, strict=True)
-    return values
+    xyz, rpy = (_numbers(joint, "origin", name, "0 0 0", place) for name in _ORIGIN)
+    if max(map(abs, rpy)) > MOST_ANGLE:
+        raise InputError(f"{place}: origin rpy", f"found {rpy}", IN_RAD, "are they in deg?")
+    return dict(zip((*_ORIGIN["xyz"], *_ORIGIN["rpy"]), (*xyz, *rpy), strict=True))
 
 
 def _attribute(joint: Element, child: str, attribute: str, default: str) -> str:
     """An attribute of a joint's first child of some name; `default` where either is missing."""
     element = joint.find(child)
     return default if element is None else element.get(attribute, default)
+
+
+def _numbers(joint: Element, child: str, attribute: str, default: str, place: str) -> list[float]:
+    """An attribute of as many numbers as its default; only limits may be infinite.
+
+    Raises:
+        InputError: It holds something else.
+    """
+    text, n = _attribute(joint, child, attribute, default), len(default.split())
+    numbers = _figures(text)
+    if len(numbers) != n or any(abs(one) > MOST_SIZE and not (child == "limit" and np.isinf(one)) for one in numbers):
+        expected = f"{n} number{'s' * (n > 1)}, finite and no larger than {MOST_SIZE:g}"
+        raise InputError(f"{place}: {child} {attribute}", f"found {shown(text)}", expected)
+    return numbers
 
 
 def _figures(text: str) -> list[float]:
@@ -307,36 +299,24 @@ def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
     """The joint with its limits; URDF's missing limit is 0, and two zeros are none at all."""
     kind, mimic = joint.element.get("type"), joint.element.find("mimic")
     if kind not in {"revolute", "continuous", "prismatic"}:
-        found = f"type {shown_word(kind)}" if kind else "no type"
-        raise InputError(place, found, "revolute, continuous, prismatic or fixed on the chain")
+        raise InputError(place, f"type {shown(kind)}", "revolute, continuous, prismatic or fixed on the chain")
     if mimic is not None:
         found = f"mimics joint {shown(mimic.get('joint', ''))}"
         raise InputError(place, found, "joints on the chain that move by themselves")
-    lower, upper = (0.0, 0.0) if kind == "continuous" else (_limit(joint, end, place) for end in ("lower", "upper"))
-    if lower == upper == 0.0:
+    (lower,), (upper,) = (_numbers(joint.element, "limit", end, "0", place) for end in ("lower", "upper"))
+    if kind == "continuous" or lower == upper == 0.0:
         return Joint(joint.name, kind == "prismatic")
     if not lower < upper:
         raise InputError(f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
     return Joint(joint.name, kind == "prismatic", lower, upper)
 
 
-def _limit(joint: _UrdfJoint, end: str, place: str) -> float:
-    text = _attribute(joint.element, "limit", end, "0")
-    figures = _figures(text)
-    if len(figures) != 1:
-        raise InputError(f"{place}: limit {end}", f"found {shown(text)}", "a number")
-    if MOST_SIZE < abs(figures[0]) < np.inf:
-        raise InputError(f"{place}: limit {end}", f"found {shown(text)}", ORDINARY)
-    return figures[0]
-
-
 def _axis(joint: _UrdfJoint, place: str) -> NDArray[np.float64]:
     """The joint's unit axis, shape (3,); x where the file says none."""
-    text = _attribute(joint.element, "axis", "xyz", "1 0 0")
-    axis = np.array(_figures(text))
+    axis = np.array(_numbers(joint.element, "axis", "xyz", "1 0 0", place))
     length = math.hypot(*axis)
-    if axis.shape != (3,) or not LEAST_SIZE <= length <= MOST_SIZE:
-        raise InputError(f"{place}: axis", f"found {shown(text)}", "a direction of three numbers")
+    if length < LEAST_SIZE:
+        raise InputError(f"{place}: axis", f"found {axis.tolist()}", "a direction of three numbers")
     return axis / length
 
 
@@ -345,15 +325,12 @@ class _Tree:
 
     def __init__(self, joints: Sequence[_UrdfJoint], links: Sequence[str], place: str) -> None:
         self._place = place
-        self._links = dict.fromkeys([*links, *(link for j in joints for link in (j.parent, j.child))])
-        self._joint_above: dict[str, _UrdfJoint] = {}  # by child link
+        self._links = list(dict.fromkeys([*links, *(link for j in joints for link in (j.parent, j.child))]))
+        self._above: dict[str, _UrdfJoint] = {}  # by child link
         for joint in joints:
-            if joint.child in self._joint_above:
-                first = self._joint_above[joint.child].name
-                raise InputError(
-                    place, f"link {joint.child!r} is the child of joints {first!r} and {joint.name!r}", "one"
-                )
-            self._joint_above[joint.child] = joint
+            if (first := self._above.setdefault(joint.child, joint)) is not joint:
+                found = f"link {joint.child!r} is the child of joints {first.name!r} and {joint.name!r}"
+                raise InputError(place, found, "one")
 
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
@@ -366,48 +343,35 @@ class _Tree:
         """The only link without a parent."""
         if not self._links:
             raise InputError(self._place, "no links and joints", "<link> and <joint> within <robot>")
-        roots = dict.fromkeys(self._links_up(link)[-1] for link in self._links)
-        return self._only(list(roots), "root", "base_link")
+        return self._only([link for link in self._links if self._up(link) == [link]], "root", "base_link")
 
     def leaf(self, base: str) -> str:
         """The only link without a child at or below `base`."""
-        below: dict[str, list[str]] = {}
-        for joint in self._joint_above.values():
-            below.setdefault(joint.parent, []).append(joint.child)
-        self._links_up(base)  # without end where links are in a circle
-        reached = [base]
-        for link in reached:
-            reached += below.get(link, ())
-        return self._only([link for link in reached if link not in below], "leaf", "tip_link")
+        parents = {joint.parent for joint in self._above.values()}
+        leaves = [link for link in self._links if link not in parents and base in self._up(link)]
+        return self._only(leaves, "leaf", "tip_link")
 
     def chain(self, base: str, tip: str) -> list[tuple[_UrdfJoint, bool]]:
         """The joints from `base` to `tip`, with whether each is passed from child to parent."""
-        up, down = self._links_up(base), self._links_up(tip)
-        all_down = set(down)
-        common = next((link for link in up if link in all_down), None)
-        if common is None:
+        up, down = self._up(base), self._up(tip)
+        if up[-1] != down[-1]:
             raise InputError(self._place, f"links {base!r} and {tip!r} are not connected", "two links of one tree")
-        above = self._joint_above
-        return [
-            *((above[link], True) for link in up[: up.index(common)]),
-            *((above[link], False) for link in reversed(down[: down.index(common)])),
-        ]
+        there, back = [link for link in up if link not in down], [link for link in down if link not in up]
+        return [(self._above[link], True) for link in there] + [(self._above[link], False) for link in reversed(back)]
 
-    def _links_up(self, link: str) -> list[str]:
+    def _up(self, link: str) -> list[str]:
         """`link` and the links above it, up to the root."""
         links = [link]
-        while links[-1] in self._joint_above:
-            links.append(self._joint_above[links[-1]].parent)
+        while links[-1] in self._above:
+            links.append(self._above[links[-1]].parent)
             if links[-1] in links[:-1]:
-                circle = " below ".join(map(shown_word, links[links.index(links[-1]) :]))
+                circle = " below ".join(links[links.index(links[-1]) :])
                 raise InputError(self._place, f"links in a circle: {circle}", "a tree of links")
         return links
 
     def _only(self, found: list[str], what: str, argument: str) -> str:
         if len(found) != 1:
-            listed = ", ".join(shown_word(link) for link in found[:12]) + ", ..." * (len(found) > 12)
             where = f"{{urdf: {self._place}, {argument}: ...}} in a file, --{argument.replace('_', '-')} of observe"
-            raise InputError(
-                self._place, f"{len(found)} {what} links ({listed})", "one", f"name one as {argument}: {where}"
-            )
+            hint = f"name one as {argument}: {where}"
+            raise InputError(self._place, f"{len(found)} {what} links ({', '.join(found)})", "one", hint)
         return found[0]

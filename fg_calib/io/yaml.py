@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -112,40 +113,43 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
         InputError: It does not fit; the first misfit is named, others are counted.
     """
     try:
-        return schema.model_validate(value)
+        with within(place):  # of types that check themselves
+            return schema.model_validate(value)
     except ValidationError as error:
         raise first_misfit(error, place) from None
-    except InputError as error:  # of a type that checks itself
+
+
+@contextmanager
+def within(place: str) -> Iterator[None]:
+    """The place of what is refused in the block is within another place."""
+    try:
+        yield
+    except InputError as error:
         raise InputError(f"{place}: {error.place}", error.found, error.expected, error.hint) from None
 
 
 def first_misfit(error: ValidationError, place: str) -> InputError:
     """A validation error as one line: the first misfit is named, with all keys that are missing there; others count."""
     misfits = error.errors(include_url=False)
-    first = misfits[0]
-    context = first.get("ctx", {})
-    more = f" (and {len(misfits) - 1} more)" if len(misfits) > 1 else ""
+    first, context = misfits[0], misfits[0].get("ctx", {})
+    at, found, expected, hint, n = list(first["loc"]), f"found {shown(first['input'])}", _expected(first), "", 1
     match first["type"]:
         case "missing":
-            *path, key = first["loc"]
-            if isinstance(key, int):
-                return InputError(_place(place, path), f"found {shown(first['input'])}", f"more than {key} in the list")
-            missing = [m["loc"][-1] for m in misfits if m["type"] == "missing" and list(m["loc"][:-1]) == path]
-            names = ", ".join(map(repr, missing))
-            others = f" (and {len(misfits) - len(missing)} more)" if len(misfits) > len(missing) else ""
-            return InputError(_place(place, path), f"missing key{'s' * (len(missing) > 1)} {names}{others}")
+            at = at[:-1]
+            missing = [m["loc"][-1] for m in misfits if m["type"] == "missing" and list(m["loc"][:-1]) == at]
+            n, names = len(missing), ", ".join(map(repr, missing))
+            found, expected = f"missing key{'s' * (n > 1)} {names}", ""
         case "unknown_key":
+            found, expected = f"unknown key {context['key']!r}", f"one of {', '.join(context['known'])}"
             hint = did_you_mean(context["key"], context["known"])
-            known = f"one of {', '.join(context['known'])}"
-            found = f"unknown key {context['key']!r}"
-            return InputError(_place(place, first["loc"]), found, known + more * (not hint), hint + more * bool(hint))
-    hint = did_you_mean(first["input"], _options(first)) if first["type"] == "literal_error" else ""
-    if first["type"] == "string_type" and isinstance(first["input"], bool):
-        hint = "text such as no, on or true stands in quotes"
-    if first["type"] == "float_parsing":
-        hint = number_hint(first["input"])
-    found = f"found {shown(first['input'])}"
-    return InputError(_place(place, first["loc"]), found, _expected(first) + more, hint)
+        case "literal_error":
+            hint = did_you_mean(first["input"], _options(first))
+        case "string_type" if isinstance(first["input"], bool):
+            hint = "text such as no, on or true stands in quotes"
+        case "float_parsing":
+            hint = number_hint(first["input"])
+    more = f" (and {len(misfits) - n} more)" * (len(misfits) > n)
+    return InputError(_place(place, at), found + more * (not expected), expected + more * bool(expected), hint)
 
 
 def number_hint(found: object) -> str:
@@ -214,12 +218,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
         InputError: There is no such file, it is not YAML or not a mapping, or a key stands there twice.
     """
     text = read_text(path)
+    if half := re.search(r"\\[uU]0*[dD][89a-fA-F][0-9a-fA-F]{2}", text):
+        line = text[: half.start()].count("\n") + 1
+        raise InputError(f"{path.name}:{line}", f"half a character, {half[0]}", "the character itself")
     try:
         mapping = yaml.load(text, _Loader)
     except RecursionError:
         raise InputError(path.name, "nested too deeply", "a mapping, key: value") from None
     except yaml.MarkedYAMLError as error:
-        raise _of_yaml(error, path.name) from None
+        place = path.name if error.problem_mark is None else f"{path.name}:{error.problem_mark.line + 1}"
+        raise InputError(place, error.problem or "not YAML", hint=error.context or "") from None
+    except (ValueError, LookupError, AttributeError, TypeError, OverflowError) as error:
+        raise InputError(path.name, f"not YAML: {error}") from None
     except yaml.reader.ReaderError as error:
         line = text[: error.position].count("\n") + 1
         raise InputError(f"{path.name}:{line}", f"character {error.character:#04x}", "printable text") from None
@@ -228,17 +238,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
         hint = "is it a URDF? its name ends in .urdf" if text.lstrip().startswith("<") else ""
         raise InputError(path.name, found, "a mapping, key: value", hint)
     return mapping
-
-
-def _of_yaml(error: yaml.MarkedYAMLError, name: str) -> InputError:
-    """What the parser says, with the line, and the line where what it could not finish begins."""
-    mark, start = error.problem_mark, error.context_mark
-    found, hint = error.problem or "not YAML", ""
-    if found.startswith("but ") and error.context:
-        found = f"{error.context}, {found}"
-    elif error.context and start and mark and start.line < mark.line:
-        hint = f"{error.context} from line {start.line + 1} on"
-    return InputError(f"{name}:{mark.line + 1}" if mark else name, found, hint=hint)
 
 
 class _Loader(yaml.SafeLoader):
@@ -252,22 +251,6 @@ class _Loader(yaml.SafeLoader):
         for first, known in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
-    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
-        """The value of a node.
-
-        Raises:
-            yaml.MarkedYAMLError: Python cannot make it: too many digits, half of a pair of surrogates.
-        """
-        try:
-            value = super().construct_object(node, deep)
-            if isinstance(value, str):
-                value.encode()
-            return value
-        except (ValueError, LookupError, AttributeError, TypeError, OverflowError):
-            tag = node.tag.removeprefix("tag:yaml.org,2002:")
-            found = f"{shown(getattr(node, 'value', None))} is no YAML of type {tag}"
-            raise yaml.MarkedYAMLError(problem=found, problem_mark=node.start_mark) from None
-
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """A mapping; its keys are words.
 
@@ -275,8 +258,6 @@ class _Loader(yaml.SafeLoader):
             yaml.MarkedYAMLError: A key is no word, or stands there twice.
         """
         found: dict[str, Any] = {}
-        if not isinstance(node, yaml.MappingNode):
-            raise yaml.MarkedYAMLError(problem="no mapping behind the tag of one", problem_mark=node.start_mark)
         for key_node, value_node in node.value:
             key, problem = key_node.value, ""
             if not isinstance(key_node, yaml.ScalarNode):
@@ -300,8 +281,3 @@ for _tag, _pattern, _first in (
     ),
 ):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_pattern})$"), list(_first))
-
-
-def shown_word(text: str) -> str:
-    """A word as it stands, cut to 60 characters."""
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -143,7 +143,7 @@ def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
     for one in (more, another.build()):
         with pytest.raises(InputError, match="the robot has elements or parameters of its own, expected base, joints"):
             write_robot(tmp_path / "robot.yaml", one)
-    with pytest.raises(InputError, match="the robot is of the convention 'urdf', expected base, joints"):
+    with pytest.raises(InputError, match="convention: found 'urdf', expected one of dh"):
         write_robot(tmp_path / "robot.yaml", replace(robot, convention="urdf"))
     assert list(tmp_path.iterdir()) == []
 

@@ -350,7 +350,7 @@ MISTAKES = [
      {"base_link": "left_1", "tip_link": "left_tip"},
      "torso.urdf: links in a circle: left_1 below left_tip below left_2 below left_1, expected a tree of links"),
     (changed("1 2 -3", "${pi} 0 0"), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l1': axis: found '${pi} 0 0', expected a direction of three numbers"),
+     "torso.urdf: joint 'l1': axis xyz: found '${pi} 0 0', expected 3 numbers, finite and no larger than 1e+15"),
     (changed('name="l2"', 'name="l1"'), {},
      "torso.urdf:14: joint 'l1': a second joint of this name, expected different names"),
     (changed('<origin xyz="0.3 0 0.1"', '<orign xyz="0.3 0 0.1"'), {"tip_link": "left_tip"},

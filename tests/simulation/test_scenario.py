@@ -244,7 +244,7 @@ MISTAKES = [
     (with_board("cone: 2"), "configurations: board: cone: found 2 rad, expected at most a quarter turn"),
     (replaced("{random: {count: 3}}", "{tracker: {station: {x: 3}, acceptance: 4}}"),
      "configurations: tracker: acceptance: found 4 rad, expected at most half a turn"),
-    (replaced("0.002}", "0.002, joint: [1]}"), "noise: joint: 1 figures, expected one for all or 2, one a joint"),
+    (replaced("0.002}", "0.002, joint: [1]}"), "noise: joint: 1 values, expected one for all or 2, one a joint"),
     (SHORT + "frame: room\n", "frame: found 'room', expected one of base, unknown"),
     (SHORT + "job: {frame: known}\n", f"job: found key 'frame', {FOLLOWS}"),
     (SHORT + "job: {noise: {position: -1}}\n", "job: noise: position: found -1, expected a number not below 0"),
