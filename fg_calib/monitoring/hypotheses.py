@@ -160,8 +160,7 @@ def fit_change(hypothesis: ChangeHypothesis, rows: Linear, n: int) -> Hypothesis
         n: Number of hypotheses that are tested.
     """
     size = np.linalg.norm(hypothesis.columns, axis=0)
-    robot = rows.placed.problem.robot
-    ordinary = np.array([robot.scale_of(unit) if unit else 1.0 for unit in hypothesis.units])
+    ordinary = np.array([rows.robot.scale_of(unit) if unit else 1.0 for unit in hypothesis.units])
     acts = size * ordinary > SEEN
     scale = np.where(acts, size, 1.0)
     U, s, Vt = np.linalg.svd(rows.new(np.where(acts, hypothesis.columns / scale, 0.0)), full_matrices=False)
@@ -238,10 +237,11 @@ def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
     if len(rows.of_arm) > MOST_ROWS:
         return []
     ends, found = ends_of_rows(problem), []
+    unit = np.eye(len(ends))
     for k in np.unique(ends[ends >= 0]).tolist():
         mine = np.flatnonzero((ends == k).any(axis=1))
         if 3 * len(mine) <= len(ends):
-            columns = whitened(problem, np.eye(len(ends))[:, mine])
+            columns = whitened(problem, unit[:, mine])
             columns, none = columns[:, columns.any(axis=0)], np.zeros((rows.of_arm.shape[1], 0))
             found.append(ChangeHypothesis((problem.data.names[k],), "row", ("",) * columns.shape[1], columns, none))
     return found

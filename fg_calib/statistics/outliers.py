@@ -141,13 +141,9 @@ def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, r
 
 def _names(ends: list[tuple[str, str]]) -> tuple[str, ...]:
     """Names of measurements by what they are between: one that is an end of several is named in their place."""
-    found = []
-    while ends:
-        count = Counter(name for both in ends for name in filter(None, both))
-        worst = max(count, key=lambda name: count[name])
-        if count[worst] > 1:
-            found.append(worst)
-            ends = [both for both in ends if worst not in both]
-        else:
-            found.append(" and ".join(filter(None, ends.pop(0))))
+    count = Counter(name for both in ends for name in both if name)
+    found: dict[str, None] = {}
+    for both in ends:
+        worst = max(filter(None, both), key=lambda name: count[name])
+        found[worst if count[worst] > 1 else " and ".join(filter(None, both))] = None
     return tuple(found)

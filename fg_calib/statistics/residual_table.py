@@ -161,16 +161,6 @@ class ResidualTable(FrozenArrays):
         """`distance`, `angle`, `position.x`, ... of each row, shape (n,)."""
         return np.array([kind.name for kind in self.kinds] or [""])[self.kind_code]
 
-    @property
-    def of(self) -> NDArray[np.str_]:
-        """Name of each row's target, anchor, corner, ...; empty where its table does not say, shape (n,)."""
-        return np.array(self.labels)[self.label_code]
-
-    @property
-    def reason(self) -> NDArray[np.str_]:
-        """Why a row takes no part, empty where it does, shape (n,)."""
-        return np.array(self.reasons)[self.reason_code]
-
     @cached_property
     def families(self) -> tuple[str, ...]:
         """Kinds of noise, in the order in which they first stand in the table."""

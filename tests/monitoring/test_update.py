@@ -7,7 +7,7 @@ import pytest
 from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
-from fg_calib import Calibration, Measurements, Table, calibrate
+from fg_calib import Measurements, Table, calibrate
 from fg_calib.inputs import InputError
 from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
@@ -52,19 +52,6 @@ def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
     old, new = tables_of(FINE, unknown, "pose", rng, true_robot(robot, rng))
     with pytest.raises(InputError, match="update: gauge none, and rows that do not determine"):
         calibrate(robot, old, gauge="none").update(new)
-
-
-@pytest.mark.slow
-def test_three_updates_in_a_row_are_a_calibration_of_all_rows():
-    calibration, true, rng = calibrated(3)
-    tables = [calibration.solution.problem.data.tables[0]]
-    for name in "bcd":
-        tables.append(Table(measured(true, 6, rng, ids=name), "pose"))
-        calibration = calibration.update(tables[-1])
-    off, of_sigma = difference(calibration, calibrate(arm(), tables))
-    assert off < 3e-3
-    assert of_sigma < 1e-3
-    assert [run.n_residuals for run in calibration.runs] == [240, 36, 36, 36]
 
 
 def seen(true, spots, rng, n, ids):
@@ -207,20 +194,6 @@ def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
     assert "relative" in classes(updated).values()
 
 
-@pytest.mark.slow
-def test_classes_of_an_update_know_what_other_instruments_saw_before(tmp_path):
-    """Of distances, then of angles alone: reasons are of both, also once saved and loaded."""
-    rng = np.random.default_rng(1)
-    true = true_robot(arm(), rng)
-    old, new = (with_still_joint(model, n, rng, true) for model, n in (("distance", 30), ("rotation", 10)))
-    batch, first = calibrate(arm(), [old, new]), calibrate(arm(), old)
-    first.save(tmp_path / "first")
-    for calibration in (first, Calibration.load(tmp_path / "first")):
-        updated = calibration.update(new)
-        assert classes(updated) == classes(batch)
-        assert reasons(updated) == reasons(batch)
-
-
 @pytest.mark.parametrize("change", [{"growth": {"theta": 1e-9, "d": 1e-9}}, {"changed": ["theta3"]}])
 def test_what_tolerances_alone_say_is_no_data_of_an_update(change):
     """With growth the tolerances are part of what is known: d2, d3 and d4 of parallel axes were called independent."""
@@ -249,14 +222,6 @@ def test_a_limit_that_the_arm_before_misses_is_not_evaluated():
     rows = measured(slipped(true, theta3=2e-3), 8, rng)
     assert "the arm before this update misses it" in calibration.update(rows).not_accepted[0]
     assert "no measurement of any position was held out" in calibration.update(rows, changed="theta3").not_accepted[0]
-
-
-def test_test_rows_of_an_update_judge_its_limits():
-    calibration, true, rng = calibrated(12, accept=ACCEPT)
-    rows = measured(slipped(true, theta3=2e-3), 20, rng)
-    updated = calibration.update(replace(rows, test=np.arange(20) >= 12), changed="theta3")
-    assert updated.not_accepted == ()
-    assert {one.n for one in updated.result.acceptance.judgements} == {8}
 
 
 def test_rows_that_are_counted_already_are_refused_in_memory():

@@ -11,9 +11,8 @@ from tolerances import rounding
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError, Pairing
+from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.prediction.tool_pose import pose_rms
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
 from fg_calib.statistics.goodness_of_fit import chi2_bounds
@@ -172,16 +171,6 @@ def test_residual_table_holds_every_row_before_and_after(model):
         assert whitened @ whitened == pytest.approx(2 * solution.cost, rel=rounding(1, 10))
 
 
-def test_position_rms_is_that_of_the_vectors_length():
-    rng = np.random.default_rng(8)
-    robot = small_arm()
-    solution = solve(build_problem(robot, measure(robot, 30, rng), model="position"))
-    table = assess(solution).fit.residuals
-    lengths = np.linalg.norm(table.after.reshape(-1, 3), axis=1)
-    assert table.rms()["train"]["position"]["after"] == pytest.approx(np.sqrt(np.mean(lengths**2)))
-    assert table.rms()["test"] == {}
-
-
 def test_frame_estimate_is_world_T_base():
     rng = np.random.default_rng(9)
     robot = small_arm()
@@ -248,32 +237,3 @@ def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all(rms < 1.0 + 3.0 / np.sqrt(24.0))  # three standard errors of 12 draws
     assert np.all(rms > 0.4)
-
-
-@pytest.mark.filterwarnings("error")
-def test_an_error_of_which_rounding_leaves_less_than_nothing_is_unknown():
-    """Tolerances of a million metres that cancel after the best rigid fit left variances below 0."""
-    rng = np.random.default_rng(0)
-    points, jacobian = rng.normal(size=(4, 3)), rng.normal(size=(4, 6, 2))
-    base, fitted = pose_rms(points, jacobian, lambda rows: np.full(len(rows), -1e-3))
-    assert (base.position, base.orientation, fitted.position, fitted.orientation) == (None,) * 4
-
-
-@pytest.mark.parametrize(
-    ("function", "said"),
-    [
-        (lambda robot: 1 / 0, "raised ZeroDivisionError: division by zero, expected figures of any robot"),
-        (lambda robot: "far", "found 'far', expected a number or an array of them"),
-        (lambda robot: [[1.0], [1.0, 2.0]], "found [[1.0], [1.0, 2.0]], expected a number or an array of them"),
-        (lambda robot: 1j, "found 1j, expected a number or an array of them"),
-    ],
-)
-def test_what_a_function_of_ones_own_raises_or_returns_is_one_line(function, said):
-    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3})
-    rng = np.random.default_rng(0)
-    found = assess(solve(build_problem(robot, measure(true_robot(robot, rng), 12, rng), model="position")))
-    with pytest.raises(InputError) as error:
-        found.predict(function)
-    assert str(error.value) == f"function: {said}"
-    with pytest.raises(InputError, match=r"^function: 2 figures, expected points, shape \(n, 3\), where errors are f"):
-        found.predict(lambda robot: [1.0, 2.0], fitted=True)

@@ -117,15 +117,6 @@ def test_the_spread_is_sigma_where_measurements_determine_a_parameter():
     assert np.mean(squares) > 0.85
 
 
-@pytest.mark.slow
-def test_limits_without_test_rows_are_judged_by_the_folds():
-    robot, m = poses()
-    result = calibrate(robot, m, model="pose", folds=5, accept={"position": 5e-4})
-    one = result.result.acceptance.judgements[0]
-    assert (one.verdict, one.n) == ("pass", 40)
-    assert one.error == result.result.folds.kinds["position"].after
-
-
 @pytest.mark.parametrize("n", [1, 0, -3, 2.5, True])
 def test_a_number_of_folds_that_cannot_be_is_one_line(n):
     with pytest.raises(InputError, match="folds: found"):
@@ -150,16 +141,6 @@ def test_only_what_chance_does_not_explain_is_wide():
     assert wide({"a": 2.0, "b": 1.0}, 5) == []
     assert wide({"a": 3.0, "b": 4.0, "c": 1.0}, 5) == ["b", "a"]
     assert wide({"a": 2.0}, 30) == ["a"]
-
-
-@pytest.mark.slow
-def test_repeats_of_one_place_are_held_out_together():
-    robot, m = poses(n=20)
-    rows = np.repeat(np.arange(20), 3)
-    noise = 1e-4 * np.random.default_rng(5).normal(size=(60, 3))
-    repeated = replace(m.select(rows), ids=np.arange(60).astype(str), position=m.position[rows] + noise)
-    fold = cross_validate(job_of(robot, repeated), 5).fold
-    assert all(len(set(fold[rows == k])) == 1 for k in range(20))
 
 
 @pytest.mark.slow

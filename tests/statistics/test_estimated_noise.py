@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from instruments import TOLERANCE, measured_by
-from simulated import measure, small_arm, true_robot
+from simulated import small_arm, true_robot
 from sparing import as_case
 from touches import reach, reach_faces
 
 from fg_calib.calibration import calibrate
-from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
@@ -57,17 +56,3 @@ def test_contact_with_a_single_point_does_not_move_it():
     """Nothing that was measured moves: healthy, and no figure over 0."""
     robot, table = touched("contacts", np.random.default_rng(1), n_points=1)
     assert not calibrate(robot, table, estimate_noise=True).findings
-
-
-@pytest.mark.slow
-def test_noise_that_is_kept_where_other_noise_was_stated_far_too_small_is_not_good():
-    """All noise stated 25 times too small: joint noise explains the angles too, whose own stayed as stated and GOOD."""
-    rng = np.random.default_rng(2)
-    robot = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
-    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-3, 1e-3), sigma_joint=1e-3)
-    stated = {"sigma_position": m.sigma_position / 25, "sigma_orientation": m.sigma_orientation / 25}
-    m = replace(m, **stated, sigma_joint=np.full(4, 1e-3 / 25))
-    found = calibrate(robot, m, model="distance-rotation", pairing=Pairing("star"), estimate_noise=True)
-    (finding,) = found.assessment.verdict.errors
-    assert finding.startswith("the noise of angle could not be estimated")
-    assert "other noise was stated 34.5 times too small, and so may this be" in finding

@@ -1,6 +1,5 @@
 """Goodness of fit: by kind, by row, by configuration, under repetition; and noise estimated from the residuals."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,14 +7,13 @@ import pytest
 from reported import format_report
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
-from sparing import diagonal
 from touches import SIGMA, TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
 from fg_calib.graph import problem as problem_module
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import NoiseState
-from fg_calib.graph.solver import SolverOptions, solve
+from fg_calib.graph.solver import solve
 from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Pairs
 from fg_calib.measurements.table import Table
@@ -60,13 +58,10 @@ def case(name, robot, rng, n=16, stated=1.0):
     m = replace(m, sigma_position=m.sigma_position * stated, sigma_orientation=m.sigma_orientation * stated)
     if name.startswith("pose"):
         return build_problem(robot, m, model="pose")
-    pairing, *rest = name.split()
-    errors = "independent" if "independent" in rest else "shared"
-    return build_problem(robot, m, model="distance-rotation", pairing=Pairing(pairing), pair_errors=errors)
+    return build_problem(robot, m, model="distance-rotation", pairing=Pairing(name.split()[0]))
 
 
-RUNS = {"pose": 100, "star": 70, "all": 40, "direct": 100, "direct joint": 60}
-RUNS |= {"pose joint": 60, "star joint": 60, "star independent": 60}
+RUNS = {"pose": 60, "star": 40, "direct joint": 30}
 
 
 @pytest.mark.parametrize(("name", "n_runs"), RUNS.items())
@@ -87,8 +82,7 @@ def test_p_values_are_uniform_and_the_noise_seen_is_the_noise_there_is(name, n_r
         for fit in uncertainty.fit.goodness.kinds:
             by_kind.setdefault(fit.kind, []).append(fit.p_value)
             squares.setdefault(fit.kind, []).append((fit.chi2, fit.expected))
-    if "independent" not in name:
-        assert kstest(overall, "uniform").pvalue > 1e-3
+    assert kstest(overall, "uniform").pvalue > 1e-3
     for kind, p in by_kind.items():
         assert kstest(p, "uniform").pvalue > 1e-3
         chi2, expected = np.sum(squares[kind], axis=0)
@@ -123,25 +117,6 @@ def test_leverages_are_those_of_the_hat_matrix():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "wrong"), diagonal(["star", "all", "pose"], [0, 7]))
-def test_a_configuration_wrong_by_50_sigma_is_the_first_suspect(name, wrong):
-    rng = np.random.default_rng(4)
-    robot = small_arm(tolerance=TOLERANCE)
-    m = measure(true_robot(robot, rng), 25, rng, sigma=(1e-3, 5e-4))
-    m = replace(m, position=plus(m.position, wrong, 50e-3 * np.array([0.6, 0.0, 0.8])))
-    settings = {"model": "pose"} if name == "pose" else {"model": "distance-rotation", "pairing": Pairing(name)}
-    solution = solve(build_problem(robot, m, **settings))
-    uncertainty = assess(solution)
-    table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
-    assert goodness.configurations[0].configuration == wrong
-    worst = goodness.suspects[0]
-    assert wrong in (table.a[worst], table.b[worst])
-    text = format_report(solution, uncertainty)
-    assert re.search(rf"Suspicious configurations\n +rows +chi-square +expected\n{wrong} ", text)
-    assert re.search(rf"Suspicious rows\n(  pose {wrong} is in .*\n)?.*\n(\d+ +)?{wrong} ", text)
-
-
-@pytest.mark.slow
 def test_verdicts_tell_outliers_from_noise_stated_wrong():
     rng = np.random.default_rng(6)
     robot = small_arm(tolerance=TOLERANCE)
@@ -153,22 +128,6 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
     m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
     fits = assess(solve(build_problem(robot, m, model="pose"))).fit.goodness.kinds
     assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as stated", "position": "outliers"}
-
-
-def test_a_solution_that_has_not_arrived_does_not_end_the_estimate_of_the_noise(monkeypatch):
-    problem = case("pose", small_arm(tolerance=TOLERANCE), np.random.default_rng(15), 24, 1 / 25)
-    rounds = []
-
-    def gives_up_at_first(problem, options):
-        rounds.append(solve(problem, options if rounds else SolverOptions(max_iterations=1)))
-        return rounds[-1]
-
-    expected = factors_of(estimate_noise(problem))
-    monkeypatch.setattr(noise, "solve", gives_up_at_first)
-    solution = estimate_noise(problem)
-    assert not rounds[0].converged
-    assert solution.converged, solution.message
-    assert factors_of(solution) == pytest.approx(expected, rel=1e-4)  # 10 times SETTLED
 
 
 @pytest.mark.slow
@@ -218,16 +177,6 @@ def test_a_same_point_that_is_not_is_suspect():
     assert np.linalg.norm(table.after[other] / table.sigma[other]) == pytest.approx(10.0, abs=1.0)
     assert goodness.suspects[0] in other
     assert {one.configuration for one in goodness.configurations} == {1, 21}
-
-
-def test_pairs_that_a_model_of_poses_does_not_use_are_named(caplog):
-    rng = np.random.default_rng(14)
-    robot = small_arm(tolerance=TOLERANCE)
-    m = measure(robot, 20, rng)
-    direct = measured_directly(m, robot, rng, np.arange(10), np.arange(10, 20))
-    solution = solve(build_problem(robot, replace(m, pairs=direct.pairs), model="pose"))
-    assert caplog.messages == ["pairs: not used, model pose is of poses"]
-    assert "pairs is not used: model pose is of poses, not of pairs" in format_report(solution, assess(solution))
 
 
 def test_robust_weights_count_rows_and_flag_outliers():
@@ -300,7 +249,7 @@ def predicted(name, rng):
     return build_problem(robot, [Table(m, model="pose"), Table(direct, model="distance")])
 
 
-@pytest.mark.parametrize("name", ["touches", "touches joint", "pose joint", "star joint", "tables", "tables joint"])
+@pytest.mark.parametrize("name", ["touches joint", "star joint", "tables joint"])
 @pytest.mark.long
 @pytest.mark.usefixtures("without_reasons")
 def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_they_are_said_to(name):
@@ -308,7 +257,7 @@ def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_th
 
     Kolmogorov-Smirnov at 0.1 %, of kinds whose every run leaves a degree of freedom.
     """
-    n_runs, rng = 50, np.random.default_rng(21)
+    n_runs, rng = 25, np.random.default_rng(21)
     off, p_values = {}, {}
     for _ in range(n_runs):
         goodness = assess(solve(predicted(name, rng))).fit.goodness
@@ -317,7 +266,6 @@ def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_th
         for key, fit in (fits | {"together": goodness.test}).items():
             off.setdefault(key, []).append(fit.chi2 - fit.expected)
             p_values.setdefault(key, []).append(fit.p_value)
-    assert len(off) == {"touches": 5, "pose": 5, "star": 5, "tables": 7}[name.split()[0]]
     for key, found in off.items():
         assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(n_runs), key
     for key, p in p_values.items():
@@ -365,34 +313,13 @@ def test_touches_of_a_point_that_is_their_mean_share_its_noise():
     assert goodness.leverage[row] == pytest.approx((J @ C @ J + 2 * SIGMA**2 / n) / sigma**2, rel=1e-3)
 
 
-@pytest.mark.slow
-def test_the_only_touch_of_a_point_is_met_whatever_was_measured():
-    rng = np.random.default_rng(23)
-    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
-    m = touched(robot, rng)
-    alone = np.flatnonzero(m.groups.index == 4)[1:]
-    index = plus(m.groups.index, alone, -5)  # of no point
-    m = replace(m, groups=replace(m.groups, index=index), sigma_point=plus(m.sigma_point, alone, np.nan))
-    for loss in ("none", "gnc"):
-        judged = assess(solve(build_problem(robot, m, model="distance", loss=loss)))
-        table, goodness = judged.fit.residuals, judged.fit.goodness
-        (first, *_) = met = np.flatnonzero(table.a == alone[0] - 1)
-        assert (len(met), table.kind[first]) == (3, "point.x")
-        assert np.all(np.isnan(goodness.studentised[met]))
-        assert goodness.test.n_unknown == 0
-        assert 1e-4 < goodness.test.p_value < 1.0
-        points = goodness.test.kinds[0]
-        assert (points.kind, points.n) == ("point", 3 * (3 + 8))
-        assert np.isfinite([points.chi2, points.expected, points.p_value, points.largest]).all()
-
-
 def differences(function, x, step=1e-5):
     """Derivative of a function by central differences."""
     return np.stack([(function(x + h) - function(x - h)) / (2 * step) for h in step * np.eye(len(x))], axis=-1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["one table", "two tables", "independent"])
+@pytest.mark.parametrize("what", ["one table", "independent"])
 def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_covariance_with_the_estimate(what):
     """Against the whole covariance of all rows; to 2 % of a sigma, by which noise lengthens the shortest.
 
@@ -404,10 +331,8 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
     m = measured_directly(measure(true, n, rng), true, rng, i, j, sigma=(3e-4, 1e-4), sigma_joint=sigma_joint)
     test = np.arange(66) >= 50
     whole = replace(m, named=True, pairs=replace(m.pairs, test=test))
-    parts = [replace(whole, pairs=whole.pairs.select(rows)) for rows in (~test, test)]
-    tables = [Table(part, model="distance") for part in parts] if what == "two tables" else whole
     errors = "independent" if what == "independent" else "shared"
-    solution = solve(build_problem(robot, tables, model="distance", pair_errors=errors))
+    solution = solve(build_problem(robot, whole, model="distance", pair_errors=errors))
     uncertainty = assess(solution)
 
     def lengths(values, q):

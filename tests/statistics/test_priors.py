@@ -178,23 +178,6 @@ def test_corrections_beyond_their_tolerances_are_no_finding_once_these_are_estim
     assert not assess(solved()).verdict.errors
 
 
-def test_a_joint_may_have_one_scale():
-    problem, _ = drawn_problem(estimate_tolerance="joint")
-    scales = estimate_tolerances(problem).estimated_tolerances.scales
-    assert [one.group for one in scales] == [joint.name for joint in problem.robot.joints]
-    assert scales[1].parameters == ("a2", "alpha2", "d2", "theta2")
-
-
-def test_places_and_turns_of_a_tool_have_scales_of_their_own():
-    rng = np.random.default_rng(0)
-    tolerance = STATED | {"tool": 1e-3} | dict.fromkeys(TOOL[3:], 1e-3)
-    robot = small_arm(tolerance=tolerance, estimate=TOOL)
-    problem = build_problem(robot, measure(true_robot(robot, rng), 20, rng), model="pose", estimate_tolerance="kind")
-    groups = {one.group: one.parameters for one in estimate_tolerances(problem).estimated_tolerances.scales}
-    assert set(groups) == {*STATED, "tool", "tool angles"}
-    assert set(groups["tool"]) == set(TOOL[:3])
-
-
 def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
     """Base and tool do not: theirs may be anywhere."""
     rng = np.random.default_rng(0)
@@ -226,11 +209,6 @@ def test_an_arm_that_is_only_evaluated_keeps_its_tolerances():
 def test_without_priors_there_is_nothing_to_estimate(choices):
     with pytest.raises(InputError, match=r"^tolerance: to be estimated beside gauge: \w+, expected gauge: prior"):
         Options.of(estimate_tolerance="kind", **choices)
-
-
-def test_an_unknown_group_is_refused():
-    with pytest.raises(InputError, match=r"^estimate_tolerance: found 'kinds', expected one of kind, joint"):
-        Options.of(estimate_tolerance="kinds")
 
 
 def test_a_correction_varies_by_what_the_data_take_off_its_prior_variance():
