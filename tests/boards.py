@@ -91,7 +91,7 @@ def _drawing(board):
         squares[~inside] = 220.0
         drawing = np.kron(squares, np.ones((_TEXTURE, _TEXTURE)))
         return drawing.astype(np.float32), 2 * _TEXTURE - 0.5
-    from fg_calib.importers.opencv import charuco_board
+    from fg_calib.importers.board import charuco_board
 
     size = (board.columns * _TEXTURE, board.rows * _TEXTURE)
     drawing = 30.0 + (190.0 / 255.0) * charuco_board(board, "board").generateImage(size)

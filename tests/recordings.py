@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot
-from fg_calib.importers.recording import JointStream, PoseStream, Source
+from fg_calib.importers.bag import JointStream, PoseStream, Source
 from fg_calib.robot.kinematics import pose
 
 NAMES = ["pan", "lift", "elbow", "wrist1", "wrist2", "wrist3"]

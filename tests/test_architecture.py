@@ -228,7 +228,7 @@ def test_all_that_is_imported_is_installed_with_the_package():
                 modules = [node.module] if isinstance(node, ast.ImportFrom) else []
             for module in modules:
                 used.setdefault(module.partition(".")[0], set()).add(name)
-    extras = {"camera": ("opencv-python-headless", "cv2", "importers/opencv"),
+    extras = {"camera": ("opencv-python-headless", "cv2", "importers/board"),
               "ros": ("rosbags", "rosbags", "importers/bag"),
               "distributed": ("distributed", "distributed", "parallel")}  # fmt: skip
     for extra, (distribution, module, name) in extras.items():

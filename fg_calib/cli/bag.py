@@ -95,9 +95,7 @@ def _clocks(stops: Stops) -> list[str]:
     offset = stops.offset
     if offset is None:
         return [f"offset {stops.applied:.6g} s as specified"]
-    others = ", ".join(f"{other:+.2f}" for other in offset.others[:3])
     return [
         f"poses are stamped {offset.seconds:+.6f} +- {offset.sigma:.6f} s against the joints, which is taken out",
         f"from {offset.n_moves} moves; speeds by joints and by poses correlate by {offset.correlation:.3f}",
-        *([f"motions repeat: offsets of {others} s fit nearly as well; --offset specifies it"] if others else []),
     ]

@@ -68,7 +68,7 @@ def _report(tables: BoardTables) -> RenderableType:
     images, camera = [], []
     for view in fit.views:
         turn, shift = (np.sqrt(np.linalg.eigvalsh(C)[-1]) for C in (view.covariance[:3, :3], view.covariance[3:, 3:]))
-        remark = ", ".join(["two poses"] * view.ambiguous + ["large residuals"] * view.poor)
+        remark = "two poses" if view.ambiguous else ""
         values = view.rms, view.sigma, float(np.linalg.norm(view.position)), shift, turn
         images.append((view.name, len(view.corners), *values, remark))
     for name, sigma in (fit.camera_sigma or {}).items():
@@ -95,7 +95,6 @@ def _notes(tables: BoardTables) -> Iterator[str]:
     two = "Only in pixels.csv, as a second pose, tilted the other way, explains the corners as well:"
     for words, names in (
         ("No pose of the board explains the corners of", fit.without_pose),
-        ("Large residuals, of a blurred image or a board that is not flat:", [v.name for v in fit.views if v.poor]),
         (two, [v.name for v in tables.used if v.ambiguous]),
         ("No row of joint readings, and so not in the tables:", tables.without_row),
         ("Rows of joint readings without an image of the board:", tables.without_image),

@@ -1,4 +1,4 @@
-"""Calibration boards: their files, their corners, and the images that show them.
+"""Calibration boards: their files, images that show them, and the tables `pixels.csv`, `board.csv` with the camera.
 
 type: charuco            # or checkerboard
 columns: 9               # squares in a row; of a checkerboard the inner corners in a row
@@ -7,28 +7,564 @@ square: 20
 marker: 14               # charuco alone, as are dictionary and legacy
 dictionary: DICT_5X5_100
 units: {length: mm}
+
+With R, t the board and c a corner on it, `t + R c` is where it is in the camera's frame, and `Camera.image` where it is
+seen. A turn w of the board about its origin and a shift dt, both along the camera's axes, move its image by
+`J_image (w x R c + dt)`: these are the rows of `RoomPixel`, and the axes of `BoardPose`, so that the covariance of
+(w, dt), orientation first, is what a table's columns `cov_11 ... cov_66` hold.
+
+The only module that calls OpenCV, so that nothing else needs it installed.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
+import yaml
+from numpy.typing import NDArray
 from pydantic import Field, StrictBool
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
 
-from fg_calib.importers.opencv import (
-    CalibrationBoard,
-    charuco_board,
-    decode,
-    dictionaries,
-    find_corners,
+from fg_calib import __version__
+from fg_calib.inputs import Floats, InputError, Integers, check
+from fg_calib.io import (
+    KNOWN,
+    Count,
+    Positive,
+    Schema,
+    Table,
+    Units,
+    UnitsOfFile,
+    fill_folder,
+    read_bytes,
+    read_yaml,
+    require_own,
+    shown,
+    validate,
+    write_csv,
+    write_text,
 )
-from fg_calib.importers.views import Corners
-from fg_calib.inputs import Floats, InputError, check
-from fg_calib.io import Count, Positive, Schema, Units, UnitsOfFile, read_bytes, read_yaml, shown, validate
+from fg_calib.measurements import COVARIANCE, Frames, RoomPixel
+from fg_calib.measurements.kinds import Camera
 from fg_calib.parallel import tell
+
+Image = NDArray[np.uint8]
+
+_SEARCHED = 1600
+"""Longest side, [px], to which an image is reduced before a checkerboard is searched in it: in 12 megapixels without a
+board the search takes seconds, or minutes where there is much texture."""
+
+
+UNDETERMINED = ("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
+
+MIN_IMAGES = 3
+"""From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
+the lens."""
+
+MIN_CORNERS = 6
+"""Of a ChArUco board: four determine its pose, and more its accuracy."""
+
+
+@dataclass(frozen=True)
+class CalibrationBoard:
+    """A checkerboard, or a ChArUco board, whose white squares hold markers that say which ones they are.
+
+    The board's frame has its origin at the first corner of a checkerboard, between whose first four corners is a
+    black square, or at the outer corner of a ChArUco board's first square; x runs along the rows of corners, y from
+    row to row, z away from who looks at it.
+
+    Attributes:
+        type: Which of the two.
+        columns: Of a checkerboard the inner corners in a row, of a ChArUco board the squares in a row, as in OpenCV.
+        rows: Inner corners, or squares, in a column.
+        square: Side of a square, [m].
+        marker: Side of a marker, [m]; 0 for a checkerboard.
+        dictionary: The markers' dictionary, such as `DICT_5X5_100`; empty for a checkerboard.
+        legacy: Whether the ChArUco board was drawn by an OpenCV before 4.6, which began boards with an even number of
+            rows with a white square.
+        upright: Whether the camera never turned more than a quarter turn about its axis between images, seen from the
+            first one: this orients a checkerboard that looks the same after half a turn.
+        name: What the board is called in a column `board`; without a name there is no such column.
+    """
+
+    type: Literal["checkerboard", "charuco"]
+    columns: int
+    rows: int
+    square: float
+    marker: float = 0.0
+    dictionary: str = ""
+    legacy: bool = False
+    upright: bool = False
+    name: str = ""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Corners in a row, and rows of them."""
+        fewer = self.type == "charuco"
+        return self.columns - fewer, self.rows - fewer
+
+    @property
+    def corners(self) -> Floats:
+        """Places of the corners in the board's frame, x and y, row by row, shape (n_corners, 2), [m]."""
+        columns, rows = self.shape
+        j, i = np.divmod(np.arange(columns * rows), columns)
+        first = 1.0 if self.type == "charuco" else 0.0
+        return self.square * (np.stack([i, j], axis=1) + first)
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether it looks the same after half a turn: a checkerboard whose opposite end squares are of one colour."""
+        return self.type == "checkerboard" and (self.columns + self.rows) % 2 == 0
+
+
+@cache
+def load_opencv() -> Any:
+    """The module `cv2`.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import cv2
+    except ImportError:
+        raise InputError("fg-calib board needs OpenCV", "pip install 'fg_calib[camera]'") from None
+    logging = getattr(cv2.utils, "logging", cv2)  # 4.11 has it in the module itself
+    logging.setLogLevel(0)  # what it could not read is said by us
+    return cv2
+
+
+def decode(content: bytes, name: str) -> Image:
+    """An image in grey levels, as the sensor saw it: no turn that its file asks viewers for is made.
+
+    Args:
+        content: The bytes of its file.
+        name: The file's name, for messages.
+
+    Raises:
+        InputError: OpenCV cannot read it.
+    """
+    cv2, image = load_opencv(), None
+    with suppress(cv2.error):  # of absurd size, or of no content
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
+    if image is None:
+        raise InputError(name, "no image that OpenCV can read", "PNG, JPEG, TIFF, BMP or the like")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def charuco_board(board: CalibrationBoard, place: str) -> Any:
+    """A ChArUco board as OpenCV has it.
+
+    Args:
+        board: The board.
+        place: Its file, for messages.
+
+    Raises:
+        InputError: Its dictionary has fewer markers than it has white squares.
+    """
+    cv2 = load_opencv()
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    needed, there = board.columns * board.rows // 2, len(dictionary.bytesList)
+    if needed > there:
+        raise InputError(f"{place}: dictionary", f"{board.dictionary} has {there} markers", f"{needed} or more")
+    made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
+    made.setLegacyPattern(board.legacy)
+    return made
+
+
+def find_corners(image: Image, board: CalibrationBoard) -> tuple[Integers, Floats] | str:
+    """Corners of a board in an image.
+
+    Each is moved to where the gradients around it say it is (`cornerSubPix`), within a window of its own size: all
+    that is in it are the four squares that meet there.
+
+    Args:
+        image: The image.
+        board: The board.
+
+    Returns:
+        Which corners, numbered row by row, shape (n,), and where they are, (n, 2), [px]; or why there are none.
+    """
+    cv2 = load_opencv()
+    try:
+        found = _charuco(cv2, image, board) if board.type == "charuco" else _checkerboard(cv2, image, board)
+    except cv2.error:
+        return "OpenCV cannot search it"
+    if isinstance(found, str):
+        return found
+    corners, uv = found
+    if len(corners) < MIN_CORNERS:
+        return f"no more than {len(corners)} corners"
+    free = 0.45 if board.type == "checkerboard" else min(0.45, (board.square - board.marker) / board.square / 2)
+    half = int(np.clip(free * pdist(uv).min(), 2, 20))
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-4)
+    exact = cv2.cornerSubPix(image, np.ascontiguousarray(uv[:, None], np.float32), (half, half), (-1, -1), criteria)
+    return corners, exact[:, 0].astype(np.float64)
+
+
+def _checkerboard(cv2: Any, image: Image, board: CalibrationBoard) -> tuple[Integers, Floats] | str:
+    scale = max(1.0, max(image.shape) / _SEARCHED)
+    small = cv2.resize(image, None, fx=1.0 / scale, fy=1.0 / scale, interpolation=cv2.INTER_AREA)
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    found, uv = cv2.findChessboardCorners(small, board.shape, flags=flags)
+    if not found:  # slower, and sees more: blur, reflections, a narrow margin
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, uv = cv2.findChessboardCornersSB(small, board.shape, flags=flags)
+    if not found:
+        return "no board"
+    columns, rows = board.shape
+    uv = (uv.astype(np.float64) + 0.5) * scale - 0.5
+    grid = in_order(image, uv.reshape(rows, columns, 2))
+    return np.arange(columns * rows), grid.reshape(-1, 2)
+
+
+def _charuco(cv2: Any, image: Image, board: CalibrationBoard) -> tuple[Integers, Floats] | str:
+    detector = cv2.aruco.CharucoDetector(charuco_board(board, "board"))
+    uv, corners, _, _ = detector.detectBoard(image)
+    if corners is None or len(corners) == 0:
+        return "no board"
+    return corners.ravel().astype(np.int64), uv.reshape(-1, 2).astype(np.float64)
+
+
+def in_order(image: Image, grid: Floats) -> Floats:
+    """Corners of a checkerboard in its own order: turning right from rows to columns, a black square first.
+
+    Where the board looks the same after half a turn, both orders begin with a black square, or both with a white one:
+    then the order stays as it is.
+
+    Args:
+        image: The image.
+        grid: Corners row by row, shape (rows, columns, 2), [px].
+    """
+    along, down = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0), grid[-1].mean(axis=0) - grid[0].mean(axis=0)
+    if along[0] * down[1] - along[1] * down[0] < 0.0:  # as if seen from behind
+        grid = grid[:, ::-1]
+    centres = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
+    u, v = np.rint(centres).astype(int).reshape(-1, 2).T
+    height, width = image.shape
+    grey = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].reshape(centres.shape[0], -1).astype(np.float64)
+    i, j = np.indices(grey.shape)
+    like_first = (i + j) % 2 == 0
+    if (sum(grid.shape[:2]) % 2) and grey[like_first].mean() > grey[~like_first].mean():
+        grid = grid[::-1, ::-1]
+    return grid
+
+
+def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats, Floats]]:
+    """Poses of a plane from which its points would be seen there, nearest first.
+
+    A plane that is seen small has two: tilted one way or the other (Collins and Bartoli 2014, *Infinitesimal
+    plane-based pose estimation*). Each is refined to least squares of the distances in the image.
+
+    Args:
+        points: Points of the plane, x and y, shape (n, 2), [m].
+        uv: Where they are seen, shape (n, 2), [px].
+        camera: The camera.
+
+    Returns:
+        Axes of the plane in the camera's frame, (3, 3), and its origin, (3,), [m]; one or two poses, or none.
+    """
+    cv2 = load_opencv()
+    K, lens = _matrices(camera)
+    places = np.column_stack([points, np.zeros(len(points))])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    found = []
+    try:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(places, uv, K, lens, flags=cv2.SOLVEPNP_IPPE)
+        for turn, shift in zip(turns, shifts, strict=True):
+            v, t = cv2.solvePnPRefineLM(places, uv, K, lens, turn.copy(), shift.copy(), criteria)
+            if np.isfinite(v).all() and np.isfinite(t).all():
+                found.append((cv2.Rodrigues(v)[0], t.ravel()))
+    except cv2.error:
+        return []
+    return found
+
+
+def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
+    """The camera that explains views of a plane best (Zhang 2000, *A flexible new technique for camera calibration*).
+
+    Args:
+        points: Of each view, points of the plane, x and y, shape (n, 2), [m].
+        uv: Where they are seen, [px].
+        size: Width and height of the images, [px].
+
+    Raises:
+        InputError: There are too few views, or they do not determine it.
+    """
+    if len(points) < MIN_IMAGES:
+        expected = f"at least {MIN_IMAGES} to estimate a camera from"
+        raise InputError("images", f"{len(points)} with a board", expected)
+    cv2 = load_opencv()
+    places = [np.column_stack([p, np.zeros(len(p))]).astype(np.float32) for p in points]
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    try:
+        seen = [image.astype(np.float32) for image in uv]
+        _, K, lens, _, _ = cv2.calibrateCamera(places, seen, size, None, None, criteria=criteria)
+        return Camera(*map(float, [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]))
+    except (cv2.error, InputError):
+        raise InputError(*UNDETERMINED) from None
+
+
+def _matrices(camera: Camera) -> tuple[Floats, Floats]:
+    """The camera's matrix, and k1 k2 p1 p2 k3."""
+    K = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    return K, np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+
+
+def camera_derivatives(camera: Camera, points: Floats) -> Floats:
+    """Derivatives of image points in the camera's parameters, in the order of its fields, shape (n, 2, 9).
+
+    Args:
+        camera: The camera.
+        points: Points in its frame, in front of it, shape (n, 3), [m].
+    """
+    K, lens = _matrices(camera)
+    J = load_opencv().projectPoints(points, np.zeros(3), np.zeros(3), K, lens)[1]
+    return np.asarray(J[:, 6:15].reshape(len(points), 2, 9), dtype=np.float64)
+
+
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""A camera's parameters, in the order of its covariance."""
+
+PRIOR_RESIDUALS = 10
+"""How many residuals of its own weigh as much in an image's sigma as those of all images."""
+
+MAX_CHI2_DIFFERENCE = 10.8
+"""Chi-square by which a second pose may fit worse and still be the true one: its 99.9 % point."""
+
+MAX_RMS_SHARE = 0.002
+"""RMS of all residuals, in diagonals of the image, that no lens unlike its model leaves: a camera of other images."""
+
+MAX_FOCAL_SIGMA = 0.01
+"""Sigma of a focal length over itself above which it is hardly determined: distances are wrong by as much."""
+
+
+class Corners(NamedTuple):
+    """Corners found in an image.
+
+    Attributes:
+        name: What the image is called.
+        corners: Which corners of the board, shape (n,).
+        uv: Where they are seen, shape (n, 2), [px].
+    """
+
+    name: str
+    corners: Integers
+    uv: Floats
+
+
+@dataclass(frozen=True)
+class View:
+    """A board in an image.
+
+    Attributes:
+        name: What the image is called.
+        corners: Which of its corners are seen, shape (n,).
+        uv: Where, shape (n, 2), [px].
+        rotation: Its axes in the camera's frame, camera_R_board, shape (3, 3).
+        position: Its origin there, shape (3,), [m].
+        rms: Of the residuals, [px].
+        sigma: Of a corner along each axis of the image, [px].
+        covariance: Of its pose along and about the camera's axes, orientation first, shape (6, 6), [rad] and [m], with
+            the camera taken as known.
+        by_camera: What the camera's own covariance adds to it, in all images together; 0 for a camera that was given.
+        ambiguous: Whether a second pose, tilted the other way, explains its corners nearly as well.
+    """
+
+    name: str
+    corners: Integers
+    uv: Floats
+    rotation: Floats
+    position: Floats
+    rms: float
+    sigma: float
+    covariance: Floats
+    by_camera: Floats
+    ambiguous: bool
+
+    @property
+    def rotation_vector(self) -> Floats:
+        """`rotation` as an axis times an angle, shape (3,), [rad]."""
+        return Rotation.from_matrix(self.rotation.copy()).as_rotvec()
+
+
+@dataclass(frozen=True)
+class BoardFit:
+    """A board in some images, and the camera.
+
+    Attributes:
+        board: The board.
+        size: Width and height of the images, [px].
+        camera: The camera.
+        camera_covariance: Of its `INTRINSICS`, shape (9, 9); None for a camera that was given.
+        views: The board in each image.
+        without_pose: Names of images that no pose explains.
+        rms: Of all residuals, [px].
+        sigma: Of a corner along each axis of the image, in the mean of all images, [px].
+    """
+
+    board: CalibrationBoard
+    size: tuple[int, int]
+    camera: Camera
+    camera_covariance: Floats | None
+    views: tuple[View, ...]
+    without_pose: tuple[str, ...]
+    rms: float
+    sigma: float
+
+    @property
+    def camera_sigma(self) -> dict[str, float] | None:
+        """1 sigma of each of the camera's parameters; None for a camera that was given."""
+        C = self.camera_covariance
+        return None if C is None else dict(zip(INTRINSICS, np.sqrt(np.diag(C)).tolist(), strict=True))
+
+    @property
+    def moved_by_camera(self) -> float:
+        """Largest 1 sigma by which the error of the camera moves boards, [m]."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(view.by_camera[3:, 3:])[-1] for view in self.views)))
+
+    @property
+    def findings(self) -> tuple[str, ...]:
+        """Why the result is not to be trusted."""
+        found, (width, height) = [], self.size
+        for name in ("fx", "fy"):
+            value, sigma = getattr(self.camera, name), (self.camera_sigma or {}).get(name, 0.0)
+            if sigma > MAX_FOCAL_SIGMA * value:
+                hint = "tilt the board by 30 degrees or so, in several directions, and fill the image with it"
+                found.append(f"the images do not determine the camera: {name} = {value:.0f} ± {sigma:.0f} px; {hint}")
+        if self.rms > MAX_RMS_SHARE * np.hypot(width, height):
+            hint = f"is the camera that of these images of {width} x {height} px, is the board as its file says?"
+            found.append(f"no poses explain the corners: residuals of {self.rms:.3g} px RMS; {hint}")
+        return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Least squares of one image: squared residuals, and derivatives by pose, (2 n, 6), and by the camera, (2 n, 9)."""
+
+    pose: tuple[Floats, Floats]
+    squares: float
+    J: Floats
+    K: Floats
+    second: float = np.inf
+
+    @property
+    def information(self) -> Floats:
+        """Of the pose, for corners of sigma 1 px, shape (6, 6)."""
+        A: Floats = self.J.T @ self.J
+        return A
+
+    @property
+    def shift(self) -> Floats:
+        """What an error of the camera's parameters does to the pose, shape (6, 9)."""
+        return np.asarray(np.linalg.solve(self.information, -self.J.T @ self.K), dtype=np.float64)
+
+    @property
+    def camera_information(self) -> Floats:
+        """Of the camera's parameters, for corners of sigma 1 px and an unknown pose, shape (9, 9)."""
+        rest = self.K + self.J @ self.shift
+        return rest.T @ rest
+
+
+def fit_board(
+    board: CalibrationBoard, found: Sequence[Corners], size: tuple[int, int], camera: Camera | None = None
+) -> BoardFit:
+    """Poses of a board, each with its covariance, and with `camera` None the camera too.
+
+    Each image's corners have a sigma of their own, from its residuals and, with the weight of some, those of all
+    images: blur and slant differ from image to image.
+
+    Args:
+        board: The board.
+        found: Its corners in each image.
+        size: Width and height of the images, [px].
+        camera: The camera; None to estimate it from these images, unweighted.
+
+    Raises:
+        InputError: There are too few images for a camera, or none that a pose explains.
+    """
+    given = camera is not None
+    points = {one.name: board.corners[one.corners] for one in found}
+    if camera is None:
+        camera = first_camera(list(points.values()), [one.uv for one in found], size)
+    fits = {one.name: fit for one in found if (fit := _fit(camera, points[one.name], one.uv)) is not None}
+    if not fits:
+        raise InputError("images", "corners that no pose of the board explains", "images of this board by this camera")
+    seen = np.array([fit.camera_information for fit in fits.values()])  # (n_images, 9, 9)
+    C = np.zeros((9, 9)) if given else _scaled_inverse(seen.sum(axis=0))
+    taken = {name: 6.0 + float(np.sum(fit.camera_information * C)) for name, fit in fits.items()}
+    squares = sum(fit.squares for fit in fits.values())
+    variance = squares / sum(len(fit.J) - taken[name] for name, fit in fits.items())
+    own = {name: (fit.squares + PRIOR_RESIDUALS * variance) / (len(fit.J) - taken[name] + PRIOR_RESIDUALS)
+           for name, fit in fits.items()}  # fmt: skip
+    C = C @ sum(own[name] * fit.camera_information for name, fit in fits.items()) @ C
+    kept = [one for one in found if one.name in fits]
+    return BoardFit(
+        board=board,
+        size=size,
+        camera=camera,
+        camera_covariance=None if given else C,
+        views=tuple(_view(one, fits[one.name], own[one.name], C) for one in kept),
+        without_pose=tuple(one.name for one in found if one.name not in fits),
+        rms=float(np.sqrt(squares / sum(len(fit.J) for fit in fits.values()))),
+        sigma=float(np.sqrt(variance)),
+    )
+
+
+def _view(one: Corners, fit: _Fit, variance: float, C: Floats) -> View:
+    return View(
+        *one,
+        *fit.pose,
+        rms=float(np.sqrt(fit.squares / len(fit.J))),
+        sigma=float(np.sqrt(variance)),
+        covariance=variance * _scaled_inverse(fit.information),
+        by_camera=fit.shift @ C @ fit.shift.T,
+        ambiguous=fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance,
+    )
+
+
+def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:
+    """The better of the poses that explain some corners, and how well the other one does; None if there is none."""
+    fits = [_rows(camera, points, uv, R, t) for R, t in both_poses(points, uv, camera)]
+    fits = [fit for fit in fits if np.isfinite(fit.squares) and np.linalg.matrix_rank(fit.J) == 6]
+    if not fits:
+        return None
+    best, *others = sorted(fits, key=lambda fit: fit.squares)
+    apart = (fit for fit in others if not np.allclose(fit.pose[0], best.pose[0], rtol=0.0, atol=1e-4))
+    return replace(best, second=min((fit.squares for fit in apart), default=np.inf))
+
+
+def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _Fit:
+    """Residuals at a pose, and their derivatives."""
+    n = len(points)
+    at = Frames(np.broadcast_to(R, (n, 1, 3, 3)), np.broadcast_to(t, (n, 1, 3)))
+    rows = RoomPixel(camera).rows(at, np.column_stack([uv, points]), np.empty((n, 0)))
+    K = camera_derivatives(camera, t + points @ R[:, :2].T)
+    return _Fit((R, t), float(np.sum(rows.residual**2)), rows.wrenches.reshape(2 * n, 6), K.reshape(2 * n, 9))
+
+
+def _scaled_inverse(A: Floats) -> Floats:
+    """The inverse of an information matrix whose unknowns have different units.
+
+    Raises:
+        InputError: It has none.
+    """
+    size = np.sqrt(np.diag(A))
+    try:
+        L = np.linalg.inv(np.linalg.cholesky(A / np.outer(size, size))) / size
+    except np.linalg.LinAlgError:
+        raise InputError(*UNDETERMINED) from None
+    C: Floats = L.T @ L
+    return C
+
 
 MAX_COUNT = 1000
 """Columns or rows."""
@@ -76,7 +612,8 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
         if board.marker >= board.square:
             expected = f"a side shorter than a square's, {shown(file.square)}"
             raise InputError(f"{place}: marker", f"found {shown(file.marker)}", expected)
-        check(f"{place}: dictionary", board.dictionary, dictionaries())
+        known = [name for name in dir(load_opencv().aruco) if name.startswith("DICT_")]
+        check(f"{place}: dictionary", board.dictionary, known)
         charuco_board(board, place)
     elif board.ambiguous and (not file.upright or file.columns == file.rows):
         found = f"{file.columns} x {file.rows} inner corners look the same after half a turn"
@@ -88,8 +625,7 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FoundCorners:
+class FoundCorners(NamedTuple):
     """Corners of a board in some images.
 
     Attributes:
@@ -157,12 +693,193 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
 
 def _upright(found: Sequence[Corners]) -> list[Corners]:
     """All corners in the order in which the rows run as in the first image, within a quarter turn."""
-    first = _along(found[0])
-    return [one if _along(one) @ first > 0.0 else one._replace(uv=one.uv[::-1].copy()) for one in found]
+    half = len(found[0].uv) // 2
+    along = [one.uv[-half:].mean(axis=0) - one.uv[:half].mean(axis=0) for one in found]
+    return [
+        one if step @ along[0] > 0.0 else one._replace(uv=one.uv[::-1].copy())
+        for one, step in zip(found, along, strict=True)
+    ]
 
 
-def _along(one: Corners) -> Floats:
-    """From the first half of a board's corners to the second, in the image."""
-    half = len(one.uv) // 2
-    step: Floats = one.uv[-half:].mean(axis=0) - one.uv[:half].mean(axis=0)
-    return step
+BOARD_FILES = {
+    "board.json": b'{\n "schema": "fg-calib/board/',
+    "board.csv": b"id,",
+    "pixels.csv": b"id,",
+    "camera.yaml": b"",
+}
+"""What is written and how it begins."""
+
+
+Readings = Mapping[str, Mapping[str, str]]
+"""By the name of an image, the cells of its row by column: joint readings, and `split`, as they are written."""
+
+
+def read_readings(path: Path) -> Readings:
+    """Joint readings from a table of configurations whose `id` is the name of an image without its ending.
+
+    Columns that are measurements, such as `x`, are left out; all others are taken as they are.
+
+    Raises:
+        InputError: The table cannot be used.
+    """
+    table = Table.read(path, "configurations")
+    columns = {name.lower() if name.lower() in KNOWN else name: name for name in table.columns}
+    if "id" not in columns:
+        raise InputError(table.name, "no column id", "the name of each row's image without its ending")
+    kept = [name for name in columns if name not in KNOWN]
+    if not kept:
+        raise InputError(table.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
+    ids = table.texts(columns["id"], "the name of an image without its ending")
+    table.require(ids.is_first_distinct().to_numpy(), columns["id"], "one row an image")
+    comma = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$" if table.separator != "," else r"$^"  # of decimals: we write points
+    kept += ["split"] if "split" in columns else []
+    cells = (table.texts(columns[name]).fill_null("").str.replace(comma, "$1.$2") for name in kept)
+    return {name: dict(zip(kept, row, strict=True)) for name, *row in zip(ids, *cells, strict=True)}
+
+
+@dataclass(frozen=True)
+class BoardTables:
+    """What is written of images of a board.
+
+    Attributes:
+        fit: Poses and camera.
+        without: Names of images without a board, and why.
+        readings: Joint readings of the images, where there are some.
+        units: Of the tables that are written, and of the readings.
+        camera_file: The bytes of the camera's file; None if it was estimated.
+    """
+
+    fit: BoardFit
+    without: Mapping[str, str]
+    readings: Readings | None
+    units: Units
+    camera_file: bytes | None
+
+    def __post_init__(self) -> None:
+        if not self.used:
+            rows, images = (", ".join(names[:3]) for names in (self.without_image, self.without_row))
+            raise InputError("configurations", f"no id is the name of an image: {rows}", f"ids such as {images}")
+
+    @property
+    def used(self) -> tuple[View, ...]:
+        """Images that stand in the tables: those with a row of readings, where there are readings."""
+        return tuple(view for view in self.fit.views if self.readings is None or view.name in self.readings)
+
+    @property
+    def posed(self) -> tuple[View, ...]:
+        """Those of them whose pose stands in the table of poses: it is not one of two."""
+        return tuple(view for view in self.used if not view.ambiguous)
+
+    @property
+    def without_row(self) -> tuple[str, ...]:
+        """Images with a board that have no row of readings."""
+        return tuple(v.name for v in self.fit.views if self.readings is not None and v.name not in self.readings)
+
+    @property
+    def without_image(self) -> tuple[str, ...]:
+        """Rows of readings that have no image with a board."""
+        seen = {view.name for view in self.fit.views}
+        return tuple(name for name in self.readings or () if name not in seen)
+
+    def document(self) -> dict[str, Any]:
+        """What `board.json` holds: SI, full precision.
+
+        { "schema": "fg-calib/board/1", "version", "board": {keys of its file, in m}, "image_size": [width, height],
+          "rms_pixel", "sigma_pixel", "images": [{"id", "n_corners", "rms_pixel", "sigma_pixel", "position",
+          "rotation_vector", "covariance", "covariance_by_camera" | null, "ambiguous"}], "camera": {parameters},
+          "camera_sigma": {parameters} | null, "without_board": {file: reason}, "without_pose": [ids],
+          "without_readings": [ids], "without_image": [ids], "findings": [text] }
+
+        """
+        fit = self.fit
+        return {
+            **{"schema": "fg-calib/board/1", "version": __version__, "board": asdict(fit.board)},
+            **{"image_size": list(fit.size), "rms_pixel": fit.rms, "sigma_pixel": fit.sigma},
+            "images": [_image_document(view, fit) for view in fit.views],
+            **{"camera": asdict(fit.camera), "camera_sigma": fit.camera_sigma, "without_board": dict(self.without)},
+            **{"without_pose": list(fit.without_pose), "without_readings": list(self.without_row)},
+            **{"without_image": list(self.without_image), "findings": list(fit.findings)},
+        }
+
+
+def _image_document(view: View, fit: BoardFit) -> dict[str, Any]:
+    """A board in an image, as in `board.json`."""
+    arrays = ("position", "rotation_vector", "covariance")
+    return {
+        **{"id": view.name, "n_corners": len(view.corners), "rms_pixel": view.rms, "sigma_pixel": view.sigma},
+        **{key: getattr(view, key).tolist() for key in arrays},
+        "covariance_by_camera": None if fit.camera_covariance is None else view.by_camera.tolist(),
+        "ambiguous": bool(view.ambiguous),
+    }
+
+
+def require_no_input_of_board(folder: Path, inputs: Sequence[Path]) -> None:
+    """Check that tables written to a folder would not replace what they are made of, nor a file that no board wrote.
+
+    Raises:
+        InputError: They would.
+    """
+    given = {path.resolve() for path in inputs}
+    for name in BOARD_FILES:
+        if (folder / name).resolve() in given:
+            raise InputError(str(folder / name), "would be replaced by what is made of it", "another folder")
+    require_own(folder, BOARD_FILES)
+
+
+def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
+    """Write `pixels.csv`, `board.csv`, `camera.yaml` and `board.json`, all of them or none.
+
+    Without an image that has one pose alone there is no `board.csv`.
+
+    Returns:
+        The names of the files.
+
+    Raises:
+        InputError: The folder cannot be written, or holds files of these names that are not of a board.
+    """
+    names: list[str] = []
+
+    def write(into: Path) -> None:
+        write_text(into / "board.json", json.dumps(tables.document(), indent=1, allow_nan=False) + "\n")
+        write_csv(into / "pixels.csv", _pixel_columns(tables))
+        if tables.posed:
+            write_csv(into / "board.csv", _pose_columns(tables))
+        if tables.camera_file is not None:
+            (into / "camera.yaml").write_bytes(tables.camera_file)
+        else:
+            fit, words = (
+                tables.fit,
+                f"# fg-calib board: estimated from {len(tables.fit.views)} images, in px; 1 sigma\n",
+            )
+            values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
+            write_text(into / "camera.yaml", words + yaml.safe_dump(values, sort_keys=False))
+        names.extend(sorted(file.name for file in into.iterdir()))
+
+    fill_folder(folder, write, BOARD_FILES)
+    return tuple(names)
+
+
+def _row_columns(tables: BoardTables, views: Sequence[View], each: Sequence[int]) -> dict[str, Any]:
+    """What rows begin with: id, readings, the board's name; those of an image stand as often as `each` says."""
+    board = {"board": tables.fit.board.name} if tables.fit.board.name else {}
+    rows = [{"id": view.name, **(tables.readings or {}).get(view.name, {}), **board} for view in views]
+    return {key: np.repeat([row[key] for row in rows], each) for key in rows[0]}
+
+
+def _pixel_columns(tables: BoardTables) -> dict[str, Any]:
+    views, each = tables.used, [len(view.corners) for view in tables.used]
+    uv = np.concatenate([view.uv for view in views])
+    corner = np.concatenate([tables.fit.board.corners[view.corners] for view in views]) / tables.units.factor("m")
+    columns = _row_columns(tables, views, each)
+    columns |= dict(zip(("u", "v", "corner_x", "corner_y"), np.hstack([uv, corner]).T, strict=True))
+    return columns | {"sigma_pixel": np.repeat([view.sigma for view in views], each)}
+
+
+def _pose_columns(tables: BoardTables) -> dict[str, Any]:
+    views, length, angle = tables.posed, tables.units.factor("m"), tables.units.factor("rad")
+    size = np.repeat([angle, length], 3)
+    poses = np.array([[*view.position / length, *view.rotation_vector / angle] for view in views])
+    upper = (np.array([view.covariance for view in views]) / np.outer(size, size))[:, *np.triu_indices(6)]
+    columns = _row_columns(tables, views, [1] * len(views))
+    columns |= dict(zip((*"xyz", "rx", "ry", "rz"), poses.T, strict=True))
+    return columns | dict(zip(COVARIANCE, upper.T, strict=True))

@@ -70,18 +70,15 @@ units: {units}  # {why}
 # put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings.
 noise: {noise}
 
-# The rest as it is by default:
-# pairing: star        # of models of pairs: star | chain | all | {{random: 3000, seed: 0}}
-# targets: {{smr1: {{x: 0.0, y: 0.0, z: {target}}}}}   # where targets are on the tool, if known; anchors: from the base
-# loss: none           # huber | cauchy | geman-mcclure | gnc where there are gross errors
-# gauge: prior         # what data do not determine: priors fix it; keep: it stays at nominal; none
+# pairing: star   # of models of pairs: star | chain | all | {{random: 3000, seed: 0}}
+# loss: none      # huber | cauchy | geman-mcclure | gnc where there are gross errors
+# gauge: prior    # what data do not determine: priors fix it; keep: it stays at nominal; none
 # A column split with `test` in some rows keeps them out of the fit, to check the prediction.
 """
 
 _NO_TOLERANCE = """\
-# DECIDE how far off the nominal model may be: the robot file does not say it of all that is estimated;
-# such as tolerance: {a: 0.001, d: 0.001, alpha: 0.1, theta: 0.1}, 1 sigma in its units. Without, nothing fixes what
-# the measurements do not determine (gauge: keep, below, leaves it at nominal).
+# DECIDE how far off the nominal model may be: the robot file does not say it of all that is estimated, such as
+# tolerance: {a: 0.001, alpha: 0.1}, 1 sigma in its units. Without, nothing fixes what data do not determine.
 """
 
 _NO_TOOL = """\
@@ -256,7 +253,6 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
         units=_flow(units),
         why=f"DECIDE: {' and '.join(guessed)} guessed from the values' sizes" if guessed else "as the headers say",
         noise=_flow({**noise, "joint": 0.0, "estimate": True}),
-        target=float(f"{0.1 / factors['length']:.3g}"),
     )
 
 

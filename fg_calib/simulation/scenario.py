@@ -88,12 +88,10 @@ from typing import Annotated, Any, Literal, TypeVar, cast, dataclass_transform
 
 import numpy as np
 import pydantic
-from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import (
-    NEAR,
     PAIR_MODELS,
     POSE_MODELS,
     AngleUnit,
@@ -106,9 +104,8 @@ from fg_calib.inputs import (
     Pairing,
     as_floats,
     check,
+    check_names,
     checked,
-    did_you_mean,
-    known_names,
 )
 from fg_calib.io import (
     NOISE_UNITS,
@@ -294,11 +291,6 @@ class Placement:
     rotation: Floats
     position: Floats
 
-    def summary(self) -> dict[str, list[float]]:
-        """For programs: position, [m], and rotation."""
-        quaternion = Rotation.from_matrix(self.rotation.copy()).as_quat(canonical=True)
-        return {"xyz": self.position.tolist(), "quaternion_xyzw": quaternion.tolist()}
-
 
 def _placement(given: Any, context: FileContext) -> Placement:
     si = validate(FrameValues, given, "").si(context.units, "")
@@ -333,11 +325,6 @@ class Box:
     def __post_init__(self) -> None:
         found = f"found {self.upper.tolist()} above a lower of {self.lower.tolist()}"
         _require(bool((self.lower < self.upper).all()), "upper", found, "more than lower in x, y and z")
-
-    def holds(self, points: Floats) -> NDArray[np.bool_]:
-        """Which points, shape (n, 3), [m], are in it or on its faces, shape (n,)."""
-        inside: NDArray[np.bool_] = np.all((points >= self.lower) & (points <= self.upper), axis=1)
-        return inside
 
 
 @schema
@@ -473,7 +460,7 @@ def _the_one_of(given: Mapping[str, Any]) -> tuple[str, Any]:
     """
     found = {key: value for key, value in given.items() if value is not None}
     if len(found) != 1:
-        raise InputError("", f"found {' and '.join(found) or 'none'}", known_names(list(given)))
+        raise InputError("", f"found {' and '.join(found) or 'none'}", f"one of {', '.join(given)}")
     return next(iter(found.items()))
 
 
@@ -725,10 +712,7 @@ def values_by_name(robot: Robot, values: Mapping[str, float], place: str) -> dic
     """
     names = names_of(robot.parameters)
     kinds = sorted({kind for p in robot.parameters if (kind := tolerance_kind(p)) is not None})
-    for key in values:
-        if key not in names and key not in kinds:
-            hint = did_you_mean(key, [*kinds, *names], NEAR)
-            raise InputError(place, f"unknown parameter or kind {key!r}", known_names(kinds), hint)
+    check_names(place, values, [*kinds, *names], "parameter or kind")
     found = {p.name: values.get(p.name, values.get(tolerance_kind(p) or "")) for p in robot.parameters}
     return {name: value for name, value in found.items() if value is not None}
 

@@ -3,31 +3,514 @@
 Truth comes from forward kinematics alone; nothing here knows how a calibration works. Encoder noise moves the arm: it
 stands where the readings plus that noise say, and the table holds the readings. `measure` says what instruments
 measure; without instruments a tracker measures poses of the tool.
+
+With R, p the true tool frame in the base (where the joints stand, not their readings), n independent normal noise:
+
+| instrument | measures |
+|---|---|
+| tracker | `X (p + R t) + n`, X of its station, t the target; orientations `X R exp(n)` |
+| pairs | `abs(|p_b - p_a| + n)`, and the angle of `R_a^T R_b` plus n, reflected at 0 and 180 degrees |
+| lengths to anchors | `abs(|p - a| + offset + n)`; in contact 0, where `p = a + n` |
+| distances from planes | `normal . p - distance + n`; in contact 0, where that holds at the tool point |
+| boards | `exp(n) R^T B` and `R^T (b - p) + n`, along and about the camera's axes |
+| pixels | the image of `R^T (B c + b - p)`, or of `X (p + R c)` by a fixed camera, plus n |
+| sockets | nothing: `p = socket + n`; their distances from each other plus n |
+
+Every draw has a generator of its own, by the seed and the name of what is drawn: changing one leaves the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Brief, Floats, InputError, check_number, checked
-from fg_calib.measurements import Measurements, Table
+from fg_calib.inputs import (
+    PAIR_MODELS,
+    POSE_MODELS,
+    Booleans,
+    Brief,
+    Floats,
+    FrameKnowledge,
+    InputError,
+    Integers,
+    Pairing,
+    check_number,
+    checked,
+)
+from fg_calib.measurements import (
+    INSTRUMENTS,
+    Groups,
+    KnownPoint,
+    Labels,
+    Measurements,
+    Noise,
+    Pairs,
+    Table,
+    form_pairs,
+    no_pairs,
+)
+from fg_calib.measurements.kinds import Camera
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import Robot
-from fg_calib.simulation.measure import Measuring, Visits, choose_frame, generator_of, joint_sigma, merge_truths
+from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import (
+    BoardViews,
     Configurations,
     Errors,
     Instrument,
     Placement,
+    Plane,
     Scenario,
+    Spot,
     frame_knowledge,
+    override_noise,
     values_by_name,
 )
 from fg_calib.simulation.views import find_readings
+
+MAX_BASE_M = 5.0
+"""How far from the world's origin an unknown frame puts the base, along each axis, [m]."""
+
+Truth = Mapping[str, Mapping[str, Any]]
+"""Where landmarks truly are, by kind and name: `Spot`, `Plane`, `Placement`; offsets of instruments, [m]."""
+
+
+def generator_of(seed: int, *names: str) -> np.random.Generator:
+    """The generator of what has these names."""
+    return np.random.default_rng([seed, *"\n".join(names).encode()])
+
+
+def choose_frame(frame: Placement | str, generator: np.random.Generator) -> Placement:
+    """The frame that is given, the base itself, or one of any rotation that is drawn within `MAX_BASE_M`."""
+    if isinstance(frame, Placement):
+        return frame
+    if frame == "base":
+        return Placement(np.eye(3), np.zeros(3))
+    rotation = Rotation.from_quat(generator.normal(size=4)).as_matrix()  # any rotation as likely as any other
+    return Placement(rotation, generator.uniform(-MAX_BASE_M, MAX_BASE_M, 3))
+
+
+def joint_sigma(noise: Noise, robot: Robot) -> Floats:
+    """Sigma of the readings, shape (n_joints,), [rad] (prismatic: [m])."""
+    return np.broadcast_to(np.asarray(noise.joint, dtype=np.float64), robot.n_joints).copy()
+
+
+class Visits(NamedTuple):
+    """Configurations that the arm was sent to.
+
+    Attributes:
+        readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+        true_readings: Where the joints stood, of the same shape.
+        ids: Name of each, shape (n,).
+        test: Which are for test rows, shape (n,).
+    """
+
+    readings: Floats
+    true_readings: Floats
+    ids: NDArray[np.str_]
+    test: Booleans
+
+    def select(self, rows: Integers | Booleans) -> Visits:
+        """Some of them."""
+        values: list[Any] = [values[rows] for values in self]
+        return Visits(*values)
+
+    @staticmethod
+    def joined(parts: Sequence[Visits]) -> Visits:
+        """Visits one after the other."""
+        values: list[Any] = [np.concatenate(values) for values in zip(*parts, strict=True)]
+        return Visits(*values)
+
+
+@dataclass
+class Measuring:
+    """One instrument at work.
+
+    Attributes:
+        scenario: What is simulated.
+        instrument: The instrument.
+        true_robot: The robot that moves.
+        visits: Where it was sent.
+        frame: world_T_base.
+        seed: Seed of all draws.
+        exact: Whether measurements and known points have no errors.
+    """
+
+    scenario: Scenario
+    instrument: Instrument
+    true_robot: Robot
+    visits: Visits
+    frame: Placement
+    seed: int
+    exact: bool
+
+    def __post_init__(self) -> None:
+        self.name, self.model, self.n = self.instrument.name, self.instrument.model, len(self.visits.ids)
+        self.place = f"{self.scenario.source}: instruments: {self.name}"
+        self.places = self.generator("places")
+        self.noises = override_noise(self.scenario.noise, self.instrument.noise)
+        self.sigmas = override_noise(self.noises, self.scenario.stated_noise)
+
+    def measure(self) -> tuple[Table, Truth]:
+        """Measure: a table, and where landmarks truly are.
+
+        Raises:
+            InputError: A value of the noise is missing, nothing is seen, or no point is reached.
+        """
+        if self.instrument.sockets is not None:
+            return self.contacts()
+        if self.instrument.pairs is not None:
+            return self.pairs()
+        methods = dict.fromkeys((*POSE_MODELS, *PAIR_MODELS), self.poses)
+        methods |= {"anchor": self.lengths, "plane": self.distances, "board": self.boards, "pixels": self.pixels}
+        return methods.get(self.model, self.plain)()
+
+    # --- for all instruments ---
+
+    def generator(self, *names: str) -> np.random.Generator:
+        """The generator of something of this instrument."""
+        return generator_of(self.seed, self.name, *names)
+
+    def at(self) -> Poses:
+        """True poses of the tool."""
+        return pose(self.true_robot, self.visits.true_readings)
+
+    def noise(self, kind: str, *shape: int) -> Floats:
+        """Noise of a kind: standard normal numbers times sigma, so that another sigma scales the same noise."""
+        sigma = 0.0 if self.exact else self._value(self.noises, kind)
+        return sigma * self.generator("noise", kind).normal(size=shape)
+
+    def sigma(self, kind: str, *shape: int) -> Floats:
+        """The sigma of a kind that the calibration is given.
+
+        Raises:
+            InputError: It is 0.
+        """
+        sigma = self._value(self.sigmas, kind)
+        if sigma == 0.0:
+            hint = f"a calibration takes nothing for exact: specify what to assume under job: noise: {kind}"
+            raise InputError(f"{self.place}: noise: {kind}", "found 0", "a number above 0", hint)
+        return np.full(shape, sigma)
+
+    def _value(self, noise: Noise, kind: str) -> float:
+        value = noise.get(kind)
+        if value is None:
+            raise InputError(f"{self.place}: noise: {kind}", "found none", f"1 sigma, for model {self.model}")
+        return float(value)
+
+    def rows(self, k: Integers | None = None, **measured: Any) -> Measurements:
+        """Measurements at the configurations, or at those that rows are of."""
+        visits = self.visits if k is None else self.visits.select(k)
+        nothing: dict[str, Any] = dict.fromkeys(("position", "rotation", "sigma_position", "sigma_orientation"))
+        return Measurements(
+            readings=visits.readings,
+            ids=visits.ids,
+            test=visits.test,
+            sigma_joint=joint_sigma(self.scenario.stated_noise or self.scenario.noise, self.scenario.robot),
+            source=f"{self.name}.csv",
+            named=True,
+            **nothing | measured,
+        )
+
+    def nominal(self) -> Poses:
+        """Nominal poses of the tool at the train configurations."""
+        return pose(self.scenario.robot, self.visits.readings[~self.visits.test])
+
+    def workspace(self) -> tuple[Floats, float]:
+        """Middle and radius of the nominal tool points, [m]."""
+        points = self.nominal().position
+        middle = points.mean(axis=0)
+        return middle, max(float(np.sqrt(np.mean(np.sum((points - middle) ** 2, axis=1)))), 1e-3)
+
+    def directions(self, n: int) -> Floats:
+        """Unit vectors in any direction, shape (n, 3)."""
+        v = self.places.normal(size=(n, 3))
+        unit: Floats = v / np.linalg.norm(v, axis=1, keepdims=True)
+        return unit
+
+    def named(self, what: str, places: Sequence[Any]) -> dict[str, Any]:
+        """Landmarks that are drawn, by names that no other instrument has."""
+        stem = self.name if what in self.name else f"{self.name} {what}"
+        return {f"{stem} {i + 1}": place for i, place in enumerate(places)}
+
+    def spots(self, given: Mapping[str, Spot] | int, what: str, *, within_reach: bool) -> Mapping[str, Spot]:
+        """Points by name, drawn where there is only a number of them."""
+        if isinstance(given, Mapping):
+            return given
+        if within_reach:  # half of the train configurations: those from which the arm moves best
+            at = self.nominal()
+            slowest = np.linalg.svd(at.jacobian[:, 3:, -self.scenario.robot.n_joints :], compute_uv=False)[:, -1]
+            inside = at.position[slowest >= np.median(slowest)]
+            places = inside[self.places.choice(len(inside), given, replace=given > len(inside))]
+        else:
+            middle, radius = self.workspace()
+            places = middle + radius * self.places.uniform(0.5, 1.5, (given, 1)) * self.directions(given)
+        return self.named(what, [Spot(p) for p in places])
+
+    def known(self, spots: Mapping[str, Spot]) -> dict[str, KnownPoint]:
+        """What the calibration knows of points: they are off by their tolerances."""
+        found = {}
+        for name, spot in spots.items():
+            if spot.tolerance is not None:
+                off = (0.0 if self.exact else spot.tolerance) * generator_of(self.seed, "known", name).normal(size=3)
+                found[name] = KnownPoint(spot.xyz + off, spot.tolerance or None)
+        return found
+
+    def touch(self, points: Floats, n_starts: int = N_STARTS) -> Booleans:
+        """Move the arm from each configuration until the tool point is at a point; which are reached, shape (n,).
+
+        Others are left out. The table holds the reading, so the encoders' error is subtracted from where the joints
+        then stand.
+
+        Raises:
+            InputError: None is reached.
+        """
+        v, generator = self.visits, self.generator("touch")
+        found = solve_inverse(self.true_robot, points, near=v.true_readings, generator=generator, n_starts=n_starts)
+        if not found.reached[~v.test].any():
+            missed = f"nothing is reached from {np.sum(~v.test)} configurations"
+            raise InputError(self.place, missed, "points within the joint limits")
+        readings = np.clip(found.readings - (v.true_readings - v.readings), *self.scenario.robot.limits.T)
+        ids = np.array([f"{self.name} {i}" for i in v.ids])
+        self.visits = Visits(readings, found.readings, ids, v.test).select(found.reached)
+        return found.reached
+
+    # --- one instrument after the other ---
+
+    def poses(self) -> tuple[Table, Truth]:
+        """Poses of the tool, or positions of targets on it."""
+        i, n = self.instrument, self.n
+        rotated, placed = POSE_MODELS[self.model] if self.model in POSE_MODELS else PAIR_MODELS[self.model][::-1]
+        targets = i.targets or {}
+        if not isinstance(targets, Mapping):
+            away = 0.1 * self.workspace()[1] * self.directions(targets)
+            targets = self.named("target", [Spot(p) for p in away])
+        n_targets = max(1, len(targets))
+        k, which = np.repeat(np.arange(n), n_targets), np.tile(np.arange(n_targets), n)
+        first = self.frame if i.frame is None else choose_frame(i.frame, self.places)
+        frames = [first, *(choose_frame("unknown", self.places) for _ in range(i.stations - 1))]
+        station = k % i.stations
+        X = np.array([f.rotation for f in frames])[station]
+        at, labels, measured = self.at(), dict[str, Labels](), dict[str, Any]()
+        R = at.rotation[k]
+        if placed:
+            t = np.array([s.xyz for s in targets.values()])[which] if targets else np.zeros((len(k), 3))
+            points = at.position[k] + np.einsum("nij,nj->ni", R, t)
+            seen = np.einsum("nij,nj->ni", X, points) + np.array([f.position for f in frames])[station]
+            measured["position"] = seen + self.noise("position", len(k), 3)
+            measured["sigma_position"] = self.sigma("position", len(k), 3)
+        if rotated:
+            noise = Rotation.from_rotvec(self.noise("orientation", len(k), 3)).as_matrix()
+            measured["rotation"] = X @ R @ noise
+            measured["sigma_orientation"] = self.sigma("orientation", len(k), 3)
+        if targets:
+            labels["target"] = Labels(tuple(targets), which)
+        names = [self.name]
+        if i.stations > 1:
+            names = [f"{self.name}, station s{s + 1}" for s in range(i.stations)]
+            labels["station"] = Labels(tuple(f"s{s + 1}" for s in range(i.stations)), station)
+        known = self.model in PAIR_MODELS or frame_knowledge(i.frame or self.scenario.frame) == "known"
+        frame: FrameKnowledge = "known" if known else "unknown"
+        table = Table(
+            self.rows(k, labels=labels, **measured),
+            self.model,
+            i.pairing or Pairing(),
+            frame,
+            known=self.known(targets),
+        )
+        return table, {"targets": targets, "frames": dict(zip(names, frames, strict=True))}
+
+    def plain(self) -> tuple[Table, Truth]:
+        """Columns that the model alone has."""
+        model = INSTRUMENTS[self.model]
+        exact = model.predict(self.rows(), self.at(), lambda kind, name: np.zeros(kind.size))
+        columns = {name: exact.columns[name] + self.noise(name, self.n) for name in model.generic_columns}
+        sigmas = {name: self.sigma(name, self.n) for name in model.generic_columns}
+        return Table(replace(exact, columns=columns, sigmas=sigmas), self.model), {}
+
+    def pairs(self) -> tuple[Table, Truth]:
+        """Distances and angles between configurations."""
+        at, (distances, angles) = self.at(), PAIR_MODELS[self.model]
+        assert self.instrument.pairs is not None
+        true = form_pairs(self.rows(position=at.position, rotation=at.rotation), self.instrument.pairs)
+        n = true.n_pairs
+        found: dict[str, Any] = dict.fromkeys(
+            ("distance", "angle", "sigma_distance", "sigma_angle"), np.full(n, np.nan)
+        )
+        if distances:
+            found["distance"] = np.abs(true.distance + self.noise("distance", n))
+            found["sigma_distance"] = self.sigma("distance", n)
+        if angles:
+            found["angle"] = np.pi - np.abs(np.pi - np.abs(true.angle + self.noise("angle", n)))
+            found["sigma_angle"] = self.sigma("angle", n)
+        pairs = replace(true, source=f"{self.name}_pairs.csv", **found)
+        return Table(self.rows(pairs=pairs), self.model), {}
+
+    def lengths(self) -> tuple[Table, Truth]:
+        """Lengths to anchors."""
+        i, n = self.instrument, self.n
+        anchors = self.spots(3 if i.anchors is None else i.anchors, "anchor", within_reach=i.contact)
+        which = np.arange(n) % len(anchors)
+        places = np.array([a.xyz for a in anchors.values()])[which]
+        if i.contact:
+            which = which[self.touch(places + self.noise("distance", n, 3))]
+            length = np.zeros(len(which))
+        else:
+            length = np.linalg.norm(self.at().position - places, axis=1)
+            length = np.abs(length + (i.offset or 0.0) + self.noise("distance", n))
+        labels = {"anchor": Labels(tuple(anchors), which)}
+        m = self.rows(labels=labels, length=length, sigma_length=self.sigma("distance", len(which)))
+        table = Table(m, "anchor", known=self.known(anchors), offset=i.offset is not None)
+        return table, {"anchors": anchors, "offsets": {} if i.offset is None else {self.name: i.offset}}
+
+    def distances(self) -> tuple[Table, Truth]:
+        """Distances from planes."""
+        i = self.instrument
+        planes = i.planes if isinstance(i.planes, Mapping) else self._draw_planes(3 if i.planes is None else i.planes)
+        which, at = np.arange(self.n) % len(planes), self.at().position
+        normal = np.array([p.normal for p in planes.values()])[which]
+        distance = np.array([p.distance for p in planes.values()])[which]
+        above = np.einsum("ni,ni->n", normal, at) - distance + self.noise("distance", self.n)
+        if i.contact:
+            which = which[self.touch(at - above[:, None] * normal, n_starts=3)]
+        labels, sigma = {"plane": Labels(tuple(planes), which)}, self.sigma("distance", len(which))
+        m = self.rows(labels=labels, length=None if i.contact else above, sigma_length=sigma)
+        return Table(m, "plane"), {"planes": planes}
+
+    def _draw_planes(self, n: int) -> Mapping[str, Plane]:
+        """Planes through the workspace, the first three orthogonal."""
+        middle, radius = self.workspace()
+        normals = [*Rotation.from_quat(self.places.normal(size=4)).as_matrix(), *self.directions(max(0, n - 3))][:n]
+        away = radius * self.places.uniform(-0.5, 0.5, n)
+        return self.named("plane", [Plane(v, float(v @ middle + d)) for v, d in zip(normals, away, strict=True)])
+
+    def contacts(self) -> tuple[Table, Truth]:
+        """Contacts with points, and distances between these."""
+        sockets = self.spots(self.instrument.sockets or {}, "socket", within_reach=True)
+        which, places = np.arange(self.n) % len(sockets), np.array([s.xyz for s in sockets.values()])
+        which = which[self.touch(places[which] + self.noise("point", self.n, 3))]
+        pairs = no_pairs(f"{self.name}.csv")
+        if len(sockets) > 1:
+            a, b = np.triu_indices(len(sockets), 1)
+            d = np.linalg.norm(places[b] - places[a], axis=1) + self.noise("distance", len(a))
+            unmeasured, fitted = np.full(len(a), np.nan), np.zeros(len(a), dtype=np.bool_)
+            sigma, source = self.sigma("distance", len(a)), f"{self.name}_pairs.csv"
+            pairs = Pairs(a, b, np.abs(d), unmeasured, sigma, unmeasured, fitted, source)
+        m = self.rows(groups=Groups(tuple(sockets), which, pairs), sigma_point=self.sigma("point", len(which)))
+        return Table(m, "distance"), {"sockets": sockets}
+
+    def boards(self) -> tuple[Table, Truth]:
+        """Poses of boards in the camera's frame."""
+        boards, R, b, faced = self._boards_in_camera()
+        k, which = np.nonzero((b[:, :, 2] > 0.0) & faced)
+        self._require_seen(k)
+        n = len(k)
+        m = self.rows(
+            k,
+            labels={"board": Labels(tuple(boards), which)},
+            rotation=Rotation.from_rotvec(self.noise("orientation", n, 3)).as_matrix() @ R[k, which],
+            position=b[k, which] + self.noise("position", n, 3),
+            sigma_orientation=self.sigma("orientation", n, 3),
+            sigma_position=self.sigma("position", n, 3),
+        )
+        return Table(m, "board"), {"boards": boards}
+
+    def pixels(self) -> tuple[Table, Truth]:
+        """Images of the corners of boards that a camera on the tool sees, or of one on the tool."""
+        i, (boards, R, b, faced) = self.instrument, self._boards_in_camera()
+        assert i.camera is not None
+        assert i.corners is not None
+        points = b[:, :, None] + np.einsum("nkij,cj->nkci", R[:, :, :, :2], i.corners)
+        image = i.camera.image(points.reshape(-1, 3))[0].reshape(*points.shape[:3], 2)
+        k, which, corner = np.nonzero(_in_image(i.camera, points, image) & faced[:, :, None])
+        self._require_seen(k)
+        m = self.rows(
+            k,
+            labels={} if i.fixed else {"board": Labels(tuple(boards), which)},
+            image=np.hstack([image[k, which, corner] + self.noise("pixel", len(k), 2), i.corners[corner]]),
+            sigma_pixel=self.sigma("pixel", len(k), 2),
+        )
+        frame: FrameKnowledge = "unknown" if i.fixed else "known"
+        table = Table(m, "pixels", frame=frame, camera=i.camera, fixed_camera=i.fixed)
+        return table, {"frames" if i.fixed else "boards": boards}
+
+    def _boards_in_camera(self) -> tuple[Mapping[str, Placement], Floats, Floats, Booleans]:
+        """The boards, or the frame of a fixed camera; where boards are in the camera's frame, and which it faces.
+
+        Returns:
+            base_T_board or camera_T_base by name; camera_R_board, shape (n, n_boards, 3, 3); camera_p_board, shape
+            (n, n_boards, 3), [m]; whether the camera is on the visible side, shape (n, n_boards).
+
+        Raises:
+            InputError: There are no boards.
+        """
+        i, at = self.instrument, self.at()
+        views = i.configurations or self.scenario.configurations
+        if i.fixed:
+            X = i.frame if isinstance(i.frame, Placement) else self._looking_in()
+            boards: Mapping[str, Placement] = {self.name: X}
+            R, b = (X.rotation @ at.rotation)[:, None], (at.position @ X.rotation.T + X.position)[:, None]
+        elif i.boards or isinstance(views, BoardViews):
+            boards = i.boards or {"board": views.board}  # type: ignore[union-attr]
+            R_T, B = np.swapaxes(at.rotation, 1, 2)[:, None], np.array([one.rotation for one in boards.values()])
+            step = np.array([one.position for one in boards.values()]) - at.position[:, None]
+            R, b = R_T @ B, (R_T @ step[..., None])[..., 0]
+        else:
+            raise InputError(f"{self.place}: boards", "found none", "boards by name, or configurations: {board: ...}")
+        side = np.array([-1.0 if name in i.from_behind else 1.0 for name in boards])
+        return boards, R, b, side * np.einsum("nki,nki->nk", R[:, :, :, 2], b) < 0.0
+
+    def _require_seen(self, k: Integers) -> None:
+        if self.visits.test[k].all():
+            found = f"sees no board at any of {np.sum(~self.visits.test)} configurations"
+            raise InputError(self.place, found, hint="configurations: {board: ...} have the camera look at one")
+
+    def _looking_in(self) -> Placement:
+        """camera_T_base of a camera that looks at the workspace's middle from outside."""
+        middle, radius = self.workspace()
+        ahead = -self.directions(1)[0]
+        y = np.linalg.svd(ahead[None])[2][1]  # orthogonal to ahead
+        base_R_camera = np.stack([np.cross(y, ahead), y, ahead], axis=1)
+        return Placement(base_R_camera.T, -base_R_camera.T @ (middle - 2.5 * radius * ahead))
+
+
+def _in_image(camera: Camera, points: Floats, image: Floats) -> Booleans:
+    """Whether points in the camera's frame, shape (..., 3), are in front of it and in its image, shape (..., 2).
+
+    The distortion's polynomial is not monotonic far from the axis, and would bring into the image what is far outside.
+    """
+    ahead = points[..., 2] > 0.0
+    within = np.all((image >= 0.0) & (image <= [2.0 * camera.cx, 2.0 * camera.cy]), axis=-1)
+    z = np.where(ahead, points[..., 2], 1.0)
+    square = np.sum((points[..., :2] / z[..., None]) ** 2, axis=-1)  # of r, which must grow all the way to the point
+    s = square[..., None] * np.linspace(0.1, 1.0, 10)
+    growing = 1.0 + s * (3.0 * camera.k1 + s * (5.0 * camera.k2 + s * 7.0 * camera.k3)) > 0.0
+    seen: Booleans = ahead & within & growing.all(axis=-1)
+    return seen
+
+
+def merge_truths(tables: list[Table], truths: list[Truth], source: str) -> tuple[tuple[Table, ...], Truth]:
+    """Tables that know the same of points of one name, and all truths together.
+
+    Raises:
+        InputError: Landmarks of one kind and name are at different places.
+    """
+    every: dict[str, dict[str, Any]] = {}
+    other: Any
+    for kind, name, landmark in ((k, n, one) for t in truths for k, found in t.items() for n, one in found.items()):
+        other = every.setdefault(kind, {}).setdefault(name, landmark)
+        if other is not landmark and not all(map(np.array_equal, astuple(other), astuple(landmark))):
+            raise InputError(f"{source}: instruments: {kind}: {name}", "at two places", "one, or other names")
+    known: dict[bool, dict[str, KnownPoint]] = {True: {}, False: {}}
+    for table in tables:
+        known[table.model == "anchor"] |= table.known
+    takes = [t.model == "anchor" or t.model in POSE_MODELS for t in tables]
+    shared = (replace(t, known=known[t.model == "anchor"]) if one else t for t, one in zip(tables, takes, strict=True))
+    return tuple(shared), {kind: landmarks for kind, landmarks in every.items() if landmarks}
 
 
 @dataclass(frozen=True)
@@ -75,23 +558,19 @@ class Simulation(Brief):
     def summary(self) -> dict[str, Any]:
         """Seed, numbers of rows and truth, for programs: errors and frame in [m] and [rad]."""
         n_train, n_test = (self.n_configurations(test=test) for test in (False, True))
-        errors = self.true_robot.nominal - self.robot.nominal
-        found = {
-            "scenario": self.scenario.name,
-            "seed": self.seed,
-            "n_configurations": n_train + n_test,
-            "n_train": n_train,
-            "n_test": n_test,
-            "truth": {
-                "errors": {p.name: float(e) for p, e in zip(self.robot.parameters, errors, strict=True) if e != 0.0},
-                "world_T_base": self.frame.summary(),
-            },
+        errors = zip(self.robot.parameters, self.true_robot.nominal - self.robot.nominal, strict=True)
+        quaternion = Rotation.from_matrix(self.frame.rotation.copy()).as_quat(canonical=True).tolist()
+        truth = {
+            "errors": {p.name: float(error) for p, error in errors if error != 0.0},
+            "world_T_base": {"xyz": self.frame.position.tolist(), "quaternion_xyzw": quaternion},
         }
+        counts = {"n_configurations": n_train + n_test, "n_train": n_train, "n_test": n_test}
+        found = {"scenario": self.scenario.name, "seed": self.seed, **counts, "truth": truth}
         if self.scenario.instruments:
-            rows = [(t, t.measurements.source, int(np.sum(t.measurements.test))) for t in self.tables]
+            rows = [(t, t.measurements.source, t.measurements.test) for t in self.tables]
             found["tables"] = [
-                {"table": name, "model": t.model, "n_train": len(t.measurements.test) - n, "n_test": n}
-                for t, name, n in rows
+                {"table": name, "model": t.model, "n_train": int(np.sum(~test)), "n_test": int(np.sum(test))}
+                for t, name, test in rows
             ]
         return found
 

@@ -40,7 +40,7 @@ MAX_DRAWN_IN_VAIN = 1000
 """Without finding any, no more are drawn."""
 
 DRAWN_MORE = 50
-"""How many times more, of both, where a reflector cannot be rotated: drawing alone is fast."""
+"""How many times more, of both, for trackers: no inverse kinematics is needed."""
 
 MAX_DRAWN_AT_ONCE = 16_384
 """Most that are drawn at once, for memory."""
@@ -48,9 +48,6 @@ MAX_DRAWN_AT_ONCE = 16_384
 N_STARTS, N_STEPS = 4, 20
 """Starts of the inverse kinematics for each view of a board, and steps from each: most of the time is spent on poses
 that no start reaches."""
-
-N_STARTS_ROTATED = 2
-"""Starts for each rotated reflector: the first is at its place already."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,7 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
         InputError: Self-motion is to be held, and the first view of a board is not reached.
     """
     draw = _draw(robot, of, generator, place)
-    patience = DRAWN_MORE if isinstance(of, TargetViews) and not _can_be_rotated(robot) else 1
+    patience = DRAWN_MORE if isinstance(of, TargetViews) else 1
     most, hopeless = MAX_DRAWN_EACH * patience * n, MAX_DRAWN_IN_VAIN * patience
     if isinstance(of, GivenReadings):
         most = hopeless = len(of.readings)
@@ -160,7 +157,8 @@ def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, plac
         rotation, position = rotation[-k:], position[-k:]
         first = False
         seen = sees_board(views, rotation, position)
-        found = _reach(robot, rotation[seen], position[seen], near, N_STARTS, generator)
+        R, p = rotation[seen], position[seen]
+        found = solve_inverse(robot, p, R, near=near, generator=generator, n_starts=N_STARTS, n_steps=N_STEPS)
         readings, reason = np.zeros((k, robot.n_joints)), np.where(seen, "", "not seen").astype(WORD)
         readings[seen], reason[seen] = found.readings, np.where(found.reached, "", "out of reach")
         return readings, reason
@@ -169,45 +167,19 @@ def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, plac
 
 
 def _target(robot: Robot, views: TargetViews, generator: np.random.Generator, k: int) -> tuple[Floats, Words]:
-    """Configurations in which a tracker sees a reflector."""
-    starts, places, turns, further = generator.spawn(4)
-    readings, near = random_readings(robot, k, starts), True
+    """Configurations, and why a tracker does not see the reflector in each."""
+    readings = random_readings(robot, k, generator)
     at = forward(build_chain(robot).without_columns(), robot.trig(readings))
-    target, region = at.position + at.rotation @ views.target, views.region
-    faced = faces(views, at.rotation, target)
+    target = at.position + at.rotation @ views.target
+    towards, axis = views.station - target, at.rotation @ (views.axis / np.linalg.norm(views.axis))
+    away = np.linalg.norm(towards, axis=1)
     reason = np.full(k, "", dtype=WORD)
-    if region is not None and _can_be_rotated(robot):
-        target, faced, near = places.uniform(region.lower, region.upper, (k, 3)), np.zeros(k, dtype=np.bool_), False
-    elif region is not None:
-        reason[~region.holds(target)] = "outside the region"
-    away = np.linalg.norm(views.station - target, axis=1)
-    beyond = (away < views.distance[0]) | (away > views.distance[1]) | (away == 0.0)
-    reason[beyond & (reason == "")] = "out of range"
-    rest = (reason == "") & ~faced
-    if not _can_be_rotated(robot):
-        reason[rest] = "not seen"
-        return readings, reason
-    rotation, position = aim(views, target[rest], turns)
-    found = _reach(robot, rotation, position, readings[rest] if near else None, N_STARTS_ROTATED, further)
-    readings[rest], reason[rest] = found.readings, np.where(found.reached, "", "out of reach")
+    reason[np.sum(towards * axis, axis=1) < np.cos(views.acceptance) * away] = "not seen"
+    reason[(away < views.distance[0]) | (away > views.distance[1]) | (away == 0.0)] = "out of range"
+    if views.region is not None:
+        inside = (target >= views.region.lower) & (target <= views.region.upper)
+        reason[~inside.all(axis=1)] = "outside the region"
     return readings, reason
-
-
-def _can_be_rotated(robot: Robot) -> bool:
-    """Whether an arm may bring its tool to a place with any rotation."""
-    return robot.n_joints >= 6
-
-
-def _reach(
-    robot: Robot,
-    rotation: Floats,
-    position: Floats,
-    near: Floats | None,
-    n_starts: int,
-    generator: np.random.Generator,
-) -> Inverse:
-    """Configurations for poses, the inverse kinematics giving up early."""
-    return solve_inverse(robot, position, rotation, near=near, generator=generator, n_starts=n_starts, n_steps=N_STEPS)
 
 
 def _near(taken: Floats, readings: Floats, apart: float | None) -> Booleans:
@@ -284,56 +256,10 @@ def sees_board(views: BoardViews, rotation: Floats, position: Floats) -> Boolean
     return inside
 
 
-def aim(views: TargetViews, target: Floats, generator: np.random.Generator) -> tuple[Floats, Floats]:
-    """Poses of the tool with the reflector in given places, turned towards the tracker.
-
-    Args:
-        views: Where the tracker is, and what it sees.
-        target: Places of the reflector, shape (n, 3), [m].
-        generator: Draws how the reflector is turned.
-
-    Returns:
-        base_R_tool, shape (n, 3, 3), and base_p_tool, shape (n, 3), [m].
-    """
-    n = len(target)
-    tilts, rolls = generator.spawn(2)
-    cosine, azimuth = _in_cone(tilts, n, views.acceptance)
-    towards = views.station - target
-    axis = _frames(towards) @ _directions(cosine, azimuth)[:, :, None]  # (n, 3, 1)
-    roll = rolls.uniform(-np.pi, np.pi, n)
-    c, s, zero = np.cos(roll), np.sin(roll), np.zeros(n)
-    about_z = np.stack([c, -s, zero, s, c, zero, zero, zero, zero + 1.0], axis=1).reshape(n, 3, 3)
-    rotation = _frames(axis[:, :, 0]) @ about_z @ _frames(views.axis[None])[0].T
-    return rotation, target - rotation @ views.target
-
-
-def faces(views: TargetViews, rotation: Floats, target: Floats) -> Booleans:
-    """Whether the tracker is within the reflector's acceptance, shape (n,).
-
-    Args:
-        views: Where the tracker is, and what it sees.
-        rotation: base_R_tool, shape (n, 3, 3).
-        target: Places of the reflector, shape (n, 3), [m].
-    """
-    towards, axis = views.station - target, views.axis / np.linalg.norm(views.axis)
-    along = np.einsum("ni,nij,j->n", towards, rotation, axis)
-    within: Booleans = along >= np.cos(views.acceptance) * np.linalg.norm(towards, axis=1)
-    return within
-
-
 def _in_cone(generator: np.random.Generator, n: int, half_angle: float) -> tuple[Floats, Floats]:
     """Cosine of the angle to the axis of a cone, and azimuth, of directions spread evenly in it, shapes (n,)."""
     drawn = generator.uniform(size=(n, 2))
     return 1.0 - drawn[:, 0] * (1.0 - np.cos(half_angle)), 2.0 * np.pi * drawn[:, 1]
-
-
-def _frames(z: Floats) -> Floats:
-    """Rotations whose third columns point along vectors, shape (n, 3, 3)."""
-    z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    least = np.eye(3)[np.argmin(np.abs(z), axis=1)]  # the coordinate axis most across each
-    x = np.cross(least, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=2)
 
 
 def _half_sphere(n: int) -> Floats:

@@ -12,8 +12,7 @@ from boards import CAMERA, SIZE, render, views
 from scipy.spatial.transform import Rotation
 
 from fg_calib.importers import board as images
-from fg_calib.importers.board import CalibrationBoard
-from fg_calib.importers.opencv import load_opencv
+from fg_calib.importers.board import CalibrationBoard, load_opencv
 from fg_calib.io.job import read_camera
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")

@@ -10,8 +10,7 @@ from scipy.stats import chi2
 from sparing import diagonal
 
 from fg_calib import InputError, Robot, Table, calibrate
-from fg_calib.importers.bag import read_bag
-from fg_calib.importers.standstill import average_stops, write_stops
+from fg_calib.importers.bag import average_stops, read_bag, write_stops
 from fg_calib.io import read_measurements, write_robot
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")

@@ -5,7 +5,7 @@ import pytest
 from boards import CAMERA, render
 from scipy.spatial.transform import Rotation
 
-from fg_calib.importers.opencv import CalibrationBoard, charuco_board, find_corners, in_order
+from fg_calib.importers.board import CalibrationBoard, charuco_board, find_corners, in_order
 from fg_calib.inputs import InputError
 
 pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")

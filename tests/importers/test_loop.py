@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from simulated import true_robot
 
 from fg_calib.calibration import calibrate_job
-from fg_calib.importers.opencv import CalibrationBoard
+from fg_calib.importers.board import CalibrationBoard
 from fg_calib.io.columns import write_csv
 from fg_calib.robot.inverse import solve_inverse
 

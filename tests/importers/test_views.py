@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 from tolerances import sigmas_apart
 
-from fg_calib.importers.opencv import CalibrationBoard, camera_derivatives
-from fg_calib.importers.views import INTRINSICS, Corners, fit_board
+from fg_calib.importers.board import INTRINSICS, CalibrationBoard, Corners, camera_derivatives, fit_board
 from fg_calib.inputs import InputError
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds import Camera

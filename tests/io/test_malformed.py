@@ -190,7 +190,7 @@ SCENARIOS = [
     (s("robot.yaml","nowhere.yaml"), '{folder}/nowhere.yaml: no such file'),
     (s("{uniform: {a: 0.01}}","{normal: tolerance}"), 'scenario.yaml: errors: normal: a1 of the robot has no tolerance, expected one for all that is estimated'),
     (s("{a: 0.01}","{a: 0,01}"), "scenario.yaml:2: key '01', expected a word; is it a decimal comma? numbers have a decimal point"),
-    (s("{a: 0.01}","{A: 1}"), "scenario.yaml: errors: uniform: unknown parameter or kind 'A', expected one of a, alpha, base, d, theta, tool; did you mean a?"),
+    (s("{a: 0.01}","{A: 1}"), "scenario.yaml: errors: uniform: unknown parameter or kind 'A', expected one of a, alpha, base, d, theta, tool ..."),
     (s("uniform: {a: 0.01}","normal: 0.1"), 'scenario.yaml: errors: normal: found 0.1, expected a mapping'),
     (s("uniform: {a: 0.01}","gaussian: {a: 1}"), "scenario.yaml: errors: unknown key 'gaussian', expected one of uniform, normal, values"),
     (s("count: 3","count: 1000000000"), 'scenario.yaml: configurations: random: count: found 1000000000, expected a number not above 1e+06'),

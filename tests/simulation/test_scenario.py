@@ -234,7 +234,8 @@ MISTAKES = [
      "errors: found uniform and values, expected one of uniform, normal, values"),
     (replaced("a: 0.01", "a: -1"), "errors: uniform: a: found -1, expected a number not below 0"),
     (replaced("uniform: {a: 0.01}", "values: {b2: 1}"),
-     "errors: values: unknown parameter or kind 'b2', expected one of a, alpha, base, d, theta, tool"),
+     "errors: values: unknown parameter or kind 'b2', expected one of a, alpha, base, d, theta, tool, base.x, base.y, "
+     "base.z, base.yaw, base.pitch, base.roll, ..."),
     (replaced("{random: {count: 3}}", "{}"),
      "configurations: found none, expected one of board, tracker, random, table"),
     (replaced("count: 3", "n: 3"),
