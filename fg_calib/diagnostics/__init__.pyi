@@ -1,5 +1,4 @@
 from .inspection import Inspection, inspect_job
-from .linearity import NEAR_SIGMAS
 from .nominal_residuals import MAX_ROWS, Disagreements
 from .setup_check import SetupCheck, check_setup, check_tables, reporting
 from .unmodelled_effects import basis_of
@@ -9,7 +8,6 @@ __all__ = [
     "LIKE_NOISE",
     "MAX_ROWS",
     "MOST_ESTIMATED",
-    "NEAR_SIGMAS",
     "Disagreements",
     "Inspection",
     "SetupCheck",

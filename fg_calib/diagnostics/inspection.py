@@ -84,7 +84,6 @@ class TableSurvey:
         copy: Two that are the same; empty without.
         n_repeats: Those at the readings of one before them, with other values: they show the noise.
         n_leaked: Test rows at, or within `NEAR` of, a configuration of train rows.
-        n_near_singular: Train pairs within `linearity.NEAR_SIGMAS` of 0 or, an angle, of 180 degrees.
         n_ambiguous: Train pairs whose sign is ambiguous within the prior sigmas.
     """
 
@@ -101,7 +100,6 @@ class TableSurvey:
     copy: str
     n_repeats: int
     n_leaked: int
-    n_near_singular: int
     n_ambiguous: int
 
 
@@ -216,7 +214,6 @@ def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
         copy=copy,
         n_repeats=repeats,
         n_leaked=_n_leaked(m),
-        n_near_singular=pairs.n_near,
         n_ambiguous=len(set(pairs.names)),
     )
 

@@ -30,9 +30,6 @@ NEGLIGIBLE, NONLINEAR = 1e-3, 0.1
 N_DRAWS = 8
 """Draws of d: sums of all determined directions, each a sigma one way or the other."""
 
-NEAR_SIGMAS = 5.0
-"""Noise sigmas from 0, or of an angle from 180 degrees, within which the sign of noise matters."""
-
 
 @dataclass(frozen=True)
 class Nonlinearity:
@@ -71,9 +68,8 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
                 break
     except SolverError:
         return Nonlinearity(np.inf)
-    return Nonlinearity(
-        float(squares), _nonlinear_rows(problem, [solution.parameters, *there]) if squares >= NONLINEAR else ()
-    )
+    curved = squares >= NONLINEAR
+    return Nonlinearity(float(squares), _nonlinear_rows(problem, [solution.parameters, *there]) if curved else ())
 
 
 def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:
@@ -94,13 +90,11 @@ class AmbiguousRows:
 
     Attributes:
         n_rows: Train lengths and angles that were looked at.
-        n_near: Pairs within `NEAR_SIGMAS` of their noise from 0 or 180 degrees.
         names: Names of the ambiguous ones, `5-17`.
         share: Part of the determined directions that rests on these (sum of leverage over rank).
     """
 
     n_rows: int = 0
-    n_near: int = 0
     names: tuple[str, ...] = ()
     share: float = 0.0
 
@@ -116,7 +110,7 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
     """
     problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
-    n_rows, n_near, names, share = 0, 0, list[str](), 0.0
+    n_rows, names, share = 0, list[str](), 0.0
     if not problem.pair_series:
         return AmbiguousRows()
     for noise in (noise for noise in solution.noises if len(noise.series.train)):
@@ -127,7 +121,7 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
         end = forward(at.chains[s.table], problem.data.trigs(problem.robot)[s.table], s.ends[rows].ravel())
         R = end.rotation.reshape(-1, 2, 3, 3)
         moved = np.diff(end.jacobian.reshape(len(rows), 2, 6, -1)[..., : len(prior)], axis=1)[:, 0]
-        places, near = problem.data.places[s.table][s.ends[rows]], np.zeros(len(rows), dtype=np.bool_)
+        places = problem.data.places[s.table][s.ends[rows]]
         for k, unit in enumerate(s.kind.units):
             used, sigma, is_length = s.used[rows, k], noise.sigma[rows, k], unit == "m"
             if is_length:
@@ -142,8 +136,6 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
             flips |= prior_along > np.maximum(to_180 / 2.0, 2.0 * sigma) ** 2
             names += ["-".join(problem.end_names[i + 1] for i in pair) for pair in places[flips & used]]
             n_rows += int(used.sum())
-            near |= used & (np.minimum(f, to_180) < NEAR_SIGMAS * sigma)
             leverage = along / np.square(np.maximum(sigma, 1e-300)) * (len(s.train) / len(rows))
             share += float(leverage[flips & used].sum()) / max(rank, 1)
-        n_near += int(near.sum())
-    return AmbiguousRows(n_rows, n_near, tuple(names), min(share, 1.0))
+    return AmbiguousRows(n_rows, tuple(names), min(share, 1.0))

@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.table import Table
 
 from fg_calib import __version__
-from fg_calib.diagnostics import MAX_ROWS, NEAR_SIGMAS, Disagreements, Inspection
+from fg_calib.diagnostics import MAX_ROWS, Disagreements, Inspection
 from fg_calib.inputs import checked
 from fg_calib.io import Observability as Document
 from fg_calib.io import fill_folder, write_text
@@ -141,12 +141,6 @@ def _tables(found: Inspection) -> Table:
 
 
 def _excluded_pairs(found: Inspection) -> Iterator[str]:
-    for t in found.tables:
-        if t.n_near_singular:
-            near = (
-                f"{t.n_near_singular} of {t.n_pairs} train pairs are within {NEAR_SIGMAS:g} sigma of 0 or 180 degrees"
-            )
-            yield f"{t.name}: {near}, where norms are not differentiable: they tell little"
     yield from (f"{n} train pairs are excluded: {reason.replace('_', ' ')}" for reason, n in found.n_excluded.items())
 
 

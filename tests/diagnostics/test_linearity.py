@@ -107,21 +107,20 @@ def test_rows_of_ambiguous_sign_are_those_that_the_prior_lets_pass_zero_or_half_
 
     # At 1 mrad the vector moves by 0.01 mm, below twice the noise; from 0.2 rad on by more than half its length.
     assert set(rows(1e-2).names) == {"1-5", "2-6", "3-7"}
-    assert rows(1e-2).n_near == 1
     assert rows(9e-4).names == ()
 
 
 def test_one_statement_names_the_rows_and_the_remedy():
     names, linear = ("0-1", "0-2", "0-3", "0-4"), Nonlinearity()
-    assert check_linear(AmbiguousRows(60, 4, names, 0.04), linear) == []
-    (few,) = check_linear(AmbiguousRows(60, 4, names, 0.06), Nonlinearity(3.0))
+    assert check_linear(AmbiguousRows(60, names, 0.04), linear) == []
+    (few,) = check_linear(AmbiguousRows(60, names, 0.06), Nonlinearity(3.0))
     assert few.severity == "warning"
     assert few.text.startswith(f"the sign of 4 of 60 lengths and angles {AMBIGUOUS} (0-1, 0-2, 0-3 and 1 more near 0")
     assert few.text.endswith("leave these out, or measure longer and wider motions, in which more joints move")
-    (many,) = check_linear(AmbiguousRows(60, 4, names, 0.31), linear)
+    (many,) = check_linear(AmbiguousRows(60, names, 0.31), linear)
     assert many.severity == "error"
     for high, nonlinear in ((True, 0.0), (False, 0.1)):
-        (spoilt,) = check_linear(AmbiguousRows(60, 4, names[:1], 0.0), Nonlinearity(nonlinear), high)
+        (spoilt,) = check_linear(AmbiguousRows(60, names[:1], 0.0), Nonlinearity(nonlinear), high)
         assert "(0-1 near 0 or 180 deg" in spoilt.text
 
 

@@ -7,11 +7,7 @@ import pytest
 from instruments import measured_by
 from scipy.spatial.transform import Rotation
 
-from fg_calib.assessment import assess
-from fg_calib.diagnostics import nominal_residuals as placed_residuals
 from fg_calib.diagnostics.setup_check import check_setup
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import SolverOptions, solve
 
 
 def check(robot, table, **changes):
@@ -70,15 +66,3 @@ def test_healthy_tables_have_no_mistake(instrument):
         found = check(robot, table)
         assert 0.05 < found.excess < 3.0
         assert found.explanations == ()
-
-
-@pytest.mark.slow
-def test_what_could_not_be_checked_is_said(monkeypatch):
-    monkeypatch.setattr(placed_residuals, "residuals_at", lambda *_: ())
-    robot, _, table = measured_by("planes", np.random.default_rng(6))
-    m = table.measurements
-    wrong = build_problem(robot, [replace(table, measurements=replace(m, length=m.length / 1e3))])
-    found = assess(solve(wrong, SolverOptions(max_iterations=5)))
-    assert any("was not checked for common mistakes (units, signs, columns)" in said for said in found.verdict.cautions)
-    good = assess(solve(build_problem(robot, [table])))
-    assert not any("was not checked" in said for said in good.verdict.cautions)

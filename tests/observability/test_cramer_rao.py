@@ -5,7 +5,7 @@ import pytest
 from simulated import measure, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib import InputError, Pairing
+from fg_calib import Pairing
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.observability.cramer_rao import Bound, cramer_rao
 from fg_calib.robot import pose
@@ -114,10 +114,3 @@ def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
     assert bound.position(readings) == pytest.approx(real.base_frame.rms, rel=1e-4)
     assert bound.position(readings, fitted=True) == pytest.approx(real.best_rigid_fit.rms, rel=1e-4)
     assert real.best_rigid_fit.rms < 0.95 * real.base_frame.rms
-
-
-def test_an_error_of_unknown_size_that_stays_is_an_error():
-    robot = planar("a1", "a2")
-    measurements = at(robot, [[0.0, 0.0]] * N)
-    with pytest.raises(InputError, match=r"^robot planar: no tolerance for a2, expected one: its own error stays"):
-        cramer_rao(robot, measurements, model="position", prior=False, kept=["a1"])
