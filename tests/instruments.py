@@ -63,9 +63,9 @@ def _targets(at, q, test, rng, sigma_joint, how):
 def _nearly(letter, places, how, rng):
     """Places known within 1 mm on each axis; if one is wrong, the first by 12 mm more."""
     away = rng.normal(size=3)
-    stated = places + 1e-3 * rng.normal(size=places.shape)
-    stated[0] += ("wrong" in how) * 12e-3 * away / np.linalg.norm(away)
-    return {f"{letter}{i}": KnownPoint(place, 1e-3) for i, place in enumerate(stated)}
+    specified = places + 1e-3 * rng.normal(size=places.shape)
+    specified[0] += ("wrong" in how) * 12e-3 * away / np.linalg.norm(away)
+    return {f"{letter}{i}": KnownPoint(place, 1e-3) for i, place in enumerate(specified)}
 
 
 def _anchors(at, q, test, rng, sigma_joint, how):

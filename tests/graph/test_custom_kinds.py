@@ -11,11 +11,9 @@ from simulated import measure
 
 from fg_calib import Calibration, calibrate
 from fg_calib.assessment import assess
-from fg_calib.baseline.comparison import compare
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError, Options
-from fg_calib.job import Job
+from fg_calib.inputs import InputError
 from fg_calib.measurements.kinds import Kind, Rows
 from fg_calib.measurements.kinds.pair import Distance
 from fg_calib.measurements.table import CustomMeasurements, Table
@@ -24,7 +22,7 @@ from fg_calib.robot.kinematics import pose
 
 
 class Offset(Kind):
-    """Height of the tool by a gauge with an offset that nobody knows."""
+    """Height of the tool by a gauge with an unknown offset."""
 
     names, units = ("height",), ("m",)
     ends, residual_dim, width, n_nuisances = 1, 1, 1, 1
@@ -51,8 +49,8 @@ def test_test_rows_of_an_unknown_that_nothing_else_says_are_not_judged():
     robot, _, table = lengths_to_anchors(1, n=40)
     (own,) = table.own
     m = measure(robot, 40, np.random.default_rng(0), sigma=(1e-4, 1e-4), readings=table.measurements.readings)
-    beside = Table(m, "position", own=(replace(own, test=np.ones(40, bool), unknowns=own.unknowns + 0.05),))
-    found = assess(solve(build_problem(robot, beside)))
+    with_lengths = Table(m, "position", own=(replace(own, test=np.ones(40, bool), unknowns=own.unknowns + 0.05),))
+    found = assess(solve(build_problem(robot, with_lengths)))
     assert found.fit.goodness.test is None or found.fit.goodness.test.n_rows == 0
     assert not any("test rows" in text for text in found.verdict.errors)
 
@@ -140,7 +138,7 @@ def test_an_anchor_that_too_few_lengths_see_is_unknown_and_harms_nothing():
     assert uncertainty.fit.chi_square.dof == len(keep) - 3 - 3 - 2
 
 
-def test_reasons_beside_a_kind_of_ones_own_do_not_say_what_it_cannot_see():
+def test_reasons_with_a_custom_kind_do_not_say_what_it_cannot_see():
     robot, _, table = lengths_to_anchors(0, n=60)
     found = assess(solve(build_problem(robot, table))).identifiability
     reasons = {name: lost.reason for lost in found.lost for name in lost.relation}
@@ -273,17 +271,3 @@ def test_a_mistake_in_what_was_measured_is_named(change, said):
     with pytest.raises(InputError) as found:
         replace(lengths_to_anchors(5)[2].own[0], **change)
     assert str(found.value).startswith(f"own: {said}")
-
-
-@pytest.mark.slow
-def test_plain_least_squares_takes_it_too():
-    robot, true, table = lengths_to_anchors(5, n_test=10)
-    found = compare(Job(None, robot, (table,), Options(), true))
-    _, keep, _, weighted = found.estimates
-    assert weighted.converged
-    for name, sigma in keep.sigma.items():
-        values = [e.robot.nominal[robot.index(name)] for e in (keep, weighted)]
-        assert values[1] == pytest.approx(values[0], rel=0, abs=1e-3 * sigma)
-    lines = format_comparison(found).splitlines()
-    assert lines[0] == "small-arm: own, judged at 10 test configurations"
-    assert sum(line.startswith("  anchor ") for line in lines) == 2  # train and test rows

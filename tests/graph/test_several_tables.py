@@ -25,7 +25,7 @@ from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 PLACED = (Rotation.from_rotvec([0.4, -1.1, 2.0]), np.array([3.0, -1.0, 0.5]))
-ELSEWHERE = (Rotation.from_rotvec([-2.0, 0.3, 0.7]), np.array([-2.0, 4.0, 1.0]))
+ANOTHER = (Rotation.from_rotvec([-2.0, 0.3, 0.7]), np.array([-2.0, 4.0, 1.0]))
 SIGMA = (5e-4, 5e-4)
 
 
@@ -62,11 +62,11 @@ def test_each_table_has_its_own_frame():
     rng = np.random.default_rng(5)
     robot = paper_robot({"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3})
     true = true_robot(robot, rng)
-    first, second = (measure(true, 25, rng, sigma=SIGMA, frame=frame) for frame in (PLACED, ELSEWHERE))
+    first, second = (measure(true, 25, rng, sigma=SIGMA, frame=frame) for frame in (PLACED, ANOTHER))
     tables = [Table(first, "pose", frame="unknown"), Table(second, "position", frame="unknown")]
     uncertainty = assess(solve(build_problem(robot, tables)))
     assert len(uncertainty.estimates.frames) == 2
-    for found, (turn, shift) in zip(uncertainty.estimates.frames, (PLACED, ELSEWHERE), strict=True):
+    for found, (turn, shift) in zip(uncertainty.estimates.frames, (PLACED, ANOTHER), strict=True):
         off = np.concatenate([(turn.inv() * Rotation.from_quat(found.quaternion_xyzw)).as_rotvec(), found.xyz - shift])
         assert np.all(np.abs(off[:3]) < 6 * found.sigma[:3])
         assert np.linalg.norm(off[3:]) < 6 * np.linalg.norm(found.sigma[3:])
@@ -140,8 +140,8 @@ def test_a_landmark_of_one_name_in_another_frame_is_another():
     robot, _, table = lengths_to_anchors(0, n=20)
     rng = np.random.default_rng(0)
     m = measure(robot, 20, rng, sigma=SIGMA, frame=PLACED, readings=table.measurements.readings)
-    elsewhere = Table(m, "position", frame="unknown", own=(replace(table.own[0], data=table.own[0].data + 0.1),))
-    assert len(build_problem(robot, [table, elsewhere]).data.unknowns.names) == 6
+    other = Table(m, "position", frame="unknown", own=(replace(table.own[0], data=table.own[0].data + 0.1),))
+    assert len(build_problem(robot, [table, other]).data.unknowns.names) == 6
 
 
 def write_tables(folder, robot, tables, **keys):
@@ -348,8 +348,8 @@ def test_test_rows_have_no_say_in_the_fit(model, apart):
     m = measure(true_robot(robot, rng), 20, rng, sigma_joint=1e-4, n_test=12)
     train, test = m.select(np.flatnonzero(~m.test)), m.select(np.flatnonzero(m.test))
     together = [Table(part, model) for part in (train, replace(test, source="others"))] if apart else Table(m, model)
-    alone, beside = (build_problem(robot, tables) for tables in (Table(train, model), together))
-    fitted, beside = solve(alone), solve(beside)
+    alone, both = (build_problem(robot, tables) for tables in (Table(train, model), together))
+    fitted, both = solve(alone), solve(both)
     sigma = np.sqrt(np.diag(assess(fitted).spread.tangent))
-    step = fitted.problem.variables.step(fitted.parameters, beside.parameters) / sigma
+    step = fitted.problem.variables.step(fitted.parameters, both.parameters) / sigma
     assert np.abs(step).max() < 1e-6
