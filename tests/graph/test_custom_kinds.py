@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from custom_kinds import ANCHORS, SIGMA, AnchorDistance, lengths_to_anchors
-from reported import format_comparison, format_report, result_document
+from reported import format_report, result_document
 from simulated import measure
 
 from fg_calib import Calibration, calibrate

@@ -4,12 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dense import SeriesRows
 from instruments import TOLERANCE, measured_by
-from simulated import small_arm, true_robot
+from simulated import measure, small_arm, true_robot
 from sparing import as_case
 from touches import reach, reach_faces
 
+from fg_calib.assessment import assess
 from fg_calib.calibration import calibrate
+from fg_calib.graph.build import build_problem
+from fg_calib.graph.noise_models import JOINT_NOISE
+from fg_calib.graph.problem import relinearized_at
+from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
@@ -56,3 +62,20 @@ def test_contact_with_a_single_point_does_not_move_it():
     """Nothing that was measured moves: healthy, and no figure over 0."""
     robot, table = touched("contacts", np.random.default_rng(1), n_points=1)
     assert not calibrate(robot, table, estimate_noise=True).findings
+
+
+def test_a_kinds_factor_is_that_of_all_its_noise_where_joint_noise_has_another():
+    """Specified and estimated rms are those of the dense covariance without and with the factors."""
+    rng, robot = np.random.default_rng(0), small_arm(dict.fromkeys(("a", "d", "alpha", "theta"), 2e-3))
+    m = measure(robot, 20, rng, sigma=(1e-3, 5e-4), sigma_joint=5e-4)
+    problem = build_problem(robot, m, model="position")
+    state = replace(problem.state, factors={(0, "position"): 2.0, JOINT_NOISE: 0.5})
+    solution = solve(relinearized_at(problem, problem.start, state))
+    (kind,) = assess(solution).fit.goodness.kinds
+    with_factors = replace(problem, state=solution.problem.state)
+    without, estimated = (
+        np.sqrt(np.mean(np.einsum("nii->ni", SeriesRows(p, solution.parameters, 0).total)))
+        for p in (problem, with_factors)
+    )
+    assert kind.stated_sigma_rms == pytest.approx(without, rel=1e-6)
+    assert kind.factor == pytest.approx(estimated / without, rel=1e-6)
