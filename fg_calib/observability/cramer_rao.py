@@ -42,7 +42,6 @@ from fg_calib.inputs import (
     PairErrors,
     Pairing,
     check,
-    check_flag,
     check_names,
     checked,
 )
@@ -133,7 +132,6 @@ def cramer_rao(
     """
     names = tuple(p.name for p in robot.parameters if p.estimated)
     check_names("kept", () if kept is None else kept, names, "or fixed parameter")
-    check_flag("prior", prior)
     k = np.array([kept is None or name in kept for name in names])
     if isinstance(measurements, Measurements):
         chosen = check("model", model, Model)

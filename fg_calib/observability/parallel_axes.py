@@ -109,12 +109,10 @@ def _of_convention(robot: Robot) -> tuple[MissingMotion, ...]:
     found: list[MissingMotion] = []
     for i in range(robot.n_joints - 1):
         angle = float(np.arcsin(np.clip(np.linalg.norm(np.cross(z[i], z[i + 1])), 0.0, 1.0)))
-        if angle > PARALLEL_RAD:
-            continue
         apart = float(np.linalg.norm(np.cross(points[i + 1] - points[i], z[i])))
         coaxial = not (prismatic[i] or prismatic[i + 1]) and apart < COAXIAL_SHARE * robot.reach
         motions = (Axis.TY,) * coaxial + (Axis.RY,) * (not has_beta)
-        if not motions:
+        if angle > PARALLEL_RAD or not motions:
             continue
         one = MissingMotion((i + 1, i + 2), motions, robot.convention, "a URDF" if coaxial else hayati, angle)
         last = found[-1] if found else None

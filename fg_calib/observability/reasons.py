@@ -12,33 +12,14 @@ known or not as they are; the arm goes to random configurations, and measures wh
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from fg_calib.graph import (
-    SUPPORT_TOLERANCE,
-    Places,
-    Problem,
-    eliminate,
-    named_triangle,
-    places_of,
-    square_root,
-    true_problem,
-)
-from fg_calib.inputs import (
-    PAIR_MODELS,
-    POSE_MODELS,
-    Booleans,
-    Floats,
-    FrameKnowledge,
-    Integers,
-    Model,
-    Options,
-    Pairing,
-)
+from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, places_of, square_root, true_problem
+from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model, Options, Pairing
 from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Labels, Measurements, Table
 from fg_calib.measurements.kinds import Instrument
 from fg_calib.observability.indices import Observability
@@ -199,7 +180,9 @@ def at_random_configurations(problem: Problem, parameters: Floats) -> Problem | 
     places, before = places_of(problem, parameters), () if problem.knowledge is None else problem.knowledge.views
     q = np.zeros((1, problem.robot.n_joints))
     anything = Measurements.from_arrays(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
-    earlier = [Table(anything, m, frame=frame) for m, frame in before if m in (*POSE_MODELS, *PAIR_MODELS)]
+    earlier = [
+        Table(anything, m, frame=frame) for m, frame in before if INSTRUMENTS[m].is_pose or INSTRUMENTS[m].uses_pairs
+    ]
     different: dict[tuple[object, ...], Table] = {}
     for table in (*problem.data.tables, *earlier):
         if table.model is not None and (named := _named(table))[1]:
@@ -223,7 +206,10 @@ def _named(table: Table) -> tuple[str, list[str | None]]:
     return column, [labels.names[k] if k >= 0 else None for k in np.unique(labels.index[train]).tolist()]
 
 
-def at_configurations(robot: Robot, table: Table, q: Floats, places: Places, source: str) -> Table:
+_Places = Mapping[tuple[str, str], Floats]
+
+
+def at_configurations(robot: Robot, table: Table, q: Floats, places: _Places, source: str) -> Table:
     """A table of what the arm predicts at configurations, landmarks in turn.
 
     Args:
@@ -315,15 +301,13 @@ class _Motion:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self._parameters = problem.estimated
         self._seen = seen
-        number = {p.name: i for i, p in enumerate(robot.parameters)}
-        columns = {number[p.name]: k for k, p in enumerate(self._parameters)}
+        columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, robot.trig(random_readings(robot, 60, np.random.default_rng(0))))
         n = len(self._parameters)
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, :n]
-        scale = {unit: robot.scale_of(unit) for unit in ("m", "rad")}
-        self._scales = np.array([scale[p.unit] for p in self._parameters])
+        self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
         self._sizes = np.abs(self._J)
         self._most = [float((J * self._scales).max(initial=0.0)) for J in np.split(self._sizes, 2, axis=1)]
         last = poses.jacobian[:, 3:, -1]
@@ -338,7 +322,7 @@ class _Motion:
         parallel, about = "parallel directions", "it" if self._on_last_axis else "its own point"
         if all(p.kind in ("d", "theta") for p in members):
             parallel = f"parallel axes {', '.join(str(p.owner) for p in members)}"
-        in_itself = self._constant(np.einsum("nji,nj->ni", self._R, w)) and not (moves and seen.position)
+        in_itself = _constant(np.einsum("nji,nj->ni", self._R, w)) and not (moves and seen.position)
         of_what = "" if all(p.name.startswith("tool.") for p in members) else on_last_axis
         causes = (
             (still and units == {"m"}, f"{parallel}: only the sum of the shifts along them acts"),
@@ -355,8 +339,8 @@ class _Motion:
     def of_base(self, direction: Floats) -> bool:
         """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""
         w, dp, turns, _ = self._of_tool(direction)
-        relative = self._seen.is_relative(position=True, orientation=turns) and self._constant(w)
-        return relative and (not self._seen.position or self._constant(dp - np.cross(w, self._p)))
+        relative = self._seen.is_relative(position=True, orientation=turns) and _constant(w)
+        return relative and (not self._seen.position or _constant(dp - np.cross(w, self._p)))
 
     def _of_tool(self, direction: Floats) -> tuple[Floats, Floats, bool, bool]:
         """Turns and shifts of the tool, shape (n_configurations, 3), and whether these are any."""
@@ -368,7 +352,7 @@ class _Motion:
         moves = float(np.abs(dp).max()) > max(_NOTHING * size_p, 1e-3 * _NOTHING * size_w, share * self._most[1])
         return w, dp, turns, moves
 
-    @staticmethod
-    def _constant(values: Floats) -> bool:
-        """Whether rows are all the same."""
-        return float(np.abs(values - values[0]).max()) <= 1e-8 * max(1.0, float(np.abs(values).max()))
+
+def _constant(values: Floats) -> bool:
+    """Whether rows are all the same."""
+    return float(np.abs(values - values[0]).max()) <= 1e-8 * max(1.0, float(np.abs(values).max()))
