@@ -3,8 +3,8 @@
 import numpy as np
 from simulated import small_arm, true_robot
 
+from fg_calib.measurements import Kind, Rows
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import Kind, Rows
 from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.robot.kinematics import pose
 

@@ -31,7 +31,7 @@ class SeriesRows:
     """
 
     def __init__(self, problem, parameters, number):
-        self.problem, self.series = problem, problem.data.series[number]
+        self.problem, self.series = problem, problem.data.blocks[number]
         s, data, state = self.series, problem.data, problem.state
         self.m, self.place = data.tables[s.table].measurements, data.places[s.table]
         at = problem.variables.at(parameters)
@@ -181,7 +181,7 @@ def dense(problem, parameters):
     Returns:
         Shapes (n, n_columns + n_nuisance + 1), (n, n_configurations, n_joints) and (n, n).
     """
-    every = [SeriesRows(problem, parameters, i) for i in range(len(problem.data.series))]
+    every = [SeriesRows(problem, parameters, i) for i in range(len(problem.data.blocks))]
     n_configurations = problem.data.n_configurations
     reached = {}
     for rows in every:
@@ -236,7 +236,7 @@ def dense(problem, parameters):
 
 def priors(problem, parameters):
     """[K k] of the priors on the arm and on landmarks, shape (n, n_columns + n_nuisance + 1)."""
-    variables, unknowns = problem.variables, problem.data.unknowns
+    variables, unknowns = problem.variables, problem.data.landmarks
 
     def residual(step):
         x, out = variables.moved(parameters, step), []
@@ -251,7 +251,8 @@ def priors(problem, parameters):
             sigma = [variables.robot.parameters[i].tolerance or np.inf for i in v.parameters]
             out += list(off / sigma)
         places = np.split(variables.at(x).coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
-        for place, start, sigma in zip(places, unknowns.starts, unknowns.tolerances, strict=True):
+        for place, item in zip(places, unknowns.items, strict=True):
+            start, sigma = item.start, item.tolerance
             out += list((place - start) / sigma) if sigma else []
         return np.array(out)
 

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from simulated import small_arm, true_robot
 
+from fg_calib.initialization import Camera
 from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.table import KnownPoint, Table
 from fg_calib.robot.kinematics import pose
 

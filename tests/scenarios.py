@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import Pairing
-from fg_calib.measurements import Camera
+from fg_calib.initialization import Camera
 from fg_calib.measurements.dataset import Noise
 from fg_calib.simulation.scenario import (
     Errors,

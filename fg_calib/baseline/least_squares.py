@@ -260,7 +260,7 @@ class _Rows:
 def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
     """Every measured train row of all tables."""
     found = []
-    for s in data.series:
+    for s in data.blocks:
         train, h = s.train, s.kind.residual_dim
         if not len(train):
             continue
@@ -287,12 +287,12 @@ class _System:
     def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None) -> None:
         self._sigma_joint, unknown = data.sigma_joint, np.array([table.unknown_frame for table in data.tables])
         estimated, n, n_frames = data.estimated(), len(robot.parameters), int(unknown.sum())
-        places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.unknowns.sizes]).tolist())]
-        self._coordinates: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
+        places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.landmarks.sizes]).tolist())]
+        self._coordinates: Floats = data.landmarks.start
         self._priors = [
-            (place, self._coordinates[place], sigma)
-            for place, sigma, of in zip(places, data.unknowns.tolerances, estimated, strict=True)
-            if of and sigma is not None
+            (place, self._coordinates[place], item.tolerance)
+            for place, item, of in zip(places, data.landmarks.items, estimated, strict=True)
+            if of and item.tolerance is not None
         ]
         free = (place for place, of in zip(places, estimated, strict=True) if of)
         self._estimated = np.concatenate([np.zeros(0, np.int64), *free])

@@ -186,7 +186,8 @@ def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
     if before is None:
         return np.zeros((0, n))
     A = square_root(before, before.start, with_loss=True)[:, :-1]
-    columns, own = _columns_by_name(v, problem.data.unknowns), _columns_by_name(before.variables, before.data.unknowns)
+    columns = _columns_by_name(v, problem.data.landmarks)
+    own = _columns_by_name(before.variables, before.data.landmarks)
     both = [name for name in own if name in columns]
     shared = np.concatenate([own[name] for name in both])
     others = np.setdiff1d(np.arange(A.shape[1]), shared)

@@ -68,7 +68,7 @@ def pool_of_rows(problem: Problem, source: str) -> Pool:
         InputError: Pairs without one reference pose.
     """
     data, references = problem.data, find_references(problem, source)
-    used = np.concatenate([data.places[s.table][s.ends[s.train]].ravel() for s in data.series])
+    used = np.concatenate([data.places[s.table][s.ends[s.train]].ravel() for s in data.blocks])
     poses = np.setdiff1d(used, references)
     which = np.full(data.n_configurations, NONE)  # test rows
     which[references], which[poses] = REFERENCE, np.arange(len(poses))

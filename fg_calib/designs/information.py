@@ -123,7 +123,7 @@ def _derivatives(
 
 def _poses_of(problem: Problem, series: int, residual_dim: int, pose_of: Integers) -> Integers:
     """The pose of each row of a series; -1 of rows without a configuration."""
-    s = problem.data.series[series]
+    s = problem.data.blocks[series]
     if not s.kind.ends:
         return np.full(len(s.train) * residual_dim, -1)
     found: Integers = np.repeat(pose_of[problem.data.places[s.table][s.ends[s.train]]].max(axis=1), residual_dim)
@@ -309,4 +309,4 @@ class Posterior(Brief):
 
 def count_measurements(problem: Problem) -> int:
     """Number of measurements of a problem's rows."""
-    return sum(len(s.train) for s in problem.data.series)
+    return sum(len(s.train) for s in problem.data.blocks)

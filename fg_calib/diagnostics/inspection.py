@@ -192,8 +192,8 @@ def inspect_job(job: Job) -> Inspection:
 def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
     """The counts of a table, with the test rows that it states."""
     m, problem = table.measurements, at_nominal.problem
-    copies, copy, repeats = find_copies(m, table.uses_pairs)
-    series = [s for s in problem.data.series if s.table == number]
+    copies, copy, repeats = find_copies(table)
+    series = [s for s in problem.data.blocks if s.table == number]
     pairs = find_ambiguous_rows(at_nominal, np.zeros((problem.variables.n_columns, 0)), 0, number)
     n_residuals = Counter[str]()
     for s in series:

@@ -150,7 +150,7 @@ def _apart(a: Solution, b: Solution) -> bool:
 def _mirrored_landmarks(problem: Problem) -> list[tuple[int, ...]]:
     """Coordinates of the landmarks that may have mirror images: estimated ones that nothing was in contact with."""
     found, touched = dict[tuple[int, ...], None](), set[int]()
-    for s in problem.data.series:
+    for s in problem.data.blocks:
         each = np.unique(s.nuisances[s.train], axis=0)
         if s.kind.is_contact:
             touched |= set(each.ravel().tolist())
@@ -164,7 +164,7 @@ def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
     """The problem with one landmark mirrored and the arm at nominal; None where it has no mirror image."""
     problem, at, key = solution.problem, at_parameters(solution.problem, solution.parameters), np.array(landmark)
     points, data, variables = list[Floats](), list[Floats](), problem.variables
-    for s in problem.data.series:
+    for s in problem.data.blocks:
         if s.nuisances.shape[1] == len(key) and type(s.kind).mirrored is not Kind.mirrored:
             kind, rows = s.kind, s.train[np.all(s.nuisances[s.train] == key, axis=1)]
             trig = problem.data.trigs(problem.robot)[s.table]
@@ -175,10 +175,10 @@ def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
         return None
     places, start, others = variables.coordinates[key], solution.before.copy(), variables.others.copy()
     start[places[places >= 0]], others[key[places < 0]] = image[places >= 0], image[places < 0]
-    unknowns = problem.data.unknowns
-    for i in np.unique(unknowns.owners[key[places < 0]]).tolist():  # what is not estimated of it
-        unknowns = unknowns.with_start(unknowns.span(i).start, others[unknowns.span(i)])
-    there, whole = replace(problem.data, unknowns=unknowns), problem.whole
+    unknowns = problem.data.landmarks
+    known = np.unique(unknowns.owners[key[places < 0]]).tolist()  # what is not estimated of it
+    unknowns = unknowns.with_starts({i: others[unknowns.span(i)] for i in known})
+    there, whole = replace(problem.data, landmarks=unknowns), problem.whole
     if whole is not None:
         whole = replace(whole, data=there, variables=replace(whole.variables, others=others))
     return with_factors(problem, start, data=there, variables=replace(variables, others=others), whole=whole)

@@ -42,8 +42,7 @@ from fg_calib.graph import (
     whitening_of,
 )
 from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
-from fg_calib.measurements import INSTRUMENTS, Table, residuals
-from fg_calib.measurements.kinds import Instrument
+from fg_calib.measurements import INSTRUMENTS, Instrument, Table, residuals
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 from fg_calib.statistics import MAX_OUTLIER_SHARE
@@ -218,9 +217,9 @@ def residuals_at(
         robot: The robot with what is estimated of the arm.
         table: Number of the table that is asked for; all if None.
     """
-    series = [s for s in problem.data.series if table in (None, s.table) and len(s.train) and s.kind.ends]
+    series = [s for s in problem.data.blocks if table in (None, s.table) and len(s.train) and s.kind.ends]
     some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in series)
-    sampled = replace(problem, data=replace(problem.data, series=some))
+    sampled = replace(problem, data=replace(problem.data, blocks=some))
     found: list[TypicalResidual] = []
     for noise, of_arm in with_arm_errors(sampled, parameters, robot):
         residual, _, sigma = noise.figures()
@@ -406,7 +405,7 @@ def _disagreement(
     kind = max(units, key=lambda kind: sizes[kind] / expected[kind])
     part = data.tables[s.table].measurements.part
     row = int(part[s.ends[k, 0]]) if part is not None and s.kind.ends == 1 else -1
-    landmarks = data.n_configurations + np.unique(data.unknowns.owners[s.nuisances[k]])
+    landmarks = data.n_configurations + np.unique(data.landmarks.owners[s.nuisances[k]])
     ends = tuple(data.names[i] for i in (data.places[s.table][s.ends[k]] if s.kind.ends else landmarks).tolist())
     of = s.of.names[s.of.index[k]] if s.of is not None and s.of.index[k] >= 0 else ""
     values = sizes[kind], expected[kind], d, bool(test[s.ends[k]].any())

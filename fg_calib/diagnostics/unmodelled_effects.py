@@ -36,7 +36,7 @@ from scipy import special
 
 from fg_calib.graph import Problem, Solution, at_parameters, build_variables, prior_rows, unknown_prior_rows
 from fg_calib.inputs import Floats
-from fg_calib.measurements import LANDMARKS, Block, residuals
+from fg_calib.measurements import Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
 from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Chain, Element, Parameter, Robot, pose
 
@@ -152,7 +152,7 @@ def probability_of_noise(solution: Solution) -> float | None:
         estimated, rows that share errors but are weighted as independent.
     """
     problem = solution.problem
-    if problem.data.unknowns.names or not _is_plain(problem) or problem.missing_correlation:
+    if problem.data.landmarks.names or not _is_plain(problem) or problem.missing_correlation:
         return None
     fit, J, names = regress(solution)
     least, n = 1.0, 0
@@ -179,7 +179,7 @@ def find_change(solution: Solution) -> Change | None:
     problem = solution.problem
     blocks = [part.block for rows in problem.rows for part in rows.parts]
     several = len(problem.data.tables) > 1 or any(rows.states is not None for rows in problem.rows)
-    if several or not _is_plain(problem) or problem.data.unknowns.names or any(b.kind.ends != 1 for b in blocks):
+    if several or not _is_plain(problem) or problem.data.landmarks.names or any(b.kind.ends != 1 for b in blocks):
         return None
     fit, J, names = regress(solution)
     links = {"tool": problem.robot.n_joints, "base": 0}
@@ -232,12 +232,12 @@ def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
 
 def _offsets(problem: Problem) -> dict[int, int]:
     """Tables with an offset that is not estimated, by the offset's place among the nuisance coordinates."""
-    unknowns, columns = problem.data.unknowns, problem.variables.coordinates
-    numbers = [i for i, letter in enumerate(unknowns.letters) if LANDMARKS[letter].is_one]
+    unknowns, columns = problem.data.landmarks, problem.variables.coordinates
+    numbers = [i for i, item in enumerate(unknowns.items) if item.kind.is_one]
     return {
         place: s.table
         for place in np.flatnonzero(np.isin(unknowns.owners, numbers) & (columns < 0)).tolist()
-        for s in problem.data.series
+        for s in problem.data.blocks
         if np.any(s.nuisances[s.train] == place)
     }
 

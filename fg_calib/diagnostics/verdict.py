@@ -189,7 +189,7 @@ def check_solver(case: Case) -> Iterator[Statement]:
     """Check whether the solver converged, and whether a robust loss left enough."""
     yield Statement("error", case.solution.message, not case.solution.converged)
     weights, data, loss = case.problem.state.weights, case.problem.data, case.problem.options.loss
-    for s, w in zip(data.series, weights or (), strict=False):
+    for s, w in zip(data.blocks, weights or (), strict=False):
         n, lost = len(s.train), int(np.sum(w[s.train] < OUTLIER_WEIGHT))
         of = f" of {data.labels[s.table]}" if len(data.labels) > 1 else ""
         text = f"loss {loss} takes {lost} of {n} measurements of {s.kind.names[0].partition('.')[0]}{of} for outliers"

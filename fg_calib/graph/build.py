@@ -38,14 +38,16 @@ from fg_calib.job import Job
 from fg_calib.measurements import (
     INSTRUMENTS,
     Dataset,
+    Frames,
     Measurements,
     Table,
     build_dataset,
+    check_rows,
+    is_ours,
     missing_values,
     predict_measurements,
     warn_of_copies,
 )
-from fg_calib.measurements.kinds import Frames, check_derivatives, check_start, is_ours
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, forward, names_of, random_readings
 
@@ -236,12 +238,12 @@ def true_problem(
         places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
     """
     data, places = build_dataset(robot, tables_of(tables, options), predicted=True), places or {}
-    unknowns = data.unknowns
-    unknowns.place(places)
+    starts = {i: places[key] for i, key in enumerate(data.landmarks.keys) if key in places}
+    data = replace(data, landmarks=data.landmarks.with_starts(starts))
     variables = variables_of(robot, data, options)
     start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
     for name in places:
-        place = coordinates_of(variables, unknowns, name)
+        place = coordinates_of(variables, data.landmarks, name)
         if place is not None:
             start[place] = places[name]
     for v, name in zip(variables.frames, frame_names(data, variables), strict=True):
@@ -252,7 +254,7 @@ def true_problem(
 
 def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Floats]:
     """Coordinates of landmarks by letter and name, and unknown measurement frames, called as `frame_names` says."""
-    unknowns, coordinates = problem.data.unknowns, problem.variables.at(parameters).coordinates
+    unknowns, coordinates = problem.data.landmarks, problem.variables.at(parameters).coordinates
     parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
     frames = [parameters[v.places] for v in problem.variables.frames]
     names = [*unknowns.keys, *frame_names(problem.data, problem.variables)]
@@ -289,7 +291,7 @@ def random_problem(
 def _check_frames(data: Dataset) -> None:
     """Whether every table whose measurement frame is unknown has a row that says where it is."""
     for number, table in enumerate(data.tables):
-        n_train = sum(len(s.train) for s in data.series if s.table == number)
+        n_train = sum(len(s.train) for s in data.blocks if s.table == number)
         if table.unknown_frame and not n_train and len(data.tables) > 1:
             found = "test rows alone, in a measurement frame of their own"
             raise ProblemError(table.measurements.source, found, "train rows, or frame known")
@@ -298,20 +300,19 @@ def _check_frames(data: Dataset) -> None:
 def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: Floats) -> None:
     """Compare the derivatives of kinds of one's own with differences at some measurements, where they are started."""
     at = variables.at(start)
-    for s in data.series:
+    for s in data.blocks:
         if is_ours(s.kind):
             continue
         table = data.tables[s.table].measurements
         poses = forward(at.chains[s.table].without_columns(), robot.trig(table.readings), s.ends.ravel())
         rotation, position = poses.rotation.reshape(*s.ends.shape, 3, 3), poses.position.reshape(*s.ends.shape, 3)
         nuisances = at.coordinates[s.nuisances]
-        check_start(s.kind, Frames(rotation, position), s.data, nuisances, s.source)
-        check_derivatives(s.kind, Frames(rotation[:3], position[:3]), s.data[:3], nuisances[:3], s.source)
+        check_rows(s.kind, Frames(rotation, position), s.data, nuisances, s.source)
 
 
 def _source(problem: Problem) -> str:
     """What the rows are called in messages."""
-    series = problem.data.series
+    series = problem.data.blocks
     return ", ".join(dict.fromkeys(s.source for s in series)) if series else problem.data.source
 
 

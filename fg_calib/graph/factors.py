@@ -33,8 +33,7 @@ from fg_calib.inputs import (
     check_number,
     shown,
 )
-from fg_calib.measurements import Block, Distance, RotationAngle, unpack
-from fg_calib.measurements.kinds import Kind
+from fg_calib.measurements import Block, Distance, Kind, RotationAngle, unpack
 
 Sparse = scipy.sparse.csr_array
 Linearise = Callable[[gtsam.Values], tuple[Floats, Floats]]

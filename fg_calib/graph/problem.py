@@ -185,12 +185,12 @@ class Problem(FrozenArrays):
     @property
     def pair_series(self) -> tuple[MeasurementBlock, ...]:
         """Series of pairs of configurations."""
-        return tuple(s for s in self.data.series if s.kind.ends == 2)
+        return tuple(s for s in self.data.blocks if s.kind.ends == 2)
 
     @property
     def formed(self) -> bool:
         """Whether pairs were formed from measured poses."""
-        return any(s.formed for s in self.data.series)
+        return any(s.formed for s in self.data.blocks)
 
     @property
     def n_pairs(self) -> int:
@@ -206,7 +206,7 @@ class Problem(FrozenArrays):
     @property
     def n_residuals(self) -> int:
         """Scalar residuals of the fit, priors and added factors not counted."""
-        return sum(int(s.used[s.train].sum()) for s in self.data.series)
+        return sum(int(s.used[s.train].sum()) for s in self.data.blocks)
 
     @property
     def n_independent(self) -> int:
@@ -229,7 +229,7 @@ class Problem(FrozenArrays):
         """What earlier rows say of what is estimated; None where they say nothing."""
         if self.knowledge is None:
             return None
-        found = self.knowledge.seen_by(self.variables, self.data.unknowns)
+        found = self.knowledge.seen_by(self.variables, self.data.landmarks)
         return found if found.n else None
 
     @property
@@ -246,7 +246,7 @@ class Problem(FrozenArrays):
     def n_excluded(self) -> dict[str, int]:
         """Train pairs that take no part, by reason: once each, whatever was measured of them."""
         found: dict[str, set[tuple[int, int]]] = {}
-        for s in self.data.series:
+        for s in self.data.blocks:
             for reason, mask in s.excluded.items():
                 pairs = s.number[mask & ~s.test].tolist()
                 found.setdefault(reason, set()).update((s.table, pair) for pair in pairs)
@@ -340,7 +340,7 @@ def depends(rows: WhitenedBlock, variables: Variables) -> bool:
 def known_factors(problem: Problem) -> list[gtsam.NonlinearFactor]:
     """What earlier rows say as a factor, where they say anything."""
     known = problem.known
-    return [] if known is None else [known.factor(problem.variables, problem.data.unknowns)]
+    return [] if known is None else [known.factor(problem.variables, problem.data.landmarks)]
 
 
 def _whitened(problem: Problem, noises: tuple[RowNoise, ...]) -> tuple[WhitenedBlock, ...]:
@@ -348,7 +348,7 @@ def _whitened(problem: Problem, noises: tuple[RowNoise, ...]) -> tuple[WhitenedB
     state, sharing = problem.state, problem.options.pair_errors == "shared"
     weights = None
     if state.weights is not None:
-        weights = [w[s.train] for w, s in zip(state.weights, problem.data.series, strict=True)]
+        weights = [w[s.train] for w, s in zip(state.weights, problem.data.blocks, strict=True)]
     return whitened_rows(noises, sharing=sharing, joint_errors=state.joint_errors, weights=weights)
 
 
@@ -364,7 +364,7 @@ def noises_at(
         fitted: Whether they are the train rows alone; else train and test.
     """
     places = _places(problem, parameters, at_readings)
-    series = [s.fitted if fitted else s for s in problem.data.series]
+    series = [s.fitted if fitted else s for s in problem.data.blocks]
     return tuple(row_noise(s, places[s.table], problem.state) for s in series)
 
 
@@ -434,8 +434,8 @@ def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
 
 def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
     """Of each unknown coordinate of a touched point the mean of what touched it, of others the start as given."""
-    found: Floats = np.concatenate([np.zeros(0), *data.unknowns.starts])
-    for s in data.series:
+    found: Floats = data.landmarks.start
+    for s in data.blocks:
         touches = np.flatnonzero(says_where(data, s))
         if len(touches):
             p = forward(chains[s.table].without_columns(), trigs[s.table], s.ends[touches, 0]).position
@@ -453,7 +453,7 @@ def says_where(data: Dataset, series: MeasurementBlock) -> Booleans:
     """
     if not (series.kind.is_contact and series.kind.n_nuisances):
         return np.zeros(series.n, dtype=np.bool_)
-    first, start = series.nuisances[:, 0], np.concatenate([np.zeros(0), *data.unknowns.starts])
+    first, start = series.nuisances[:, 0], data.landmarks.start
     says: Booleans = np.isnan(start[first]) & ~(series.test & np.isin(first, first[~series.test]))
     return says
 
@@ -466,7 +466,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
         parameters: The parameter vector.
         state: What has been learned of the noise; None for what the problem has.
     """
-    same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.series)
+    same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
     if (state is None or state is problem.state) and same:
         return replace(problem, start=parameters)
     return with_factors(problem, parameters, state)
@@ -485,9 +485,9 @@ def subsampled(problem: Problem, share: float) -> Problem | None:
     if problem.variables.nuisance or problem.options.loss != "none" or problem.state.weights is not None:
         return None
     rng, series = np.random.default_rng(0), []
-    for s in problem.data.series:
+    for s in problem.data.blocks:
         series.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
-    return with_factors(replace(problem, data=replace(problem.data, series=tuple(series))), problem.start)
+    return with_factors(replace(problem, data=replace(problem.data, blocks=tuple(series))), problem.start)
 
 
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:
@@ -559,7 +559,7 @@ def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False
     v = problem.variables
     others = [unknown_prior_rows(v, parameters)] if v.nuisance else []
     if problem.known is not None:
-        others.append(problem.known.at_parameters(v, problem.data.unknowns, parameters))
+        others.append(problem.known.at_parameters(v, problem.data.landmarks, parameters))
     if problem.added:
         others.append(linearize_factors(problem.added, v, v.values(parameters)))
     triangles = row_triangles(problem, parameters, with_loss=with_loss)
@@ -634,7 +634,7 @@ def _linear_rows(problem: Problem, blocks: Sequence[WhitenedBlock], at: State) -
     for block in blocks:
         rows.append(block.private(at))
         for part in block.parts:
-            series = problem.data.series[part.series]
+            series = problem.data.blocks[part.series]
             counts.append(np.full(part.block.n, part.block.residual_dim))
             used.append(series.used[series.train].ravel())
         if shared is not None and shared.states is not None:
@@ -663,10 +663,10 @@ def _with_loss(problem: Problem) -> tuple[tuple[WhitenedBlock, ...], float]:
     state, loss = problem.state, problem.options.loss
     if state.weights is None:
         return problem.rows, 1.0
-    dims = [s.used.sum(axis=1) for s in problem.data.series]
+    dims = [s.used.sum(axis=1) for s in problem.data.blocks]
     largest = max(int(d.max(initial=0)) for d in dims)
     of_dim = np.array([effect(loss, max(dim, 1)).variance for dim in range(largest + 1)])
-    of_train = np.concatenate([d[s.train] for d, s in zip(dims, problem.data.series, strict=True)])
+    of_train = np.concatenate([d[s.train] for d, s in zip(dims, problem.data.blocks, strict=True)])
     present = np.unique(of_train[of_train > 0])
     variance = float(of_dim[present].min(initial=np.inf)) if len(present) else 1.0
     if len(present) <= 1:
@@ -713,7 +713,7 @@ def frames_only(problem: Problem) -> Problem | None:
 def variables_of(robot: Robot, data: Dataset, options: Options) -> Variables:
     """The variables of a robot, its measurement frames and the measurements' unknowns."""
     frames = [table.unknown_frame for table in data.tables]
-    return build_variables(robot, frames, options.has_priors).with_unknowns(data.unknowns, data.estimated())
+    return build_variables(robot, frames, options.has_priors).with_unknowns(data.landmarks, data.estimated())
 
 
 def tables_of(

@@ -210,7 +210,7 @@ class Solution(FrozenArrays):
             return self.cost
         total = self.weighted_cost
         distances = mahalanobis_distances(self.problem, self.parameters)
-        for s, w, (e, residual_dim) in zip(self.problem.data.series, weights, distances, strict=True):
+        for s, w, (e, residual_dim) in zip(self.problem.data.blocks, weights, distances, strict=True):
             more = cost(loss, e, constants(loss, residual_dim)) - 0.5 * w * e**2
             total += float(np.sum(more[s.train]))
         return total
@@ -331,10 +331,10 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
     state, final = problem.state, True
     if problem.options.loss != "none":
         found = mahalanobis_distances(problem, parameters)
-        test = np.concatenate([s.test for s in problem.data.series])
+        test = np.concatenate([s.test for s in problem.data.blocks])
         e, residual_dim = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
         weights, final = weighting.update(e, residual_dim)
-        ends = np.cumsum([s.n for s in problem.data.series])[:-1]
+        ends = np.cumsum([s.n for s in problem.data.blocks])[:-1]
         state = replace(state, weights=tuple(np.split(weights, ends)))
     if state.joint_errors is not None:
         state = replace(state, joint_errors=joint_errors(problem, parameters))

@@ -271,21 +271,22 @@ class Variables(Brief):
         coordinates: list[int] = []
         more: list[Variable] = []
         taken = {v.symbol for v in self.items}  # the base has the letter of boards
-        for index, (letter, size) in enumerate(zip(unknowns.letters, unknowns.sizes, strict=True)):
+        for index, (item, size) in enumerate(zip(unknowns.items, unknowns.sizes, strict=True)):
+            letter = item.kind.letter
             if not estimated[index]:
                 coordinates += [-1] * size
                 continue
             parameters = tuple(range(place, place + size))
-            number = len(unknowns.letters) if f"{letter}({index})" in taken else index
-            symbol, scales = f"{letter}({number})", tuple(map(self.robot.scale_of, unknowns.units[index]))
+            number = len(unknowns.items) if f"{letter}({index})" in taken else index
+            symbol, scales = f"{letter}({number})", tuple(map(self.robot.scale_of, item.units))
             key, columns = gtsam.symbol(letter, number), slice(column, column + size)
-            tolerance, prior = unknowns.tolerances[index], None
+            tolerance, prior = item.tolerance, None
             if tolerance is not None:
-                prior = (tuple(unknowns.starts[index].tolist()), size * (tolerance,))
+                prior = (tuple(item.start.tolist()), size * (tolerance,))
             more.append(Variable(key, symbol, "unknown", parameters, columns, scales, prior))
             coordinates += parameters
             column, place = column + size, place + size
-        others = np.nan_to_num(np.concatenate([np.zeros(0), *unknowns.starts]))
+        others = np.nan_to_num(unknowns.start)
         found = np.array(coordinates, dtype=np.int64)
         return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found, others=others)
 

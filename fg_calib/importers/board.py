@@ -34,6 +34,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__
+from fg_calib.initialization import Camera
 from fg_calib.inputs import Floats, InputError, Integers, check
 from fg_calib.io import (
     KNOWN,
@@ -53,7 +54,6 @@ from fg_calib.io import (
     write_text,
 )
 from fg_calib.measurements import COVARIANCE, Frames, RoomPixel
-from fg_calib.measurements.kinds import Camera
 from fg_calib.parallel import tell
 
 Image = NDArray[np.uint8]

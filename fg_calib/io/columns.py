@@ -35,7 +35,7 @@ from fg_calib.inputs import (
 from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
 from fg_calib.io.yaml import number_hint, shown
 from fg_calib.measurements import INSTRUMENTS
-from fg_calib.measurements.kinds import Column as ColumnSet
+from fg_calib.measurements import Column as ColumnSet
 from fg_calib.parallel import require_polars
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool, create_model
 
+from fg_calib.initialization import Camera
 from fg_calib.inputs import (
     LIMITED,
     POSE_MODELS,
@@ -46,7 +47,6 @@ from fg_calib.io.yaml import (
 )
 from fg_calib.job import Job
 from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
-from fg_calib.measurements.kinds import Camera
 from fg_calib.robot import Robot, names_of
 
 _log = logging.getLogger(__name__)

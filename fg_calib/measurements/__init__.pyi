@@ -1,18 +1,17 @@
-from .build import Dataset, build_dataset, find_copies, start_frames, warn_of_copies
-from .checks import ANGLE_SLACK, check_readings, covariances
-from .dataset import Groups, Labels, Measurements, Noise, Pairs, form_pairs, no_pairs, pairs_from_arrays
-from .kind import Frames, Kind
-from .kinds import GENERIC_COLUMNS, INSTRUMENTS, LANDMARKS, Camera
+from .build import Dataset, build_dataset, find_copies, predict_measurements, start_frames, warn_of_copies
+from .dataset import Groups, Labels, Measurements, Noise, Pairs, are_same, form_pairs, no_pairs, pairs_from_arrays
+from .kind import Coincidence, Frames, Kind, Length, Rows, check_rows, directions, is_ours, stack
+from .kinds import GENERIC_COLUMNS, INSTRUMENTS, LANDMARKS
 from .kinds.board import COVARIANCE
+from .kinds.instrument import Column, Instrument
 from .kinds.pair import Distance, RotationAngle, missing_values, usable_pairs
 from .kinds.pixel import RoomPixel
 from .kinds.pose import TARGET
-from .landmarks import Landmarks
-from .limits import LIMIT_SLACK, limit_hint, outside_limits
+from .landmarks import Estimate, Landmark, LandmarkKind, Landmarks
 from .moments import Moments, angle_moments, length_moments
-from .predictions import predict_measurements
 from .residuals import Block, pack, squares_along, unit_whitening, unpack
-from .table import CustomMeasurements, KnownPoint, MeasurementBlock, Table, by_station
+from .table import UNKNOWN, CustomMeasurements, KnownPoint, MeasurementBlock, Table, by_station
+from .validation import ANGLE_SLACK, LIMIT_SLACK, check_readings, covariances, limit_hint, outside_limits
 
 __all__ = [
     "ANGLE_SLACK",
@@ -22,17 +21,24 @@ __all__ = [
     "LANDMARKS",
     "LIMIT_SLACK",
     "TARGET",
+    "UNKNOWN",
     "Block",
-    "Camera",
+    "Coincidence",
+    "Column",
     "CustomMeasurements",
     "Dataset",
     "Distance",
+    "Estimate",
     "Frames",
     "Groups",
+    "Instrument",
     "Kind",
     "KnownPoint",
     "Labels",
+    "Landmark",
+    "LandmarkKind",
     "Landmarks",
+    "Length",
     "MeasurementBlock",
     "Measurements",
     "Moments",
@@ -40,14 +46,19 @@ __all__ = [
     "Pairs",
     "RoomPixel",
     "RotationAngle",
+    "Rows",
     "Table",
     "angle_moments",
+    "are_same",
     "build_dataset",
     "by_station",
     "check_readings",
+    "check_rows",
     "covariances",
+    "directions",
     "find_copies",
     "form_pairs",
+    "is_ours",
     "length_moments",
     "limit_hint",
     "missing_values",
@@ -57,6 +68,7 @@ __all__ = [
     "pairs_from_arrays",
     "predict_measurements",
     "squares_along",
+    "stack",
     "start_frames",
     "unit_whitening",
     "unpack",

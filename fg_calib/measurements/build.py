@@ -1,4 +1,4 @@
-"""All tables of a calibration together, as estimation takes them."""
+"""All tables of a calibration together, as estimation takes them; and what a robot predicts that one would measure."""
 
 from __future__ import annotations
 
@@ -12,13 +12,9 @@ import numpy as np
 
 from fg_calib.initialization import Frame, FrameStart
 from fg_calib.inputs import NEAR, Booleans, Brief, Floats, InputError, Integers, ProblemError, did_you_mean
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Kind, is_ours
+from fg_calib.measurements import Kind, Labels, LandmarkKind, Landmarks, MeasurementBlock, Measurements, Table, is_ours
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
 from fg_calib.measurements.kinds.contact import POINT
-from fg_calib.measurements.kinds.custom import custom_block
-from fg_calib.measurements.landmarks import Landmarks
-from fg_calib.measurements.table import MeasurementBlock, Table
 from fg_calib.robot import Robot, build_chain, forward
 
 _log = logging.getLogger(__name__)
@@ -30,6 +26,9 @@ SAME_READING = 1e-8
 MOST_LOOKED_AT = 100_000
 """Rows up to which copies are looked for."""
 
+ASSUMED_SIGMA = 1e-3
+"""1 sigma of what none is specified for, [m] and [rad]."""
+
 
 @dataclass(frozen=True)
 class Dataset(Brief):
@@ -37,15 +36,15 @@ class Dataset(Brief):
 
     Attributes:
         tables: The tables.
-        series: Their measurements, kind by kind.
-        unknowns: What the series depend on besides the arm.
+        blocks: Their measurements, kind by kind.
+        landmarks: What the blocks depend on besides the arm.
         places: Of each table, its configurations among those of all tables, shape (n_configurations,) each.
-        names: Name of each configuration, then of each unknown.
+        names: Name of each configuration, then of each landmark.
     """
 
     tables: tuple[Table, ...]
-    series: tuple[MeasurementBlock, ...]
-    unknowns: Landmarks
+    blocks: tuple[MeasurementBlock, ...]
+    landmarks: Landmarks
     places: tuple[Integers, ...]
     names: tuple[str, ...]
     _trigs: dict[Any, tuple[Floats, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -64,7 +63,7 @@ class Dataset(Brief):
     @property
     def n_configurations(self) -> int:
         """Number of different configurations."""
-        return len(self.names) - len(self.unknowns.names)
+        return len(self.names) - len(self.landmarks.names)
 
     @property
     def readings(self) -> Floats:
@@ -78,7 +77,7 @@ class Dataset(Brief):
     def fitted(self) -> Booleans:
         """Which configurations the train rows are of, shape (n_configurations,)."""
         found = np.zeros(self.n_configurations, dtype=np.bool_)
-        for s in self.series:
+        for s in self.blocks:
             found[self.places[s.table][s.ends[s.train]]] = True
         return found
 
@@ -86,7 +85,7 @@ class Dataset(Brief):
     def held_out(self) -> Booleans:
         """Which configurations have test rows and no train row, shape (n_configurations,)."""
         found = np.zeros(self.n_configurations, dtype=np.bool_)
-        for s in self.series:
+        for s in self.blocks:
             found[self.places[s.table][s.ends[s.test]]] = True
         for table, place in zip(self.tables, self.places, strict=True):
             found[place[table.measurements.test]] = True
@@ -105,7 +104,7 @@ class Dataset(Brief):
 
     def n_train(self, chosen: Callable[[Kind], bool]) -> int:
         """Number of train measurements of the kinds chosen."""
-        return sum(len(s.train) for s in self.series if chosen(s.kind))
+        return sum(len(s.train) for s in self.blocks if chosen(s.kind))
 
     @property
     def source(self) -> str:
@@ -113,13 +112,14 @@ class Dataset(Brief):
         return ", ".join(dict.fromkeys(table.measurements.source for table in self.tables))
 
     def estimated(self) -> Booleans:
-        """Which unknowns a train measurement at a configuration depends on, shape (n_unknowns,)."""
-        seen = np.zeros(self.unknowns.n_coordinates, dtype=np.bool_)
-        for s in self.series:
+        """Which landmarks a train measurement at a configuration depends on, shape (n_landmarks,)."""
+        seen = np.zeros(self.landmarks.n_coordinates, dtype=np.bool_)
+        for s in self.blocks:
             if s.kind.ends:
                 seen[s.nuisances[s.train]] = True
-        first = np.cumsum([0, *self.unknowns.sizes])[:-1]
-        return seen[first] & ~np.array(self.unknowns.known) if len(first) else np.zeros(0, dtype=np.bool_)
+        first = np.cumsum([0, *self.landmarks.sizes])[:-1]
+        known = np.array([item.known for item in self.landmarks.items], dtype=np.bool_)
+        return seen[first] & ~known if len(first) else known
 
 
 def build_dataset(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) -> Dataset:
@@ -128,7 +128,7 @@ def build_dataset(robot: Robot, tables: Sequence[Table], *, predicted: bool = Fa
     Where tables state ids, the same id is the same configuration.
 
     Args:
-        robot: The nominal robot: unknowns are started where it says that they are.
+        robot: The nominal robot: landmarks are started where it says that they are.
         tables: The tables.
         predicted: Whether nothing of them was measured: what predicts the same is no measurement counted twice.
 
@@ -136,31 +136,28 @@ def build_dataset(robot: Robot, tables: Sequence[Table], *, predicted: bool = Fa
         ProblemError: A table lacks what its model needs, the noise of a joint is no figure of one, or two tables
             contradict each other.
     """
-    unknowns, series = Landmarks(), list[MeasurementBlock]()
-    places: list[Integers] = []
-    names: list[str] = []
-    found: dict[str, tuple[int, int]] = {}
+    landmarks, blocks = Landmarks(), list[MeasurementBlock]()
+    places, names, index = list[Integers](), list[str](), dict[str, int]()
     for number, table in enumerate(tables):
-        m = table.measurements
+        m, first = table.measurements, tables[0].measurements
         for before in () if predicted else tables[:number]:
             _check_once(table, before)
         if m.named:
-            places.append(_places_of_named(number, tables, places, names, found))
+            places.append(_places_of_named(m, names, index))
         else:
             places.append(np.arange(len(names), len(names) + m.n_configurations))
             names += m.ids.tolist() if len(tables) == 1 else [f"{name} of {m.source}" for name in m.ids.tolist()]
-        if not np.array_equal(m.sigma_joint, tables[0].measurements.sigma_joint):
-            source = tables[0].measurements.source
-            raise ProblemError(
-                m.source, "another noise.joint", f"that of {source}: the readings are of the same encoders"
-            )
+        if not np.array_equal(m.sigma_joint, first.sigma_joint):
+            expected = f"that of {first.source}: the readings are of the same encoders"
+            raise ProblemError(m.source, "another noise.joint", expected)
         _check_joint_noise(robot, m)
-        series += blocks_of(table, number, unknowns)
+        blocks += blocks_of(table, number, landmarks)
+    _check_same_readings(tables, places, len(names))
     _check_known(tables)
-    _check_fitted(series, unknowns)
-    _start_landmarks(robot, tables, series, unknowns)
-    series = _predicted_alone(series, unknowns.n_coordinates)
-    return Dataset(tuple(tables), tuple(series), unknowns, tuple(places), (*names, *unknowns.names))
+    _check_fitted(blocks, landmarks)
+    _start_landmarks(robot, tables, blocks, landmarks)
+    blocks = _predicted_alone(blocks, landmarks.n_coordinates)
+    return Dataset(tuple(tables), tuple(blocks), landmarks, tuple(places), (*names, *landmarks.names))
 
 
 def _check_joint_noise(robot: Robot, m: Measurements) -> None:
@@ -171,39 +168,36 @@ def _check_joint_noise(robot: Robot, m: Measurements) -> None:
             raise ProblemError(m.source, found, "less than half a turn", "is it in degrees?")
 
 
-def _places_of_named(
-    number: int,
-    tables: Sequence[Table],
-    places: list[Integers],
-    names: list[str],
-    found: dict[str, tuple[int, int]],
-) -> Integers:
-    """Numbers of a table's configurations: by their names those of earlier ones, or new ones, which are added.
-
-    Args:
-        number: Which table.
-        tables: All of them.
-        places: What this returned for those before.
-        names: Of all configurations so far.
-        found: Table and row where each name stood first.
-
-    Raises:
-        ProblemError: A name stands for two configurations.
-    """
-    m = tables[number].measurements
+def _places_of_named(m: Measurements, names: list[str], index: dict[str, int]) -> Integers:
+    """Numbers of a table's configurations: by their names those of earlier ones, or new ones, which are added."""
     place = np.empty(m.n_configurations, dtype=np.int64)
     for k, name in enumerate(m.ids.tolist()):
-        other = found.get(name)
-        if other is None:
-            place[k], found[name] = len(names), (number, k)
+        if name not in index:
+            index[name] = len(names)
             names.append(name)
-            continue
-        of_other = tables[other[0]].measurements
-        if not np.allclose(m.readings[k], of_other.readings[other[1]], rtol=0.0, atol=SAME_READING):
-            expected = f"those of {of_other.source}, or another id"
-            raise ProblemError(m.source, f"other joint readings at id {name}", expected)
-        place[k] = places[other[0]][other[1]] if other[0] < number else place[other[1]]
+        place[k] = index[name]
     return place
+
+
+def _check_same_readings(tables: Sequence[Table], places: Sequence[Integers], n: int) -> None:
+    """Raise where a name stands for two configurations.
+
+    Args:
+        tables: The tables.
+        places: Number of each row's configuration, by table.
+        n: Number of configurations.
+    """
+    readings, origin = np.full((n, tables[0].measurements.readings.shape[1]), np.nan), np.zeros(n, dtype=np.int64)
+    for number, (table, place) in enumerate(zip(tables, places, strict=True)):
+        m = table.measurements
+        new, row = np.unique(place, return_index=True)
+        new, row = new[there := np.isnan(readings[new, 0])], row[there]
+        readings[new], origin[new] = m.readings[row], number
+        off = np.abs(m.readings - readings[place]).max(axis=1) > SAME_READING
+        if off.any():
+            k = int(np.argmax(off))
+            expected = f"those of {tables[origin[place[k]]].measurements.source}, or another id"
+            raise ProblemError(m.source, f"other joint readings at id {m.ids[k]}", expected)
 
 
 def warn_of_copies(table: Table) -> None:
@@ -214,44 +208,43 @@ def warn_of_copies(table: Table) -> None:
     m = table.measurements
     if (m.n_configurations if m.pairs is None else m.pairs.n_pairs) > MOST_LOOKED_AT:
         return
-    n, two, _ = find_copies(m, table.uses_pairs)
+    n, two, _ = find_copies(table)
     if n:
         found = f"{n} rows have the readings and figures of an earlier one, such as {two}"
         _log.warning("%s: %s; were they copied? They count as often", m.source, found)
 
 
-def find_copies(m: Measurements, measured_pairs: bool) -> tuple[int, str, int]:
+def find_copies(table: Table) -> tuple[int, str, int]:
     """How many rows, or measured pairs, equal an earlier one, two names, and how many have its place but other values.
 
-    Args:
-        m: The measurements.
-        measured_pairs: Whether its pairs are looked at, whichever end is a.
+    Pairs count whichever end is a.
     """
-    if measured_pairs and m.pairs is not None:
-        a, b = np.sort(np.stack([m.pairs.a, m.pairs.b]), axis=0)
-        columns, measured = [a[:, None], b[:, None]], [m.pairs.distance[:, None], m.pairs.angle[:, None]]
-        test = m.pairs.test
-    else:
-        a = b = np.arange(m.n_configurations)
-        columns = [m.readings, *(of.index[:, None] for of in m.labels.values())]
-        columns += [] if m.groups is None else [m.groups.index[:, None]]
-        columns += [] if m.image is None else [m.image[:, 2:]]
-        figures = (m.position, m.rotation, m.length, m.image, *m.columns.values())
-        measured = [v.reshape(len(a), -1) for v in figures if v is not None]
-        test = m.test
-    n_places = len(np.unique(np.hstack(columns) + 0.0, axis=0))
-    if not measured:
-        return 0, "", len(a) - n_places
-    values = np.hstack([*columns, *(np.nan_to_num(v, nan=-1e300) for v in measured), test[:, None]]) + 0.0  # no -0
+    m, (ends, readings, figures) = table.measurements, _rows_of(table)
+    of_rows = [of.index for of in m.labels.values()] + ([] if m.groups is None else [m.groups.index])
+    columns = np.hstack([readings, *(index[ends] for index in of_rows)]) + 0.0  # no -0
+    n_places = len(np.unique(columns, axis=0))
+    if not figures:
+        return 0, "", len(ends) - n_places
+    test = np.any(m.test[ends], axis=1, keepdims=True)
+    values = np.hstack([columns, *(np.nan_to_num(v, nan=-1e300) for v in figures.values()), test]) + 0.0
     first, of = np.unique(values, axis=0, return_index=True, return_inverse=True)[1:]
-    copied = np.flatnonzero(first[of.ravel()] != np.arange(len(values)))
-    names = (
-        [f"{m.ids[i]}" if i == j else f"{m.ids[i]}-{m.ids[j]}" for i, j in zip(a, b, strict=True)]
-        if len(copied)
-        else []
-    )
-    two = dict.fromkeys(names[i] for k in copied[:1] for i in (first[of.ravel()[k]], k))
+    before, two = first[of.ravel()], dict[str, None]()
+    copied = np.flatnonzero(before != np.arange(len(ends)))
+    for k in copied[:1]:
+        two = dict.fromkeys("-".join(m.ids[ends[row]].tolist()) for row in (before[k], k))
     return len(copied), " and ".join(two), len(first) - n_places
+
+
+def _rows_of(table: Table) -> tuple[Integers, Floats, dict[str, Floats]]:
+    """Configurations of each row, or measured pair, of a table, readings there, and what takes part, by its noise."""
+    m, pairs, instrument = table.measurements, table.measurements.pairs, INSTRUMENTS.get(table.model or "")
+    ends = np.arange(m.n_configurations)[:, None]
+    figures = {} if instrument is None else {of.noise: m.value(of.field) for of in instrument.measured}
+    if instrument is not None and instrument.uses_pairs and pairs is not None:
+        ends = np.sort(np.stack([pairs.a, pairs.b], axis=1), axis=1)
+        figures = {name: getattr(pairs, name) for name in instrument.noise}
+    found = {name: v.reshape(len(v), math.prod(v.shape[1:])) for name, v in figures.items() if v is not None}
+    return ends, np.hstack([m.readings[k] for k in ends.T]), found
 
 
 def _check_once(table: Table, other: Table) -> None:
@@ -270,33 +263,17 @@ def _check_once(table: Table, other: Table) -> None:
 
 def _measured_by(table: Table) -> dict[str, Floats]:
     """What takes part of a table, with the readings that it is of, a row each, by what it is called."""
-    m, pairs, groups = table.measurements, table.measurements.pairs, table.measurements.groups
-    instrument = INSTRUMENTS.get(table.model or "")
-    if instrument is None or instrument.sees_landmarks:
-        placed = turned = False
-    else:
-        placed, turned = instrument.sees_position, instrument.sees_orientation
-    found: dict[str, tuple[Floats, ...]] = {}
-    if groups is not None:
-        touches = groups.index >= 0
-        found["touches"] = (m.readings[touches],)
-    if pairs is None or not table.uses_pairs:
-        figures = {"orientations": m.rotation if turned else None, "positions": m.position if placed else None}
-        for name, v in figures.items():
-            if v is not None:
-                found[name] = (m.readings, v.reshape(len(v), math.prod(v.shape[1:])))
-    else:
-        ends = (m.readings[pairs.a], m.readings[pairs.b])
-        for name, wanted, v in (("distances", placed, pairs.distance), ("angles", turned, pairs.angle)):
-            if wanted and np.isfinite(v).any():
-                there = np.isfinite(v)
-                found[name] = (ends[0][there], ends[1][there], v[there, None])
+    m, (_, readings, figures) = table.measurements, _rows_of(table)
+    found = {} if m.groups is None else {"touches": m.readings[m.groups.index >= 0]}
+    if table.model is not None and not INSTRUMENTS[table.model].sees_landmarks:
+        rows = {f"{name}s": np.hstack([readings, values]) for name, values in figures.items()}
+        found |= {name: of[np.isfinite(of).all(axis=1)] for name, of in rows.items()}
     for own in table.own:
-        ends_of = np.arange(m.n_configurations)[:, None] if own.ends is None else own.ends.reshape(len(own.data), -1)
-        if len(ends_of) == len(own.data) and ends_of.max(initial=0) < m.n_configurations:
-            at = m.readings[ends_of].reshape(len(own.data), -1)
-            found[f"measurements of {type(own.kind).__name__}"] = (at, own.data)
-    return {name: np.hstack(columns) for name, columns in found.items()}
+        ends = np.arange(m.n_configurations)[:, None] if own.ends is None else own.ends.reshape(len(own.data), -1)
+        if len(ends) == len(own.data) and ends.max(initial=0) < m.n_configurations:
+            at = m.readings[ends].reshape(len(own.data), -1)
+            found[f"measurements of {type(own.kind).__name__}"] = np.hstack([at, own.data])
+    return found
 
 
 def _check_known(tables: Sequence[Table]) -> None:
@@ -355,7 +332,7 @@ def blocks_of(table: Table, number: int, landmarks: Landmarks) -> list[Measureme
     for k, own in enumerate(table.own):
         if any(own is before for before in table.own[:k]):
             raise ProblemError(m.source, "the same CustomMeasurements twice", "every measurement once")
-    found = [custom_block(own, table, number, landmarks) for own in table.own]
+    found = [own.block(table, number, landmarks) for own in table.own]
     return found + ([] if instrument is None else instrument.blocks(table, number, landmarks))
 
 
@@ -373,8 +350,8 @@ def _check_fitted(blocks: Sequence[MeasurementBlock], landmarks: Landmarks) -> N
         for i in np.unique(landmarks.owners[block.nuisances[~fitted[block.nuisances]]]).tolist():
             item = landmarks.items[i]
             if item.kind.must_be_fitted and not item.is_stated:
-                found = f"{item.kind.called(item.name)} has test rows alone"
-                raise ProblemError(block.source, found, "train rows too, or its place as known")
+                name = item.name if item.kind.is_one else f"{item.kind.name} {item.name}"
+                raise ProblemError(block.source, f"{name} has test rows alone", "train rows too, or its place as known")
 
 
 def _start_landmarks(
@@ -404,7 +381,7 @@ def start_frames(robot: Robot, data: Dataset, tool: Frame, free: Booleans) -> Fr
     Raises:
         ProblemError: No image shows enough of a board.
     """
-    start = FrameStart(tool, free, np.concatenate([np.zeros(0), *data.unknowns.starts]))
+    start = FrameStart(tool, free, data.landmarks.start)
     chain, trigs = build_chain(robot), data.trigs(robot)
     instruments = [None if table.model is None else INSTRUMENTS[table.model] for table in data.tables]
     says = [0 if i is None or not i.is_pose else i.sees_position + i.sees_orientation for i in instruments]
@@ -413,6 +390,56 @@ def start_frames(robot: Robot, data: Dataset, tool: Frame, free: Booleans) -> Fr
         if instrument is not None:
             flange = forward(chain, trigs[number])
             start.begin(number, table.unknown_frame, (flange.rotation, flange.position))
-            blocks = [block for block in data.series if block.table == number]
-            instrument.start_frames(start, table, blocks, data.unknowns)
+            blocks = [block for block in data.blocks if block.table == number]
+            instrument.start_frames(start, table, blocks, data.landmarks)
     return start
+
+
+def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measurements:
+    """Measurements of a model at configurations, without noise, all of them train rows.
+
+    Landmarks stand where they say something, at some distance from what the arm reaches.
+
+    Args:
+        robot: The robot.
+        m: The configurations, the noise, and the names of landmarks; measured values are not looked at.
+        model: Which measurements take part.
+    """
+    train = np.flatnonzero(~m.test)
+    poses, n = forward(build_chain(robot), robot.trig(m.readings[train])), len(train)
+    instrument = INSTRUMENTS[model]
+
+    def specified(noise: str, *axes: int) -> Floats:
+        sigma = m.sigma(noise)
+        return np.full((n, *axes), ASSUMED_SIGMA) if sigma is None else sigma[train]
+
+    labels = {}
+    for column in instrument.labels if instrument.sees_landmarks else ():
+        names = tuple(f"{column} {i + 1}" for i in range(instrument.n_landmarks))
+        found = m.labels.get(column)
+        labels[column] = Labels(names, np.arange(n) % len(names)) if found is None else found.of(train)
+    exact = Measurements(
+        readings=m.readings[train],
+        ids=np.arange(n).astype(str),
+        test=np.zeros(n, dtype=np.bool_),
+        position=poses.position,
+        rotation=poses.rotation,
+        sigma_position=specified("position", 3),
+        sigma_orientation=specified("orientation", 3),
+        sigma_joint=m.sigma_joint,
+        source="predictions",
+        labels=labels,
+        sigma_length=specified("distance"),
+        sigmas={name: specified(name) for name in instrument.generic_columns},
+    )
+    if not n:
+        return exact
+    middle = poses.position.mean(axis=0)
+    reach = max(1e-3, float(np.linalg.norm(poses.position - middle, axis=1).max()))
+
+    def place(kind: LandmarkKind, name: str) -> Floats:
+        names = instrument.names(exact, kind).names
+        found: Floats = kind.default_places(len(names), middle, reach)[names.index(name)]
+        return found
+
+    return instrument.predict(exact, poses, place)

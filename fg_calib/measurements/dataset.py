@@ -16,24 +16,21 @@ from fg_calib.inputs import (
     InputError,
     Integers,
     Pairing,
-    as_floats,
+    check_names,
     check_number,
     checked,
     listed,
-    once,
 )
-from fg_calib.measurements.checks import (
-    checked_covariance,
+from fg_calib.measurements.validation import (
+    COLUMNS,
+    LABELS,
+    checked_columns,
     checked_ids,
-    checked_image,
     checked_joint_sigma,
     checked_labels,
-    checked_lengths,
     checked_mask,
     checked_pairs,
     checked_readings,
-    checked_rotation,
-    checked_sigma,
 )
 from fg_calib.robot import over_spans, rotation_angle
 
@@ -76,16 +73,13 @@ class Noise:
         return replace(self, **named, more={**self.more, **others})
 
     def __post_init__(self) -> None:
-        for name, figure in self.more.items():
-            check_number(f"noise: {name}", figure)
-        for f in fields(self)[:-1]:
-            given = getattr(self, f.name)
-            if f.name == "joint" and isinstance(given, list | np.ndarray):
-                given = tuple(np.atleast_1d(np.array(given, dtype=object)).tolist())
-                object.__setattr__(self, "joint", given)
-            for figure in given if f.name == "joint" and isinstance(given, tuple) else (given,):
-                if figure is not None:
-                    check_number(f"noise: {f.name}", figure)
+        if isinstance(self.joint, list | np.ndarray):
+            object.__setattr__(self, "joint", tuple(np.atleast_1d(np.array(self.joint, dtype=object)).tolist()))
+        sigmas = [(name, getattr(self, name)) for name in _NOISE if name != "joint"]
+        sigmas += [("joint", sigma) for sigma in (self.joint if isinstance(self.joint, tuple) else (self.joint,))]
+        for name, sigma in (*sigmas, *self.more.items()):
+            if sigma is not None:
+                check_number(f"noise: {name}", sigma)
 
 
 _NOISE = tuple(f.name for f in fields(Noise) if f.name != "more")
@@ -126,25 +120,8 @@ class Pairs(FrozenArrays):
 
     def select(self, rows: Booleans | Integers) -> Pairs:
         """The pairs at `rows` only."""
-        return replace(
-            self,
-            a=self.a[rows],
-            b=self.b[rows],
-            distance=self.distance[rows],
-            angle=self.angle[rows],
-            sigma_distance=self.sigma_distance[rows],
-            sigma_angle=self.sigma_angle[rows],
-            test=self.test[rows],
-        )
-
-
-def joined(parts: Sequence[Pairs]) -> Pairs:
-    """Pairs of one table, one part after the other."""
-    names = [f.name for f in fields(Pairs) if f.name not in ("source", "unused")]
-    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-    for name in ("sigma_distance", "sigma_angle", "test"):
-        columns[name] = once(columns[name])
-    return Pairs(source=parts[0].source, unused=parts[0].unused, **columns)
+        columns = [f.name for f in fields(self) if f.name not in ("source", "unused")]
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 def are_same(places: Integers | Floats, a: Integers, b: Integers) -> Booleans:
@@ -233,11 +210,11 @@ class Measurements(FrozenArrays):
     readings: Floats
     ids: NDArray[np.str_]
     test: Booleans
-    position: Floats | None
-    rotation: Floats | None
-    sigma_position: Floats | None
-    sigma_orientation: Floats | None
-    sigma_joint: Floats
+    position: Floats | None = None
+    rotation: Floats | None = None
+    sigma_position: Floats | None = None
+    sigma_orientation: Floats | None = None
+    sigma_joint: Floats = field(default_factory=lambda: np.zeros(0))
     pairs: Pairs | None = None
     source: str = "measurements"
     groups: Groups | None = None
@@ -255,7 +232,7 @@ class Measurements(FrozenArrays):
     sigmas: Mapping[str, Floats] = field(default_factory=dict)
 
     from_frame: ClassVar[Callable[..., Measurements]]
-    """`files.tables.read_measurements`, attached by the package: this folder knows nothing of tables."""
+    """`io.read_measurements`, attached by the package: this folder knows nothing of tables."""
 
     @classmethod
     @checked
@@ -263,112 +240,58 @@ class Measurements(FrozenArrays):
         cls,
         readings: ArrayLike,
         *,
-        position: ArrayLike | None = None,
-        rotation: ArrayLike | None = None,
-        quaternion: ArrayLike | None = None,
-        roll_pitch_yaw: ArrayLike | None = None,
-        pairs: Mapping[str, ArrayLike] | Any | None = None,
-        group: ArrayLike | None = None,
-        test: ArrayLike | None = None,
         ids: ArrayLike | None = None,
+        test: ArrayLike | None = None,
+        group: ArrayLike | None = None,
         points: Sequence[str] = (),
-        sigma_position: ArrayLike | None = None,
-        sigma_orientation: ArrayLike | None = None,
+        pairs: Mapping[str, ArrayLike] | Any | None = None,
         sigma_joint: ArrayLike = 0.0,
-        sigma_point: ArrayLike | None = None,
-        target: ArrayLike | None = None,
-        station: ArrayLike | None = None,
-        anchor: ArrayLike | None = None,
-        plane: ArrayLike | None = None,
-        distance: ArrayLike | None = None,
-        sigma_distance: ArrayLike | None = None,
-        board: ArrayLike | None = None,
-        pixel: ArrayLike | None = None,
-        corner: ArrayLike | None = None,
-        sigma_pixel: ArrayLike | None = None,
-        covariance: ArrayLike | None = None,
         source: str = "measurements",
+        **columns: ArrayLike | None,
     ) -> Measurements:
-        """Measurements from arrays in [m] and [rad], which are copied; sigmas may be one figure for all.
+        """Measurements from arrays in [m] and [rad], which are copied; n is the number of configurations.
 
         Args:
             readings: Joint readings q, shape (n, n_joints), [rad] (prismatic: [m]).
-            position: world_p_tool, shape (n, 3).
-            rotation: world_R_tool, shape (n, 3, 3); or one of the next two.
-            quaternion: As x y z w, shape (n, 4).
-            roll_pitch_yaw: As angles, Rz(yaw) Ry(pitch) Rx(roll), shape (n, 3).
+            ids: Name of each configuration, shape (n,); its row number if None.
+            test: True for rows that are predicted but never fitted, shape (n,).
+            group: Name of the point that a configuration touched, None where it touched none, shape (n,).
+            points: Names of points that other tables touch: pairs may say how far apart they are.
             pairs: Between configurations or touched points, arrays of shape (n_pairs,), or a frame of polars or pandas:
                 `a` and `b` (ids or groups; row numbers where none of these is a number); `distance`, `angle` (nan: not
                 measured), `sigma_...` each, `test`.
-            group: Name of the point that a configuration touched, None where it touched none, shape (n,).
-            test: True for rows that are predicted but never fitted, shape (n,).
-            ids: Name of each configuration, shape (n,); its row number if None.
-            points: Names of points that other tables touch: pairs may say how far apart they are.
-            sigma_position: 1 sigma: one figure, one an axis (3,), one a row (n,), or shape (n, 3).
-            sigma_orientation: The same, about the tool's axes.
-            sigma_joint: 1 sigma of the readings: one figure, or one a joint.
-            sigma_point: 1 sigma of a touch on each axis: one figure, or one a row.
-            target: Name of the target whose position was measured, None for the tool point itself, shape (n,).
-            station: Name of the station it was measured from, each with a frame of its own, shape (n,).
-            anchor: Name of the anchor that `distance` is to, shape (n,).
-            plane: Name of the plane that the tool point is on, or `distance` from, shape (n,).
-            distance: To the anchor or from the plane, nan where not measured, shape (n,).
-            sigma_distance: 1 sigma of that: one figure, or one a row.
-            board: Name of the board that a camera saw; `position` and orientation are then camera_T_board, shape (n,).
-            pixel: Where a point of the board was seen, u and v, [px], shape (n, 2).
-            corner: Where that point is on the board, x and y, shape (n, 2).
-            sigma_pixel: 1 sigma of `pixel`: one figure, one an axis (2,), one a row (n,), or shape (n, 2).
-            covariance: Of camera_T_board, rotation first, about and along the camera's axes, shape (n, 6, 6).
+            sigma_joint: 1 sigma of the readings: one for all, or one a joint.
             source: Name of the measurements, for messages.
+            columns: What was measured, its 1 sigma (one for all, an axis each, a row each, or all), and what it is of:
+                see `validation.COLUMNS` and `LABELS`.
 
         Raises:
             InputError: An array cannot be used; the message names it and its row.
         """
         n = len(q := checked_readings(readings))
+        given = {name: values for name, values in columns.items() if values is not None}
+        check_names("Measurements.from_arrays", given, (*COLUMNS, *LABELS), "argument")
         names, index = checked_labels("group", group, n)
-        given = {"target": target, "station": station, "anchor": anchor, "plane": plane, "board": board}
-        labels = {what: Labels(*checked_labels(what, v, n)) for what, v in given.items() if v is not None}
-        repeated = pixel is not None or bool(labels.keys() - {"station"})
+        labels = {what: Labels(*checked_labels(what, given[what], n)) for what in LABELS if what in given}
+        repeated = "pixel" in given or bool(labels.keys() - {"station"})
         known, rows = checked_ids(ids, n, repeated=repeated), checked_mask("test", test, n)
-        R, angles = checked_rotation(n, rotation, quaternion, roll_pitch_yaw)
         every = tuple(dict.fromkeys((*names, *listed("points", points))))
         between, of_groups = None, no_pairs(source)
         if pairs is not None:
             between, which = pairs_from_arrays(pairs, known, rows, Labels(every, index))
             between, of_groups = between.select(~which), between.select(which)
-        names = every if of_groups.n_pairs else names
+            names = every if of_groups.n_pairs else names
         return cls(
-            readings=q,
-            ids=known,
-            test=rows,
-            position=None if position is None else as_floats("position", position, f"({n}, 3)"),
-            rotation=R,
-            sigma_position=checked_sigma("sigma_position", sigma_position, (n, 3)),
-            sigma_orientation=checked_sigma("sigma_orientation", sigma_orientation, (n, 3)),
+            q,
+            known,
+            rows,
             sigma_joint=checked_joint_sigma(sigma_joint, q.shape[1]),
             pairs=between,
             source=source,
             groups=Groups(names, index, of_groups) if names else None,
-            sigma_point=checked_sigma("sigma_point", sigma_point, (n,)),
-            roll_pitch_yaw=angles,
             named=ids is not None,
             labels=labels,
-            length=checked_lengths("distance", distance, n, signed=plane is not None),
-            sigma_length=checked_sigma("sigma_distance", sigma_distance, (n,)),
-            image=checked_image(pixel, corner, n),
-            sigma_pixel=checked_sigma("sigma_pixel", sigma_pixel, (n, 2)),
-            covariance=checked_covariance(covariance, n),
-        )
-
-    def __repr__(self) -> str:
-        kinds = {"position": "positions", "rotation": "orientations"}
-        parts = [words for name, words in kinds.items() if getattr(self, name) is not None]
-        parts += [] if self.pairs is None else [f"{self.pairs.n_pairs} pairs"]
-        parts += [] if self.groups is None else [f"touches of {self.groups.n_groups} points"]
-        n, n_joints = self.readings.shape
-        of_test = f" ({int(self.test.sum())} to test)" if self.test.any() else ""
-        return f"Measurements {self.source!r}, {n} configurations of {n_joints} joints{of_test}: " + (
-            ", ".join(parts) or "nothing measured"
+            **checked_columns(given, n),
         )
 
     @property
@@ -387,13 +310,21 @@ class Measurements(FrozenArrays):
             changes[name] = {key: v.of(rows) if name == "labels" else v[rows] for key, v in getattr(self, name).items()}
         return replace(self, **changes, pairs=None, groups=None)
 
-    @property
-    def end_names(self) -> tuple[str, ...]:
-        """Names of what a row can be of: nothing at all (""), the configurations, then the groups.
+    def value(self, name: str) -> Floats | None:
+        """What was measured, by a field or a column that one instrument alone has; None where it was not."""
+        found: Floats | None = self.columns.get(name, getattr(self, name, None))
+        return found
 
-        Rows count configurations from 0, then groups, and -1 for nothing, so end k has the name at k + 1.
-        """
-        return ("", *self.ids.tolist(), *(() if self.groups is None else self.groups.names))
+    def sigma(self, noise: str) -> Floats | None:
+        """1 sigma by kind of noise; None where it is not stated."""
+        name = "sigma_length" if noise == "distance" else f"sigma_{noise}"
+        found: Floats | None = self.sigmas.get(noise, getattr(self, name, None))
+        return found
+
+    def with_values(self, values: Mapping[str, Floats]) -> Measurements:
+        """The same with other measured values, by the names that `value` takes."""
+        own: dict[str, Any] = {name: v for name, v in values.items() if hasattr(self, name)}
+        return replace(self, **own, columns={**self.columns, **{k: v for k, v in values.items() if k not in own}})
 
 
 def pairs_from_arrays(given: Any, ids: NDArray[np.str_], test: Booleans, groups: Labels) -> tuple[Pairs, Booleans]:
@@ -406,11 +337,16 @@ def pairs_from_arrays(given: Any, ids: NDArray[np.str_], test: Booleans, groups:
         groups: The contact points.
     """
     columns, of_groups = checked_pairs(given, ids, groups.names)
-    contacts = [test[groups.index == g] for g in range(len(groups.names))]
-    only_test = np.array([len(rows) > 0 and rows.all() for rows in contacts], dtype=np.bool_)
-    for flags, chosen in ((test, ~of_groups), (only_test, of_groups)):
+    for flags, chosen in ((test, ~of_groups), (only_of(test, groups.index, len(groups.names)), of_groups)):
         columns["test"][chosen] |= flags[columns["a"][chosen]] | flags[columns["b"][chosen]]
     return Pairs(**columns), of_groups  # type: ignore[arg-type]
+
+
+def only_of(chosen: Booleans, group: Integers, n_groups: int) -> Booleans:
+    """Which groups have rows, all of them chosen, shape (n_groups,)."""
+    counts = [np.bincount(group[rows & (group >= 0)], minlength=n_groups) for rows in (chosen, chosen | True)]
+    only: Booleans = (counts[1] > 0) & (counts[0] == counts[1])
+    return only
 
 
 def no_pairs(source: str) -> Pairs:
@@ -435,21 +371,19 @@ def form_pairs(measurements: Measurements, pairing: Pairing) -> Pairs:
     chosen = [_choose(np.flatnonzero(measurements.test == test), pairing, generator) for test in (False, True)]
     a, b = np.concatenate(chosen).T
     n = len(a)
-    distance, sigma_distance = np.full(n, np.nan), np.full(n, np.nan)
-    angle, sigma_angle = np.full(n, np.nan), np.full(n, np.nan)
+    names = ("distance", "angle", "sigma_distance", "sigma_angle")
+    found: dict[str, Any] = {name: np.full(n, np.nan) for name in names}
     if measurements.position is not None:
         step = measurements.position[b] - measurements.position[a]  # (n, 3)
-        distance = np.linalg.norm(step, axis=1)
+        found["distance"] = np.linalg.norm(step, axis=1)
         if measurements.sigma_position is not None:
-            sigma_distance = _sigma_along(measurements.sigma_position, a, b, step)
+            found["sigma_distance"] = _sigma_along(measurements.sigma_position, a, b, step)
     if measurements.rotation is not None:
         a_R_b = np.swapaxes(measurements.rotation[a], 1, 2) @ measurements.rotation[b]  # (n, 3, 3)
-        angle, axis = rotation_angle(a_R_b)
+        found["angle"], axis = rotation_angle(a_R_b)
         if measurements.sigma_orientation is not None:
-            sigma_angle = _sigma_along(measurements.sigma_orientation, a, b, axis)
-    return Pairs(
-        a, b, distance, angle, sigma_distance, sigma_angle, measurements.test[a], f"pairs from {measurements.source}"
-    )
+            found["sigma_angle"] = _sigma_along(measurements.sigma_orientation, a, b, axis)
+    return Pairs(a, b, test=measurements.test[a], source=f"pairs from {measurements.source}", **found)
 
 
 def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) -> Integers:

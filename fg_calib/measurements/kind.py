@@ -9,12 +9,11 @@ the frame, a parameter, a joint, a frame before or behind the arm, has a (w, dp)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from numbers import Integral
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fg_calib.inputs import Floats, InputError, Integers, as_array, as_figures, require, shown
+from fg_calib.inputs import Floats, InputError, Integers, as_array, check_number, require, shown
 
 
 class Frames(NamedTuple):
@@ -57,6 +56,7 @@ class Kind(ABC):
         turned_back: Whether only the length of its residual, a vector in the base frame, counts: derivatives in the
             parameters then leave out that all vectors turn with the base (see `kinematics.turning_of_base`).
         is_contact: Whether it says that points coincide, where a distance would be 0 and have no direction.
+        shows_data: Whether its first columns of data are what tables show, though there are more.
         code: Of its twin in `kernels`, which computes residual and D by compiled code; None if it has none.
     """
 
@@ -69,6 +69,7 @@ class Kind(ABC):
     turned_back: bool = False
     code: int | None = None
     is_contact: bool = False
+    shows_data: bool = False
 
     @abstractmethod
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
@@ -82,11 +83,8 @@ class Kind(ABC):
 
     def figures(self, data: Floats) -> Floats:
         """Each row's measured value as tables show it, shape (n, residual_dim); nan where that is no figure."""
-        return (
-            data[:, : self.residual_dim]
-            if self.width == self.residual_dim
-            else np.full((len(data), self.residual_dim), np.nan)
-        )
+        shape = len(data), self.residual_dim
+        return data[:, : shape[1]] if self.width == shape[1] or self.shows_data else np.full(shape, np.nan)
 
     @property
     def quantity(self) -> str:
@@ -109,7 +107,9 @@ class Kind(ABC):
         """
         if self.width == 0:  # a contact: its noise is where the arm stood
             return np.zeros((len(noise), 0))
-        return self.rows(at, np.zeros((len(noise), self.width)), nuisances).residual + noise
+        measured, given = np.split(data, [self.residual_dim], axis=1)
+        values = self.rows(at, np.hstack([0.0 * measured, given]), nuisances).residual + noise
+        return np.hstack([values, given])
 
     def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
         """Nuisances of one landmark at its mirror image, which the same data may fit nearly as well; None of none.
@@ -135,53 +135,163 @@ class Kind(ABC):
         return hash(type(self))
 
 
+class Step(NamedTuple):
+    """Vectors from one point to another, and their derivatives.
+
+    Attributes:
+        vector: Shape (n, 3), [m].
+        wrenches: In (w, dp) of the ends that are tool points, shape (n, ends, 3, 6).
+        nuisances: In those that are landmarks, shape (n, 3, 3 n_landmarks).
+    """
+
+    vector: Floats
+    wrenches: Floats
+    nuisances: Floats
+
+
+def steps(at: Frames, landmarks: Floats) -> Step:
+    """Vectors from the first of two points to the second: landmarks come first, then tool points.
+
+    Args:
+        at: Tool frames, of 0, 1 or 2 ends.
+        landmarks: The other points, side by side, shape (n, 3 n_landmarks), [m].
+    """
+    n, k = len(landmarks), landmarks.shape[1] // 3
+    points = np.concatenate([landmarks.reshape(n, k, 3), at.position.reshape(n, -1, 3)], axis=1)
+    signs = np.array([-np.eye(3), np.eye(3)])
+    D = np.zeros((n, 2 - k, 3, 6))
+    D[:, :, :, 3:] = signs[k:]
+    N = np.tile(signs[:k].transpose(1, 0, 2).reshape(3, 3 * k), (n, 1, 1))
+    return Step(points[:, 1] - points[:, 0], D, N)
+
+
+def directions(vectors: Floats) -> tuple[Floats, Floats]:
+    """Lengths of vectors, shape (n,), and their directions, shape (n, 3); zero has none."""
+    length: Floats = np.linalg.norm(vectors, axis=1)
+    return length, vectors / np.maximum(length, 1e-300)[:, None]
+
+
+class Length(Kind):
+    """`|b - a| + offset - measured`, [m]: its derivative is `u . (db - da) + doffset`, u from a to b.
+
+    Data: the length, [m]. Nuisances: those points that are landmarks, then the offset, where it has one.
+    """
+
+    names, units = ("distance",), ("m",)
+    residual_dim = width = 1
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        landmarks, offset = np.split(nuisances, [3 * (2 - self.ends)], axis=1)
+        step = steps(at, landmarks)
+        length, u = directions(step.vector)
+        D = np.einsum("nk,nekj->nej", u, step.wrenches)[:, :, None]
+        N = np.concatenate([np.einsum("nk,nkj->nj", u, step.nuisances), np.ones(offset.shape)], axis=1)[:, None]
+        return Rows((length + offset.sum(axis=1))[:, None] - data, D, N)
+
+    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
+        """See `Kind.simulate`."""
+        return np.abs(super().simulate(at, data, nuisances, noise))
+
+
+class Coincidence(Kind):
+    """`b - a`, [m], of points that coincide: a distance of zero, which has no direction. Its derivative is `db - da`.
+
+    Data: none. Nuisances: those points that are landmarks.
+    """
+
+    names, units = ("distance.x", "distance.y", "distance.z"), ("m", "m", "m")
+    residual_dim, width, is_contact = 3, 0, True
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        return Rows(*steps(at, nuisances))
+
+
+class Stacked(Kind):
+    """Rows of several kinds of the same ends, one below the other: a pose is an orientation and a position.
+
+    Data: those of the kinds, side by side. Nuisances: the same.
+    """
+
+    def __init__(self, *parts: Kind) -> None:
+        self._parts = parts
+        self.names = tuple(name for part in parts for name in part.names)
+        self.units = tuple(unit for part in parts for unit in part.units)
+        self.ends = parts[0].ends
+        for name in ("residual_dim", "width", "n_nuisances"):
+            setattr(self, name, sum(getattr(part, name) for part in parts))
+
+    @property
+    def parts(self) -> tuple[Kind, ...]:
+        """See `Kind.parts`."""
+        return self._parts
+
+    def _split(self, of: Floats, size: str) -> list[Floats]:
+        """What each part has of an array, a view of its columns; `size` says how many of them."""
+        return np.split(of, np.cumsum([getattr(part, size) for part in self.parts])[:-1], axis=1)
+
+    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+        """See `Kind.rows`."""
+        of_parts = zip(self.parts, self._split(data, "width"), self._split(nuisances, "n_nuisances"), strict=True)
+        residuals, wrenches, given = zip(*(part.rows(at, *arrays) for part, *arrays in of_parts), strict=True)
+        N, row, column = np.zeros((len(data), self.residual_dim, self.n_nuisances)), 0, 0
+        for part, own in zip(self.parts, given, strict=True):
+            if part.n_nuisances:
+                N[:, row : row + part.residual_dim, column : column + part.n_nuisances] = own
+            row, column = row + part.residual_dim, column + part.n_nuisances
+        return Rows(np.concatenate(residuals, axis=1), np.concatenate(wrenches, axis=2), N)
+
+    def figures(self, data: Floats) -> Floats:
+        """See `Kind.figures`."""
+        return np.hstack([part.figures(own) for part, own in zip(self.parts, self._split(data, "width"), strict=True)])
+
+    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
+        """See `Kind.simulate`."""
+        sizes = ((data, "width"), (nuisances, "n_nuisances"), (noise, "residual_dim"))
+        each = zip(self.parts, *(self._split(of, size) for of, size in sizes), strict=True)
+        return np.hstack([part.simulate(at, *arrays) for part, *arrays in each])
+
+    def twins(self) -> Integers:
+        """See `Kind.twins`; none at all if a part has none."""
+        twins, row, column = [], 0, 0
+        for part in self.parts:
+            twins.append(part.twins() + np.array([0, row, column]))
+            row, column = row + part.residual_dim, column + part.width
+        return np.concatenate(twins) if all(map(len, twins)) else np.zeros((0, 3), dtype=np.int64)
+
+
+def stack(*parts: Kind) -> Kind:
+    """The kinds measured together; one alone is itself."""
+    return parts[0] if len(parts) == 1 else Stacked(*parts)
+
+
 def is_ours(kind: Kind) -> bool:
     """Whether a kind is one of the package's, which the tests check."""
     return type(kind).__module__.startswith("fg_calib.")
 
 
 def check_kind(kind: Kind) -> None:
-    """Check what a kind of one's own says of itself.
+    """Check what a custom kind says of itself.
 
     Raises:
         InputError: Something is missing, of another type, or contradicts the rest.
     """
     place = f"kind {type(kind).__name__}"
-    for name, (least, most) in _COUNTS.items():
-        value = getattr(kind, name, None)
-        if not isinstance(value, Integral) or isinstance(value, bool) or not least <= int(value) <= most:
-            found = f"found {shown(value)}" if hasattr(kind, name) else "it is missing"
-            raise InputError(f"{place}: {name}", found, f"a whole number, {least} to {most}")
+    for name in ("ends", "residual_dim", "width", "n_nuisances"):
+        least, most = int(name == "residual_dim"), 2 if name == "ends" else 1000
+        check_number(f"{place}: {name}", getattr(kind, name, None), least=least, whole=True, most=most)
     n = kind.residual_dim
-    for name, what in (("names", "('height',)"), ("units", "('m',)")):
+    for name, example in (("names", "('height',)"), ("units", "('m',)")):
         value = getattr(kind, name, None)
         if not isinstance(value, tuple | list) or len(value) != n or not all(isinstance(v, str) and v for v in value):
-            found = f"found {shown(value)}" if hasattr(kind, name) else "it is missing"
-            raise InputError(f"{place}: {name}", found, f"a tuple of residual_dim = {n} words, such as {what}")
+            expected = f"a tuple of residual_dim = {n} words, such as {example}"
+            raise InputError(f"{place}: {name}", f"found {shown(value)}", expected)
     if not set(kind.units) <= {"m", "rad", "px"}:
         raise InputError(f"{place}: units", f"found {shown(kind.units)}", "m, rad or px each")
-    if not is_ours(kind) and len(_called(kind, "twins")):
+    if not is_ours(kind) and len(kind.twins()):
         found = f"found {shown(kind.code)}"
         raise InputError(f"{place}: code", found, "None: compiled code would take the place of its rows")
-
-
-_COUNTS = {"ends": (0, 2), "residual_dim": (1, 1000), "width": (0, 1000), "n_nuisances": (0, 1000)}
-"""Least and most of what a kind says of its sizes."""
-
-
-def _called(kind: Kind, method: str, *arguments: Any, source: str = "") -> Any:
-    """What a method of a kind returns; what it raises becomes one line.
-
-    Raises:
-        InputError: It raised something.
-    """
-    try:
-        return getattr(kind, method)(*arguments)
-    except MemoryError:  # which says nothing of the kind
-        raise
-    except Exception as error:
-        message = f"{type(error).__name__}: {error}".rstrip(": ")
-        raise InputError(_place(kind, method, source), f"raised {message}") from error
 
 
 def _place(kind: Kind, name: str, source: str) -> str:
@@ -201,9 +311,9 @@ def checked_rows(
         source: The table that they are from, for messages.
 
     Raises:
-        InputError: It raised something, or one has another shape, or no numbers.
+        InputError: One has another shape, or no numbers.
     """
-    found = _called(kind, "rows", at, data.copy(), nuisances.copy(), source=source)
+    found = kind.rows(at, data.copy(), nuisances.copy())
     if not isinstance(found, tuple) or len(found) != len(Rows._fields):
         raise InputError(_place(kind, "rows", source), f"returned a {type(found).__name__}", "Rows(residual, D, N)")
     n = len(at.position)
@@ -220,33 +330,8 @@ def checked_rows(
     return arrays[0], arrays[1], arrays[2]
 
 
-def checked_figures(kind: Kind, data: Floats, source: str) -> Floats:
-    """`Kind.figures` as an array of the shape that it must have.
-
-    Raises:
-        InputError: It raised something, or has another shape, or no numbers.
-    """
-    place, shape = _place(kind, "figures", source), f"({len(data)}, {kind.residual_dim})"
-    found = as_figures(place, _called(kind, "figures", data.copy(), source=source), f"numbers of shape {shape}")
-    if found.shape != (len(data), kind.residual_dim):
-        raise InputError(place, f"shape {found.shape}", shape)
-    return data if np.array_equal(found, data) else found  # of a long table in memory once
-
-
-def check_start(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str) -> None:
-    """Check that residuals and derivatives are finite where a kind is started, and its figures are figures.
-
-    Raises:
-        InputError: They are not.
-    """
-    for name, array in zip(Rows._fields, checked_rows(kind, at, data, nuisances, source), strict=True):
-        place = _place(kind, name, source)
-        require(np.isfinite(array), place, array, "a finite number", "at the start of the unknowns")
-    checked_figures(kind, data, source)
-
-
-def check_derivatives(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str = "") -> None:
-    """Compare what a kind says of its derivatives with differences.
+def check_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str = "") -> None:
+    """Check that a custom kind's rows are finite, and compare what it says of its derivatives with differences.
 
     Args:
         kind: The kind.
@@ -256,26 +341,30 @@ def check_derivatives(kind: Kind, at: Frames, data: Floats, nuisances: Floats, s
         source: The table that they are from, for messages.
 
     Raises:
-        InputError: They differ by more than differences do.
+        InputError: They are not, or differ by more than differences do.
     """
+    for name, array in zip(Rows._fields, checked_rows(kind, at, data, nuisances, source), strict=True):
+        place = _place(kind, name, source)
+        require(np.isfinite(array), place, array, "a finite number", "at the start of the unknowns")
+    (rotation, position), data, nuisances = (of[:N_COMPARED] for of in at), data[:N_COMPARED], nuisances[:N_COMPARED]
+    at = Frames(rotation, position)
     _, D, N = checked_rows(kind, at, data, nuisances, source)
+    n_of_ends = 6 * kind.ends
+    said = np.concatenate([np.moveaxis(D, 1, 2).reshape(*N.shape[:2], n_of_ends), N], axis=2)
+    for k in range(said.shape[2]):
+        up, down = (_moved(at, nuisances, k, h) for h in (STEP, -STEP))
+        r_up, r_down = (checked_rows(kind, frames, data, values, source)[0] for frames, values in (up, down))
+        difference = (r_up - r_down) / (2.0 * STEP)
+        off = np.abs(difference - said[:, :, k]) / np.maximum(1.0, np.abs(difference))
+        if not np.all(off < MAX_DERIVATIVE_ERROR):
+            worst = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
+            found = f"{said[:, :, k][worst]:.6g} where a small change gives {difference[worst]:.6g}"
+            place = _place(kind, "wrenches" if k < n_of_ends else "nuisances", source)
+            raise InputError(place, found, "the derivative of its residual")
 
-    def residual(name: str, k: int, h: float) -> Floats:
-        """The residual where one coordinate is another by h."""
-        moved = _moved(at, *divmod(k, 6), h) if name == "wrenches" else at
-        values = nuisances + h * (np.arange(kind.n_nuisances) == k) if name == "nuisances" else nuisances
-        return checked_rows(kind, moved, data, values, source)[0]
 
-    ends = np.moveaxis(D, 1, 2).reshape(len(D), kind.residual_dim, -1)
-    for name, said in (("wrenches", ends), ("nuisances", N)):
-        for k in range(said.shape[2]):
-            difference = (residual(name, k, STEP) - residual(name, k, -STEP)) / (2.0 * STEP)
-            off = np.abs(difference - said[:, :, k]) / np.maximum(1.0, np.abs(difference))
-            if not np.all(off < MAX_DERIVATIVE_ERROR):
-                worst = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
-                found = f"{said[:, :, k][worst]:.6g} where a small change gives {difference[worst]:.6g}"
-                raise InputError(_place(kind, name, source), found, "the derivative of its residual")
-
+N_COMPARED = 3
+"""Measurements whose derivatives are compared."""
 
 STEP = 1e-6
 """Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size."""
@@ -284,19 +373,15 @@ MAX_DERIVATIVE_ERROR = 1e-4
 """Difference of a derivative, of 1 or its size, that is a mistake."""
 
 
-def _moved(at: Frames, end: int, column: int, h: float) -> Frames:
-    """The frames with one end's turned or shifted."""
-    rotation, position = at.rotation.copy(), at.position.copy()
+def _moved(at: Frames, nuisances: Floats, k: int, h: float) -> tuple[Frames, Floats]:
+    """Frames and nuisances with one coordinate changed: of a rotation or a translation of an end, or a nuisance."""
+    (rotation, position), (end, column) = (of.copy() for of in at), divmod(k, 6)
+    if end >= position.shape[1]:
+        k -= 6 * position.shape[1]
+        return at, nuisances + h * (np.arange(nuisances.shape[1]) == k)
     if column < 3:
         K = np.cross(np.eye(3), h * np.eye(3)[column])
         rotation[:, end] = (np.eye(3) + K + 0.5 * K @ K) @ rotation[:, end]
     else:
         position[:, end, column - 3] += h
-    return Frames(rotation, position)
-
-
-def between(start: Floats, end: Floats) -> tuple[Floats, Floats]:
-    """Lengths of the vectors from start to end, shape (n,), and their directions, shape (n, 3); zero has none."""
-    vector = end - start
-    length: Floats = np.linalg.norm(vector, axis=1)
-    return length, vector / np.maximum(length, 1e-300)[:, None]
+    return Frames(rotation, position), nuisances

@@ -7,6 +7,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, Integers, ProblemError
 
@@ -25,6 +26,9 @@ class LandmarkKind:
         heading: Of its table in reports, with frame and unit; empty where reports do not show it.
         units: `m` or `rad` of each coordinate.
         key: Key of a job that may say where they are; empty where none does.
+        column: Of a table, whose names they have; that called like the kind if empty.
+        away: How far they stand from the middle of the tool points where nothing is measured yet, in their reach.
+        is_constant: Whether its coordinates are never estimated.
         n_configurations: That must be left to say where one is, in cross-validation.
         must_be_fitted: Whether a train row must say where one is, unless the job does.
         stays: Whether it is where it was at the next calibration: a target on the tool, say.
@@ -40,12 +44,20 @@ class LandmarkKind:
     heading: str
     units: tuple[str, ...] = ("m", "m", "m")
     key: str = ""
+    column: str = ""
+    away: float = 0.0
+    is_constant: bool = False
     n_configurations: int = 1
     must_be_fitted: bool = True
     stays: bool = False
     is_one: bool = False
     reference: LandmarkKind | None = None
     estimate: Callable[[Floats, Floats, Floats], Estimate] | None = None
+
+    @property
+    def label(self) -> str:
+        """Column of a table whose names they have."""
+        return self.column or self.name
 
     @property
     def size(self) -> int:
@@ -56,9 +68,19 @@ class LandmarkKind:
         """Name of the one of a table, of a kind of which a table has one at most."""
         return f"{self.name} of {source}"
 
-    def called(self, name: str) -> str:
-        """One of them in a message: `anchor ball1`."""
-        return name if self.is_one else f"{self.name} {name}"
+    def default_places(self, n: int, middle: Floats, reach: float) -> Floats:
+        """Coordinates of n landmarks where nothing is measured yet, shape (n, size); 0 where that says as much.
+
+        Args:
+            n: How many there are.
+            middle: Of the tool points, shape (3,), [m].
+            reach: How far these are from there, [m].
+        """
+        if not self.away:
+            return np.zeros((n, self.size))
+        places = middle + self.away * reach * Rotation.random(n, random_state=0).as_matrix()[:, :, 2]
+        rotated = Rotation.random(n, random_state=np.random.default_rng(0).integers(1000)).as_rotvec()
+        return places if self.size == 3 else np.hstack([rotated, places])
 
 
 @dataclass(frozen=True)
@@ -89,10 +111,10 @@ class Landmark:
         """`m` or `rad` of each coordinate."""
         return self.kind.units if len(self.start) == self.kind.size else ("m",) * len(self.start)
 
-    def says_the_same(self, other: Landmark) -> bool:
-        """Whether both say that it is at one place, equally well."""
-        same = (self.tolerance, self.known) == (other.tolerance, other.known)
-        return same and np.array_equal(self.start, other.start)
+    @property
+    def statement(self) -> tuple[list[float], float | None, bool]:
+        """Where it is said to be, and how well."""
+        return self.start.tolist(), self.tolerance, self.known
 
     def __str__(self) -> str:
         return f"{self.start.tolist()}{'' if self.tolerance is None else f' within {self.tolerance:g}'}"
@@ -111,19 +133,9 @@ class Landmarks:
         self._first: list[int] = [0]
 
     @property
-    def kinds(self) -> list[LandmarkKind]:
-        """Kind of each."""
-        return [item.kind for item in self.items]
-
-    @property
     def names(self) -> list[str]:
         """Name of each."""
         return [item.name for item in self.items]
-
-    @property
-    def letters(self) -> list[str]:
-        """Letter of each one's symbol."""
-        return [item.kind.letter for item in self.items]
 
     @property
     def keys(self) -> list[tuple[str, str]]:
@@ -136,24 +148,9 @@ class Landmarks:
         return [len(item.start) for item in self.items]
 
     @property
-    def starts(self) -> list[Floats]:
-        """Start of each."""
-        return [item.start for item in self.items]
-
-    @property
-    def units(self) -> list[tuple[str, ...]]:
-        """Units of each one's coordinates."""
-        return [item.units for item in self.items]
-
-    @property
-    def tolerances(self) -> list[float | None]:
-        """1 sigma of each one's start; None where it says nothing."""
-        return [item.tolerance for item in self.items]
-
-    @property
-    def known(self) -> list[bool]:
-        """Whether each is known exactly."""
-        return [item.known for item in self.items]
+    def start(self) -> Floats:
+        """Where all are started, shape (n_coordinates,); nan where the measurements are to say it."""
+        return np.concatenate([np.zeros(0), *(item.start for item in self.items)])
 
     @property
     def n_coordinates(self) -> int:
@@ -174,29 +171,16 @@ class Landmarks:
         spans = [self.span(self._index[kind.letter, name, -1]) for name in names]
         return np.array([np.arange(span.start, span.stop) for span in spans], dtype=np.int64).reshape(-1, kind.size)
 
-    def add(
-        self,
-        kind: LandmarkKind,
-        names: Sequence[str],
-        starts: Floats,
-        source: str,
-        frame: int = -1,
-        *,
-        tolerances: Sequence[float | None] = (),
-        known: Sequence[bool] = (),
-    ) -> Integers:
-        """Add landmarks of a kind; one of a name that is there is the same, whatever table it is from.
+    def add(self, landmarks: Sequence[Landmark], source: str, frame: int = -1, *, named: bool = True) -> Integers:
+        """Add landmarks; one of a name that is there is the same, whatever table it is from.
 
         What one table says of its place holds for all: the others may say the same, or nothing.
 
         Args:
-            kind: Their kind.
-            names: What they are called; none have names if empty.
-            starts: Where they are started, shape (n, size); nan where the measurements are to say it.
+            landmarks: The landmarks, one at least.
             source: The table, for messages.
             frame: The table in whose own measurement frame they are, -1 for the base: elsewhere a name is another.
-            tolerances: 1 sigma of each one's start; None, as of all if empty, where it says nothing.
-            known: Whether each start is exact; none is if empty.
+            named: Whether they have names; all are new otherwise.
 
         Returns:
             Their coordinates, shape (n, size).
@@ -204,41 +188,34 @@ class Landmarks:
         Raises:
             ProblemError: Two of one name are said to be at different places.
         """
-        found = np.empty(starts.shape, dtype=np.int64)
-        for k, start in enumerate(starts):
-            name = names[k] if names else str(k)
-            tolerance, exact = tolerances[k] if tolerances else None, known[k] if known else False
-            new = Landmark(kind, name, start, tolerance, exact)
-            key = kind.letter, name, frame
-            i = self._index.get(key, len(self.items)) if names else len(self.items)
-            if i == len(self.items):
+        found = []
+        for new in landmarks:
+            key, n = (new.kind.letter, new.name, frame), len(self.items)
+            i = self._index.setdefault(key, n) if named else n
+            if i == n:
                 self.items.append(new)
-                self._first.append(self._first[-1] + len(start))
+                self._first.append(self._first[-1] + len(new.start))
             elif not self.items[i].is_stated:
                 self.items[i] = new
-            elif new.is_stated and not new.says_the_same(self.items[i]):
-                expected = f"that of the other {name}: {self.items[i]}"
-                raise ProblemError(source, f"start {new} of unknown {name}", expected)
-            if names:
-                self._index[key] = i
+            elif new.is_stated and new.statement != self.items[i].statement:
+                expected = f"that of the other {new.name}: {self.items[i]}"
+                raise ProblemError(source, f"start {new} of unknown {new.name}", expected)
             span = self.span(i)
-            found[k] = np.arange(span.start, span.stop)
-        return found
+            found.append(np.arange(span.start, span.stop))
+        return np.array(found, dtype=np.int64)
 
-    def start(self, coordinate: int, place: Floats) -> None:
+    def start_at(self, coordinate: int, place: Floats) -> None:
         """Start the landmark with that first coordinate somewhere, unless a table says where it is."""
         i = self._first.index(coordinate)
         if not self.items[i].is_stated:
             self.items[i] = replace(self.items[i], start=place)
 
-    def place(self, places: Mapping[tuple[str, str], Floats]) -> None:
-        """Start landmarks at places given by letter and name, wherever a table says that they are."""
-        for i, key in enumerate(self.keys):
-            if key in places:
-                self.items[i] = replace(self.items[i], start=places[key].copy())
+    def with_starts(self, starts: Mapping[int, Floats]) -> Landmarks:
+        """The same with other starts of some, wherever a table says that they are.
 
-    def with_start(self, coordinate: int, place: Floats) -> Landmarks:
-        """The same with another start of the landmark with that first coordinate."""
-        other, i = copy(self), self._first.index(coordinate)
-        other.items = [*self.items[:i], replace(self.items[i], start=place), *self.items[i + 1 :]]
+        Args:
+            starts: Coordinates by the landmark's number.
+        """
+        other = copy(self)
+        other.items = [replace(item, start=starts.get(i, item.start).copy()) for i, item in enumerate(self.items)]
         return other

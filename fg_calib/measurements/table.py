@@ -10,8 +10,6 @@ import numpy as np
 
 from fg_calib.initialization import Camera
 from fg_calib.inputs import (
-    LEAST_SIZE,
-    ORDINARY,
     PAIR_MODELS,
     POSE_MODELS,
     Booleans,
@@ -23,20 +21,18 @@ from fg_calib.inputs import (
     Integers,
     Model,
     Pairing,
-    ProblemError,
-    as_figures,
     as_floats,
     check_fields,
     check_flag,
     check_number,
-    check_sizes,
     listed,
-    require,
     set_checked,
     shown,
 )
-from fg_calib.measurements.dataset import Groups, Labels, Measurements, Pairs
+from fg_calib.measurements.dataset import Labels, Measurements, Pairs, only_of
 from fg_calib.measurements.kind import Kind, check_kind
+from fg_calib.measurements.landmarks import Landmark, LandmarkKind, Landmarks
+from fg_calib.measurements.validation import checked_indices, checked_mask, checked_numbers, checked_sigma
 
 
 @dataclass(frozen=True)
@@ -78,8 +74,9 @@ class MeasurementBlock(Brief):
 
     @classmethod
     def of_rows(
-        cls, kind: Kind, table: Table, number: int, rows: Integers, data: Floats, sigma: Floats, **more: Any
-    ) -> MeasurementBlock:
+        cls, kind: Kind, table: Table, number: int, rows: Integers, data: Floats, sigma: Floats,
+        nuisances: Integers | None = None, **more: Any,
+    ) -> MeasurementBlock:  # fmt: skip
         """One measurement a row of a table, all of its components measured.
 
         Args:
@@ -88,14 +85,23 @@ class MeasurementBlock(Brief):
             number: Its number.
             rows: Rows of the table, shape (n,).
             data: What was measured, shape (n, kind.width).
-            sigma: 1 sigma, shape (n, kind.residual_dim).
+            sigma: 1 sigma, which broadcasts to (n, kind.residual_dim).
+            nuisances: Coordinates of nuisances, shape (n, kind.n_nuisances).
             more: Other fields.
         """
-        m, n = table.measurements, len(rows)
-        fields: dict[str, Any] = {"ends": rows[:, None], "number": rows, "source": m.source}
-        fields |= {"measured": np.ones((n, kind.residual_dim), dtype=np.bool_), "test": m.test[rows]}
-        fields |= {"nuisances": np.zeros((n, 0), dtype=np.int64)} | more
-        return cls(kind=kind, table=number, data=np.ascontiguousarray(data), sigma=sigma, **fields)
+        m, shape = table.measurements, (len(rows), kind.residual_dim)
+        nuisances = np.zeros((len(rows), 0), dtype=np.int64) if nuisances is None else np.ascontiguousarray(nuisances)
+        fields: dict[str, Any] = {"measured": np.ones(shape, dtype=np.bool_), "number": rows, "source": m.source} | more
+        return cls(
+            kind=kind,
+            table=number,
+            ends=fields.pop("ends") if "ends" in fields else rows[:, None],
+            test=fields.pop("test") if "test" in fields else m.test[rows],
+            data=np.ascontiguousarray(data),
+            sigma=sigma if sigma.shape == shape else np.ascontiguousarray(np.broadcast_to(sigma, shape)),
+            nuisances=nuisances,
+            **fields,
+        )
 
     @property
     def n(self) -> int:
@@ -132,14 +138,10 @@ class MeasurementBlock(Brief):
             of=None if self.of is None else self.of.of(rows),
         )
 
-    def __post_init__(self) -> None:
-        n, kind = len(self.test), self.kind
-        shapes = {"ends": (n, kind.ends), "data": (n, kind.width), "sigma": (n, kind.residual_dim)}
-        shapes |= {"measured": (n, kind.residual_dim), "nuisances": (n, kind.n_nuisances)}
-        for name, shape in shapes.items():
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise ProblemError(self.source, f"{name} of shape {found}", f"{shape} for {type(kind).__name__}")
+
+UNKNOWN = LandmarkKind(
+    "N", "unknown", "unknowns of kinds of your own", "Other unknowns, [m] and [rad]", must_be_fitted=False
+)
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ class CustomMeasurements(Brief):
     Attributes:
         kind: What they are.
         data: What was measured, shape (n, kind.width).
-        sigma: 1 sigma of each row, a figure or an array that broadcasts to (n, kind.residual_dim).
+        sigma: 1 sigma of each row, a number or an array that broadcasts to (n, kind.residual_dim).
         ends: Configurations of each, shape (n, kind.ends); the table's, one after the other, if None.
         unknowns: Start of each unknown that the kind depends on, shape (n_unknowns, dimension).
         which: Unknowns of each measurement, shape (n, kind.n_nuisances / dimension); the first for all if None.
@@ -170,80 +172,52 @@ class CustomMeasurements(Brief):
         if not isinstance(self.kind, Kind):
             raise InputError("own: kind", f"found {shown(self.kind)}", "an object of a class derived from Kind")
         check_kind(self.kind)
-        data = _figures("own: data", self.data)
-        n, kind = len(data), self.kind
+        kind, data = self.kind, np.atleast_1d(checked_numbers("own: data", self.data))
+        n = len(data)
         data = data.reshape(n, -1) if n else data
         if not n or data.shape[1] != kind.width:
             raise InputError("own: data", f"shape {np.shape(self.data)}", f"({n or 'n'}, {kind.width})")
-        sigma = _custom_sigma(self.sigma, n, kind.residual_dim)
-        names = listed("own: names", self.names)
+        sigma = checked_sigma("own: sigma", self.sigma, (n, kind.residual_dim))
+        starts, names = np.atleast_2d(checked_numbers("own: unknowns", self.unknowns)), listed("own: names", self.names)
         if not all(isinstance(name, str) and name for name in names):
             raise InputError("own: names", f"found {shown(self.names)}", "a word for each unknown")
-        starts = np.atleast_2d(_figures("own: unknowns", self.unknowns))
         if kind.n_nuisances and (starts.ndim != 2 or not starts.size or kind.n_nuisances % starts.shape[1]):
             expected = f"a start for each unknown; {type(kind).__name__} has {kind.n_nuisances} coordinates of them"
             raise InputError("own: unknowns", f"shape {np.shape(self.unknowns)}", expected)
         if names and len(set(names)) != len(starts):
             raise InputError("own: names", f"found {names!r}", f"{len(starts)} different names")
-        for name, given, top in (("ends", self.ends, None), ("which", self.which, len(starts))):
-            if given is not None:
-                _check_indices(f"own: {name}", given, n, top)
-        if self.test is not None:
-            test = np.array(self.test)
-            if test.shape != (n,) or test.dtype != np.bool_:
-                raise InputError("own: test", f"{test.dtype} of shape {test.shape}", f"True or False for each of {n}")
-            object.__setattr__(self, "test", test)
-        for name in ("ends", "which"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, np.array(getattr(self, name)))
-        object.__setattr__(self, "unknowns", starts)
-        object.__setattr__(self, "data", data)
-        object.__setattr__(self, "sigma", sigma)
-        object.__setattr__(self, "names", names)
+        test = None if self.test is None else checked_mask("own: test", self.test, n)
+        found = {"data": data, "sigma": sigma, "unknowns": starts, "names": names, "test": test}
+        for name, top in (("ends", None), ("which", len(starts))):
+            if (given := getattr(self, name)) is not None:
+                found[name] = checked_indices(f"own: {name}", given, n, top)
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
+    def block(self, table: Table, number: int, landmarks: Landmarks) -> MeasurementBlock:
+        """A block of them.
 
-def _custom_sigma(given: Any, n: int, residual_dim: int) -> Floats:
-    """Sigmas that broadcast to (n, residual_dim), all above 0."""
-    sigma = as_figures("own: sigma", given, "finite numbers")
-    check_sizes("own: sigma", sigma)
-    require(sigma > 0.0, "own: sigma", sigma, "a number above 0")
-    require(sigma >= LEAST_SIZE, "own: sigma", sigma, ORDINARY)
-    if sigma.shape == (n,) and n > 1:
-        if n == residual_dim:
-            expected = f"({n}, 1) for one a measurement, (1, {n}) for one a row of each"
-            raise InputError("own: sigma", f"shape ({n},) of {n} measurements of {n} rows", expected)
-        sigma = sigma[:, None]
-    try:
-        np.broadcast_to(sigma, (n, residual_dim))
-    except ValueError:
-        expected = f"one that broadcasts to ({n}, {residual_dim})"
-        raise InputError("own: sigma", f"shape {sigma.shape}", expected) from None
-    return np.atleast_1d(sigma)
+        Their unknowns are in the frame that the table's measurements are in: elsewhere one of the same name is another.
 
-
-def _figures(name: str, given: Any) -> Floats:
-    """Finite numbers, at least one-dimensional, a copy.
-
-    Raises:
-        InputError: They are something else.
-    """
-    values = as_figures(name, given, "finite numbers")
-    check_sizes(name, values)
-    return np.atleast_1d(values)
-
-
-def _check_indices(name: str, given: Any, n: int, top: int | None) -> None:
-    """Check indices of configurations or unknowns, a row each.
-
-    Raises:
-        InputError: They are no whole numbers, too few or out of range.
-    """
-    values = np.asarray(given)
-    if values.dtype.kind not in "iu" or values.shape[:1] != (n,):
-        raise InputError(name, f"{values.dtype} of shape {values.shape}", f"whole numbers, a row for each of {n}")
-    if values.size and (values.min() < 0 or (top is not None and values.max() >= top)):
-        wrong = values.min() if values.min() < 0 else values.max()
-        raise InputError(name, f"found {wrong}", "0 and above" if top is None else f"0 to {top - 1}")
+        Raises:
+            InputError: They are at configurations that the table has not.
+        """
+        m, kind, n = table.measurements, self.kind, len(self.data)
+        ends = np.arange(m.n_configurations)[:, None] if self.ends is None else self.ends.reshape(n, -1)
+        if len(ends) != n or ends.max(initial=0) >= m.n_configurations:
+            found = f"{n} measurements at {len(ends)} configurations" if len(ends) != n else f"found {ends.max()}"
+            raise InputError("own: ends", found, f"one a measurement, 0 to {m.n_configurations - 1}")
+        nuisances, of = None, None
+        if kind.n_nuisances:
+            names = self.names or tuple(map(str, range(len(self.unknowns))))
+            new = [Landmark(UNKNOWN, name, start) for name, start in zip(names, self.unknowns, strict=True)]
+            place = landmarks.add(new, m.source, number if table.unknown_frame else -1, named=bool(self.names))
+            which = np.zeros((n, 1), dtype=np.int64) if self.which is None else self.which.reshape(n, -1)
+            nuisances = place[which].reshape(n, -1)
+            of = Labels(self.names, which[:, 0]) if len(self.names) > 1 and which.shape[1] == 1 else None
+        test = np.zeros(n, dtype=np.bool_) if self.test is None else self.test
+        arrays = np.arange(n), self.data, np.asarray(self.sigma), nuisances
+        return MeasurementBlock.of_rows(kind, table, number, *arrays, ends=ends, test=test, of=of)
 
 
 @dataclass(frozen=True)
@@ -339,25 +313,17 @@ class Table(Brief):
         def split(pairs: Pairs, test: Booleans) -> Pairs:
             return replace(pairs, test=test[pairs.a] | test[pairs.b])
 
-        def of_groups(groups: Groups) -> Groups:
-            touches = [configurations[groups.index == g] for g in range(groups.n_groups)]
-            only = np.array([len(here) > 0 and bool(here.all()) for here in touches], dtype=np.bool_)
-            return replace(groups, pairs=split(groups.pairs, only))
-
-        def of_own(own: CustomMeasurements) -> CustomMeasurements:
-            if not configurations.any():
-                return replace(own, test=None)
+        def split_own(own: CustomMeasurements) -> CustomMeasurements:
             ends = np.arange(len(configurations)) if own.ends is None else own.ends
-            test: Booleans = np.any(configurations[np.reshape(ends, (len(own.data), -1))], axis=1)
-            return replace(own, test=test)
+            return replace(own, test=np.any(configurations[np.reshape(ends, (len(own.data), -1))], axis=1))
 
-        m = replace(
-            m,
-            test=configurations,
-            pairs=None if m.pairs is None else split(m.pairs, configurations),
-            groups=None if m.groups is None else of_groups(m.groups),
-        )
-        return replace(self, measurements=m, own=tuple(map(of_own, self.own)))
+        changes: dict[str, Any] = {"test": configurations}
+        if m.pairs is not None:
+            changes["pairs"] = split(m.pairs, configurations)
+        if (groups := m.groups) is not None:
+            only = only_of(configurations, groups.index, groups.n_groups)
+            changes["groups"] = replace(groups, pairs=split(groups.pairs, only))
+        return replace(self, measurements=replace(m, **changes), own=tuple(map(split_own, self.own)))
 
     @property
     def unknown_frame(self) -> bool:
@@ -374,13 +340,10 @@ def by_station(table: Table) -> tuple[Table, ...]:
     labels = m.labels.get("station")
     if labels is None or not table.unknown_frame:
         return (table,)
+    left = {what: of for what, of in m.labels.items() if what != "station"}
     parts = []
     for k, name in enumerate(labels.names):
-        rows = np.flatnonzero(labels.index == k)
-        if not len(rows):
-            continue
-        part = m.select(rows)
-        labels_left = {what: of for what, of in part.labels.items() if what != "station"}
-        part = replace(part, labels=labels_left, source=f"{m.source}, station {name}", part=rows)
-        parts.append(replace(table, measurements=part))
+        if len(rows := np.flatnonzero(labels.index == k)):
+            part = replace(m, labels=left).select(rows)
+            parts.append(replace(table, measurements=replace(part, source=f"{m.source}, station {name}", part=rows)))
     return tuple(parts) or (table,)

@@ -190,7 +190,7 @@ def _judge(
         verdict=verdict,
         reasons=tuple(reasons),
         cautions=tuple(cautions),
-        n=sum(len(s.train) for s in at.placed.problem.data.series),
+        n=sum(len(s.train) for s in at.placed.problem.data.blocks),
         chi2=at.chi2,
         dof=at.dof,
         p_value=p_value,

@@ -133,7 +133,7 @@ def place_new_data(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed
         raise ProblemError(data.source, "no row takes part", "rows that model and options use")
     solution, arm = solve(held), robot.with_estimated(names_of(robot.parameters))
     problem = started(arm, build_dataset(arm, rows.free_of(known)), options, values, solution)
-    seen, of = () if known is None else known.unknowns, problem.data.unknowns
+    seen, of = () if known is None else known.unknowns, problem.data.landmarks
     pinned = tuple(name for name in seen if coordinates_of(problem.variables, of, name) is not None)
     return Placed(calibrated, solution, problem, pinned)
 
@@ -220,7 +220,7 @@ def linearise_new_data(at: Placed) -> Linear:
     every = whitened(problem, np.vstack([block.private(v.at(problem.start)) for block in problem.rows]))
     J, r = every[:, :wide], every[:, wide]
     stated, J_stated = unknown_prior_rows(v, problem.start)
-    places = [coordinates_of(v, problem.data.unknowns, name) for name in at.pinned]
+    places = [coordinates_of(v, problem.data.landmarks, name) for name in at.pinned]
     pinned = np.array([place for place in places if place is not None], dtype=np.int64).ravel()
     pinned = pinned - v.nuisance_span.start + v.n_columns
     unit, known, information = np.eye(wide), np.zeros((wide, 0)), np.zeros((0, 0))

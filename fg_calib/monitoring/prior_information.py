@@ -161,12 +161,12 @@ def _known_at(problem: Problem, x: Floats, *, with_loss: bool) -> Knowledge:
 
 
 def _staying(problem: Problem) -> list[Name]:
-    unknowns = problem.data.unknowns
+    unknowns = problem.data.landmarks
     return [name for name in unknowns.keys if name[0] in STAYING]
 
 
 def _place(problem: Problem, name: Name) -> NDArray[np.int64] | None:
-    return coordinates_of(problem.variables, problem.data.unknowns, name)
+    return coordinates_of(problem.variables, problem.data.landmarks, name)
 
 
 def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss: bool) -> tuple[Floats, Floats]:
@@ -177,7 +177,7 @@ def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss
     wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]]) for B in blocks]
     known = problem.knowledge
     if known is not None:
-        s, D = known.step_to(v, problem.data.unknowns, parameters)
+        s, D = known.step_to(v, problem.data.landmarks, parameters)
         own = [known.rows[:, known.span(name)] for name in unseen]
         wide.append(np.column_stack([known.rows @ D, *own, known.right + known.rows @ s]))
     every = np.vstack(wide)

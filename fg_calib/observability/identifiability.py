@@ -44,7 +44,7 @@ def observability_of(
         prefer: Parameters to keep, first choice first, where only combinations are determined.
         floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
-    J, n = named_triangle(problem, parameters), sum(len(s.train) for s in problem.data.series)
+    J, n = named_triangle(problem, parameters), sum(len(s.train) for s in problem.data.blocks)
     scales = np.array([problem.robot.scale_of(p.unit) for p in problem.estimated])
     return observability_of_rows(J, problem.estimated, scales=scales, n_measurements=n, prefer=prefer, floor=floor)
 

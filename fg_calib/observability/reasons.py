@@ -20,8 +20,7 @@ import numpy as np
 
 from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, places_of, square_root, true_problem
 from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model, Options, Pairing
-from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Labels, Measurements, Table
-from fg_calib.measurements.kinds import Instrument
+from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Instrument, Labels, Measurements, Table
 from fg_calib.observability.indices import Observability
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, build_chain, forward, random_readings

@@ -431,7 +431,7 @@ def summary(result: Result, most: int = 4) -> list[str]:
 
 def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
     """What a reader of the report should know besides, a sentence each."""
-    problem, weights, series = solution.problem, solution.problem.state.weights, solution.problem.data.series
+    problem, weights, series = solution.problem, solution.problem.state.weights, solution.problem.data.blocks
     for reason, count in problem.n_excluded.items():
         if count:
             yield f"{count} train rows are excluded: {reason.replace('_', ' ')}"

@@ -91,6 +91,7 @@ import pydantic
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
 from scipy.spatial.transform import Rotation
 
+from fg_calib.initialization import Camera
 from fg_calib.inputs import (
     PAIR_MODELS,
     POSE_MODELS,
@@ -134,7 +135,6 @@ from fg_calib.io import (
     validate,
 )
 from fg_calib.measurements import Noise
-from fg_calib.measurements.kinds import Camera
 from fg_calib.robot import Robot, names_of, tolerance_kind
 
 MOST_DRAWN = 1_000_000

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib.initialization import Camera
 from fg_calib.inputs import (
     PAIR_MODELS,
     POSE_MODELS,
@@ -54,7 +55,6 @@ from fg_calib.measurements import (
     form_pairs,
     no_pairs,
 )
-from fg_calib.measurements.kinds import Camera
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import (

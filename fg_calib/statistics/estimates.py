@@ -223,7 +223,7 @@ def finite(sigma: float) -> float | None:
 def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...]:
     """Landmarks; their sigma comes from the parameters, which they follow, and from their own rows."""
     problem = solution.problem
-    unknowns = problem.data.unknowns
+    unknowns = problem.data.landmarks
     if not unknowns.names:
         return ()
     at = at_parameters(problem, solution.parameters)
@@ -231,17 +231,17 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
     names, found = unknowns.keys, []
     for i, (_, name) in enumerate(names):
-        kind = unknowns.kinds[i]
+        kind = unknowns.items[i].kind
         if not kind.heading:
             continue
         span = slice(first[i], first[i + 1])
         columns = at.columns[span] - problem.variables.n_columns
-        values, C, units = at.coordinates[span], np.zeros((unknowns.sizes[i],) * 2), unknowns.units[i]
+        values, C, units = at.coordinates[span], np.zeros((unknowns.sizes[i],) * 2), unknowns.items[i].units
         if np.all(columns >= 0):
             F, S = left.follow[columns], left.inverse[columns]
             C = whole.covariance(F) + S @ S.T
             C[left.unknown[columns]] = np.nan
-        elif not unknowns.known[i]:
+        elif not unknowns.items[i].known:
             C[:] = np.nan
         if kind.estimate is not None:
             k = i if kind.reference is None else names.index((kind.reference.letter, name))
@@ -252,9 +252,9 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
 
 def _n_rows(problem: Problem) -> Integers:
     """Number of train measurements that each landmark takes part in, shape (n_landmarks,)."""
-    unknowns = problem.data.unknowns
+    unknowns = problem.data.landmarks
     counts = np.zeros(len(unknowns.names), dtype=np.int64)
-    for s in problem.data.series:
+    for s in problem.data.blocks:
         owners = unknowns.owners[s.nuisances[s.train]]
         for k, column in enumerate(owners.T if s.kind.ends else ()):
             new = np.all(owners[:, :k] != column[:, None], axis=1)

@@ -665,7 +665,7 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
         return chi2, problem.n_independent, 1.0
     n_rows = n_kept = expected = 0.0
     distances = mahalanobis_distances(problem, solution.parameters)
-    for series, w, (e, residual_dim) in zip(problem.data.series, weights, distances, strict=True):
+    for series, w, (e, residual_dim) in zip(problem.data.blocks, weights, distances, strict=True):
         train, outlier = (residual_dim > 0) & ~series.test, w < OUTLIER_WEIGHT
         chi2 -= float(np.sum(w[train & outlier] * e[train & outlier] ** 2))
         kept = float(residual_dim[train & ~outlier].sum())

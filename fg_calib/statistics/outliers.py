@@ -116,11 +116,11 @@ def _fit_without_outliers(
 def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem:
     """The problem whose rows left out are predicted, not fitted; from where the arm is nominal."""
     data, blocks = solution.problem.data, []
-    for number, s in enumerate(data.series):
+    for number, s in enumerate(data.blocks):
         test = s.test.copy()
         test[table.measurement[out & (table.series == number)]] = True
         blocks.append(replace(s, test=test))
-    return with_factors(solution.problem, solution.before, data=replace(data, series=tuple(blocks)))
+    return with_factors(solution.problem, solution.before, data=replace(data, blocks=tuple(blocks)))
 
 
 def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, rest: Goodness) -> Goodness:

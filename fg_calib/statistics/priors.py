@@ -380,7 +380,7 @@ def _judged_rows(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], F
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
         # The places' errors follow those of the core, and what is theirs alone comes on top.
-        left, unknowns = linear_system(problem, solution.parameters, with_loss=True).left, problem.data.unknowns
+        left, unknowns = linear_system(problem, solution.parameters, with_loss=True).left, problem.data.landmarks
         of_core, of_places = P_places[:, : variables.n_columns], P_places[:, variables.n_columns :]
         P = np.vstack([P, of_core + of_places @ left.follow])
         own = np.vstack([np.zeros((len(z), left.rank)), of_places @ left.inverse])

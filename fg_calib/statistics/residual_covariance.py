@@ -161,9 +161,11 @@ class RowModel:
         self._common = self._states.predicted(noises)
         core, landmarks = np.split(felt(problem, parameters, self._states, self._common), [self._n])
         self._felt = np.eye(width, self._n) @ core + of_landmarks.T @ landmarks
-        blocks, unknowns = problem.data.series, problem.data.unknowns
+        blocks, unknowns = problem.data.blocks, problem.data.landmarks
         self._means = [says_where(problem.data, s) & ~estimated[s.nuisances].any(axis=1) for s in blocks]
-        located = estimated | np.repeat(np.array(unknowns.known, dtype=np.bool_), unknowns.sizes)
+        located = estimated | np.repeat(
+            np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes
+        )
         for s, touches in zip(blocks, self._means, strict=True):
             located[s.nuisances[touches].ravel()] = True
         self._nowhere: list[Booleans] = [np.any(~located[s.nuisances], axis=1) for s in blocks]

@@ -14,7 +14,6 @@ from scipy import special
 from fg_calib.graph import Solution, noises_at
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import Labels, MeasurementBlock
-from fg_calib.measurements.kinds import checked_figures
 
 Codes = NDArray[np.int16]
 Indices = NDArray[np.int32]
@@ -298,14 +297,14 @@ def residual_table(solution: Solution) -> ResidualTable:
     kinds: dict[RowKind, int] = {}
     reasons, labels = {"": 0}, {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
-    for number, (s, old, new) in enumerate(zip(data.series, before, solution.noises, strict=True)):
+    for number, (s, old, new) in enumerate(zip(data.blocks, before, solution.noises, strict=True)):
         names = zip(s.kind.names, s.kind.units, strict=True)
         codes = np.array([kinds.setdefault(RowKind(*name, s.table), len(kinds)) for name in names], dtype=np.int16)
         excluded = np.zeros(s.n, dtype=np.int16)
         for reason, mask in s.excluded.items():
             excluded[mask] = reasons.setdefault(reason, len(reasons))
         m, k = np.nonzero(s.measured)  # measurement and component of each row
-        a, b = _ends(data.places[s.table][s.ends], data.unknowns.owners[s.nuisances], data.n_configurations)
+        a, b = _ends(data.places[s.table][s.ends], data.landmarks.owners[s.nuisances], data.n_configurations)
         after, excess, sigma = new.figures()
         columns.append(
             {
@@ -319,7 +318,7 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "table_row": _table_rows(s, data.tables[s.table].measurements.part)[m],
                 "test": s.test[m],
                 "reason_code": excluded[m],
-                "measured": checked_figures(s.kind, s.data, s.source)[m, k],
+                "measured": s.kind.figures(s.data)[m, k],
                 "before": old.residual()[m, k],
                 "after": after[m, k],
                 "excess": excess[m, k],

@@ -127,8 +127,8 @@ def error_of(found, true):
 
 def sides(problem, parameters, normals):
     """Sign of each normal along the true one; every unknown has three coordinates."""
-    unknowns, at = problem.data.unknowns, problem.variables.at(parameters).coordinates.reshape(-1, 3)
-    place = dict(zip(zip(unknowns.letters, unknowns.names, strict=True), at, strict=True))
+    unknowns, at = problem.data.landmarks, problem.variables.at(parameters).coordinates.reshape(-1, 3)
+    place = dict(zip(unknowns.keys, at, strict=True))
     return [np.sign((place["F", f"p{i}"] - place["C", f"p{i}"]) @ n) for i, n in enumerate(normals)]
 
 

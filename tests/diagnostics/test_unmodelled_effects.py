@@ -139,7 +139,7 @@ def test_a_forgotten_offset_is_reported_with_its_size():
     solution = solve(build_problem(robot, [table]))
     (found,) = forgotten_offsets(solution)
     estimated = solve(build_problem(robot, [replace(table, offset=True)]))
-    unknowns = estimated.problem.data.unknowns
+    unknowns = estimated.problem.data.landmarks
     place = int(np.flatnonzero(unknowns.owners == [n.startswith("offset") for n in unknowns.names].index(True))[0])
     estimate = estimated.parameters[estimated.problem.variables.nuisance_span][place]
     # As it is estimated with all others: linear to a tenth of its sigma.

@@ -14,7 +14,7 @@ from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import InputError
-from fg_calib.measurements.kinds import Kind, Rows
+from fg_calib.measurements import Kind, Rows
 from fg_calib.measurements.kinds.pair import Distance
 from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.observability.reasons import NOT_EXCITED
@@ -59,7 +59,7 @@ def test_a_sigma_that_may_mean_two_things_is_refused():
     class Three(Offset):
         residual_dim, names, units = 3, ("x", "y", "z"), ("m", "m", "m")
 
-    with pytest.raises(InputError, match=r"own: sigma: shape \(3,\) of 3 measurements of 3 rows, expected \(3, 1\)"):
+    with pytest.raises(InputError, match=r"own: sigma: shape \(3,\) of 3 rows, expected \(3, 1\)"):
         CustomMeasurements(Three(), [[1.0], [2.0], [3.0]], sigma=[1e-3, 2e-3, 3e-3], unknowns=[[0.0]])
     with pytest.raises(InputError, match=r"own: sigma: shape \(7,\), expected one that broadcasts to \(3, 3\)"):
         CustomMeasurements(Three(), [[1.0], [2.0], [3.0]], sigma=np.full(7, 1e-3), unknowns=[[0.0]])
@@ -167,14 +167,9 @@ def described(**attributes):
     return type("Mine", (Kind,), {name: value for name, value in own.items() if value is not None})()
 
 
-def fail(_):
-    raise KeyError("tip")
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (fail, "lengths: kind Mine: rows: raised KeyError: 'tip'"),
         (lambda r: None, "lengths: kind Mine: rows: returned a NoneType, expected Rows(residual, D, N)"),
         (lambda r: r._replace(residual=r.residual * np.nan), "lengths: kind Mine: residual: row 0: found nan, expected "
          "a finite number; at the start of the unknowns"),
@@ -193,21 +188,20 @@ def test_what_rows_raise_or_return_is_one_line_that_names_kind_and_table(change,
     with pytest.raises(InputError) as found:
         of_kind(changed(change))
     assert str(found.value) == said
-    assert isinstance(found.value.__cause__, KeyError) == (change is fail)
 
 
 @pytest.mark.parametrize(
     ("attributes", "said"),
     [
-        ({"ends": None}, "ends: it is missing, expected a whole number, 0 to 2"),
-        ({"ends": 3}, "ends: found 3, expected a whole number, 0 to 2"),
-        ({"residual_dim": "1"}, "residual_dim: found '1', expected a whole number, 1 to 1000"),
-        ({"width": 1.0}, "width: found 1.0, expected a whole number, 0 to 1000"),
-        ({"n_nuisances": True}, "n_nuisances: found True, expected a whole number, 0 to 1000"),
+        ({"ends": None}, "ends: found None, expected a whole number not below 0"),
+        ({"ends": 3}, "ends: found 3, expected at most 2"),
+        ({"residual_dim": "1"}, "residual_dim: found '1', expected a whole number not below 1"),
+        ({"width": 1.0}, "width: found 1.0, expected a whole number not below 0"),
+        ({"n_nuisances": True}, "n_nuisances: found True, expected a whole number not below 0"),
         ({"names": "anchor"},
          "names: found 'anchor', expected a tuple of residual_dim = 1 words, such as ('height',)"),
         ({"units": ("m", "m")}, "units: found ('m', 'm'), expected a tuple of residual_dim = 1 words, such as ('m',)"),
-        ({"units": None}, "units: it is missing, expected a tuple of residual_dim = 1 words, such as ('m',)"),
+        ({"units": None}, "units: found None, expected a tuple of residual_dim = 1 words, such as ('m',)"),
         ({"units": ("mm",)}, "units: found ('mm',), expected m, rad or px each"),
         ({"code": 1}, "code: found 1, expected None: compiled code would take the place of its rows"),
     ],
@@ -227,20 +221,6 @@ def test_a_kind_of_ours_cannot_be_changed_under_its_compiled_twin():
         CustomMeasurements(Longer(), np.ones(3), SIGMA, ends=np.zeros((3, 2), int))
 
 
-def test_numbers_that_a_kind_shows_are_checked_and_want_of_memory_is_no_fault_of_it():
-    class Mine(AnchorDistance):
-        def figures(self, data):
-            if len(data) != 12:
-                raise MemoryError
-            return data.ravel()
-
-    with pytest.raises(InputError, match=r"^lengths: kind Mine: figures: shape \(12,\), expected \(12, 1\)$"):
-        of_kind(Mine())
-    robot, _, table = lengths_to_anchors(5)
-    with pytest.raises(MemoryError):
-        build_problem(robot, replace(table, own=(replace(table.own[0], kind=Mine()),)))
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -256,14 +236,14 @@ def test_numbers_that_a_kind_shows_are_checked_and_want_of_memory_is_no_fault_of
         ({"sigma": -1.0}, "sigma: found -1, expected a number above 0"),
         ({"sigma": "1e-3"}, "sigma: found '1e-3', expected finite numbers"),
         ({"sigma": 1e-200}, "sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances no "),
-        ({"which": np.full((60, 1), 3)}, "which: found 3, expected 0 to 2"),
-        ({"ends": np.full((60, 1), -1)}, "ends: found -1, expected 0 and above"),
+        ({"which": np.full((60, 1), 3)}, "which: row 0: found 3, expected 0 to 2"),
+        ({"ends": np.full((60, 1), -1)}, "ends: row 0: found -1, expected 0 and above"),
         ({"names": ("A", "A", "B")}, "names: found ('A', 'A', 'B'), expected 3 different names"),
         ({"names": (1, 2, 3)}, "names: found (1, 2, 3), expected a word for each unknown"),
         ({"names": 3}, "names: found 3, expected a list of names"),
         ({"unknowns": np.zeros((0, 0))}, "unknowns: shape (0, 0), expected a start for each unknown; "),
         ({"unknowns": np.zeros((3, 1, 3))}, "unknowns: shape (3, 1, 3), expected a start for each unknown; "),
-        ({"test": [True]}, "test: bool of shape (1,), expected True or False for each of 60"),
+        ({"test": [True]}, "test: shape (1,), expected (60,), one a row"),
         ({"kind": AnchorDistance}, "kind: found <class 'custom_kinds.AnchorDistance'>, expected an object of a class"),
     ],
 )

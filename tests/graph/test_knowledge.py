@@ -66,7 +66,7 @@ def test_rows_elsewhere_follow_the_tangent_of_frames():
     robot, _, table = measured_by("anchors", np.random.default_rng(3), n=24)
     robot = robot.with_estimated([*(p.name for p in robot.parameters if p.estimated), *TOOL])
     problem = build_problem(robot, table)
-    variables, unknowns = problem.variables, problem.data.unknowns
+    variables, unknowns = problem.variables, problem.data.landmarks
     rng, names = np.random.default_rng(4), [name for name in unknowns.keys if name[0] == "A"]
     A, at = rng.normal(size=(50, 22 + 3 * len(names))), rng.normal(size=3 * len(names))
     known = Knowledge.of_rows(robot.with_values(robot.nominal + 0.01), names, at, A, rng.normal(size=50))

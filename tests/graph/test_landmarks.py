@@ -259,7 +259,7 @@ def test_a_length_of_zero_is_contact_unless_the_instrument_adds_an_offset():
     length[[4, 7]] = 0.0
     for offset, kinds in ((True, {"AnchorDistance": 40}), (False, {"AnchorDistance": 38, "AnchorContact": 2})):
         m = replace(table.measurements, length=length)
-        series = build_problem(robot, replace(table, measurements=m, offset=offset)).data.series
+        series = build_problem(robot, replace(table, measurements=m, offset=offset)).data.blocks
         assert {type(s.kind).__name__: s.n for s in series} == kinds
     assert [[s.of.names[i] for i in s.of.index[:3]] for s in series] == [["a0", "a1", "a2"], ["a1", "a1"]]
 
@@ -269,7 +269,7 @@ def test_what_an_instruments_model_lacks_is_named():
     m = table.measurements
     for model, lacks in (
         ("plane", "no column plane, expected the name of a plane for model plane"),
-        ("board", "no columns qx, qy, qz, qw, or roll, pitch, yaw, or rx, ry, rz, expected measured"),
+        ("board", "no columns qx, qy, qz, qw or roll, pitch, yaw, expected measured"),
         ("pixels", "no columns u, v, corner_x, corner_y, expected images of a board's points for model pixels"),
         ("position", "no columns x, y, z, expected measured positions for model position"),
     ):

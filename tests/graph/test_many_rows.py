@@ -62,18 +62,18 @@ def test_a_small_table_beside_a_large_one_of_which_no_row_is_drawn(sigma_joint, 
     problem = build_problem(robot, tables)
     expected = solve(problem)
     monkeypatch.setattr(solver, "MAX_AT_ONCE", 100)
-    assert any(s.n == 0 for s in subsampled(problem, solver.SAMPLE_SHARE).data.series)
+    assert any(s.n == 0 for s in subsampled(problem, solver.SAMPLE_SHARE).data.blocks)
     found = solve(problem)
     assert found.converged
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
 
 
 def test_some_rows_are_train_rows_and_as_many_as_asked_for(problem):
-    (s,) = problem.data.series
+    (s,) = problem.data.blocks
     test = np.arange(s.n) % 3 == 0
-    held_out = replace(problem, data=replace(problem.data, series=(replace(s, test=test),)))
+    held_out = replace(problem, data=replace(problem.data, blocks=(replace(s, test=test),)))
     few = subsampled(held_out, 0.1)
-    (drawn,) = few.data.series
+    (drawn,) = few.data.blocks
     assert drawn.n == round(0.1 * np.sum(~test))
     assert not test[drawn.number].any()
     assert np.array_equal(drawn.data, s.data[drawn.number])

@@ -219,8 +219,8 @@ def test_rows_optimum_and_covariance_are_those_of_dense_formulas(name):
         found = joint_errors(there, x) / there.sigma_joint
         assert np.abs(found + effect[:, :, -1])[np.any(effect, axis=(1, 2))].max() < 1e-4
     rng = np.random.default_rng(1)
-    weights = tuple(rng.uniform(0.1, 1.0, s.n) for s in problem.data.series)
-    kinds = {(s.table, part.split(".")[0]) for s in problem.data.series for part in s.kind.names}
+    weights = tuple(rng.uniform(0.1, 1.0, s.n) for s in problem.data.blocks)
+    kinds = {(s.table, part.split(".")[0]) for s in problem.data.blocks for part in s.kind.names}
     factors = dict(zip(sorted(kinds), rng.uniform(0.5, 2.0, len(kinds)), strict=True)) | {JOINT_NOISE: 1.3}
     check_system(relinearized_at(problem, problem.start, replace(problem.state, weights=weights, factors=factors)),
                  problem.start)  # fmt: skip
@@ -271,7 +271,7 @@ def check_derivatives(problem, values):
     """
     graph, rng, ordering, variables = problem.graph, np.random.default_rng(3), gtsam.Ordering(), problem.variables
     scales = {v.key: variables.all_scales[v.columns] for v in (*variables.items, *variables.nuisance)}
-    if any(part.turned_back for s in problem.data.series for part in s.kind.parts):
+    if any(part.turned_back for s in problem.data.blocks for part in s.kind.parts):
         scales |= {v.key: 0.0 * scales[v.key] for v in variables.items}
     step, sizes = gtsam.VectorValues(), values.zeroVectors()
     for key in graph.keyVector():

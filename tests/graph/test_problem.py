@@ -62,7 +62,7 @@ def test_angles_near_0_and_180_degrees_have_the_moments_of_drawn_ones():
     s, off = 1e-3, np.array([0.0, 1.0, 2.0, 30.0, 30.0, 2.0, 1.0])
     angles = np.where(np.arange(7) < 4, s * np.maximum(off, 1e-9), np.pi - s * off)
     problem = build_problem(planar_robot(), planar_pairs(angles, sigma=(1e-5, s)), model="rotation")
-    (series,), (noise,) = problem.data.series, problem.noises
+    (series,), (noise,) = problem.data.blocks, problem.noises
     assert series.kind.names == ("angle",)
     assert series.used.all()
     assert problem.n_excluded == {"same_configuration": 0}
@@ -86,7 +86,7 @@ def test_an_angle_of_0_or_180_degrees_that_contradicts_the_arm_is_in_chi_square(
 def test_only_a_directly_measured_distance_of_zero_becomes_three_coordinates():
     distance = [0.0, 1e-12, 0.0031, 0.6]
     problem = build_problem(planar_robot(), planar_pairs([0.2] * 4, distance=distance), model="distance-rotation")
-    pairs, same = problem.data.series
+    pairs, same = problem.data.blocks
     assert same.kind.names == ("distance.x", "distance.y", "distance.z")
     assert same.number.tolist() == [0]
     assert pairs.kind.names == ("distance", "angle")
@@ -102,7 +102,7 @@ def test_a_distance_of_zero_between_measured_poses_is_a_number_like_others():
     position = m.position.copy()
     position[3] = position[0]
     problem = build_problem(robot, replace(m, position=position), model="distance", pairing=Pairing("all"))
-    assert [s.kind.names for s in problem.data.series] == [("distance",)]
+    assert [s.kind.names for s in problem.data.blocks] == [("distance",)]
     assert problem.n_residuals == 45
 
 
@@ -158,7 +158,7 @@ def test_what_cannot_be_solved_is_refused_in_one_line():
         "poses.csv: no sigma for orientation, expected noise.orientation or a column sigma_orientation"
     )
     assert refused(robot, replace(poses, rotation=None), model="rotation") == (
-        "poses.csv: no columns qx, qy, qz, qw or roll, pitch, yaw, expected orientations for model rotation"
+        "poses.csv: no columns qx, qy, qz, qw or roll, pitch, yaw, expected measured orientations for model rotation"
     )
     assert refused(robot, replace(poses, sigma_position=None), model="distance") == (
         "pairs from poses.csv: no sigma for distance, expected noise.position or a column sigma_position"

@@ -10,9 +10,9 @@ from scipy.stats import chi2, kstest
 from tolerances import sigmas_apart
 
 from fg_calib.importers.board import INTRINSICS, CalibrationBoard, Corners, camera_derivatives, fit_board
+from fg_calib.initialization import Camera
 from fg_calib.inputs import InputError
 from fg_calib.measurements.kind import Frames
-from fg_calib.measurements.kinds import Camera
 from fg_calib.measurements.kinds.board import BoardPose
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")

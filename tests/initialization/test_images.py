@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fg_calib.initialization import Camera
 from fg_calib.initialization.boards import boards_from_image, undistorted
-from fg_calib.measurements.kinds import Camera
 
 CAMERA = Camera(fx=900, fy=880, cx=640, cy=480)
 CORNERS = np.array([[0.08 * i, 0.08 * j] for i in range(4) for j in range(3)])

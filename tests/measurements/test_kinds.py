@@ -9,16 +9,16 @@ from scipy.spatial.transform import Rotation
 from sparing import diagonal
 from tolerances import rounding
 
-from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import Camera, Frames, Kind, Rows, check_derivatives
+from fg_calib.initialization import Camera
+from fg_calib.measurements import Frames, Kind, Rows, check_rows, residuals
+from fg_calib.measurements.kind import Stacked
 from fg_calib.measurements.kinds.anchor import AnchorContact, AnchorDistance
 from fg_calib.measurements.kinds.board import BoardPose
-from fg_calib.measurements.kinds.contact import PointDistance, TouchedPoint
-from fg_calib.measurements.kinds.pair import Distance, RotationAngle, SamePoint
+from fg_calib.measurements.kinds.contact import PointDistance, SamePoint, TouchedPoint
+from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.kinds.pixel import Pixel, RoomPixel
 from fg_calib.measurements.kinds.plane import PlaneDistance
 from fg_calib.measurements.kinds.pose import Orientation, Position, TargetPosition
-from fg_calib.measurements.kinds.stacked import Stacked
 from fg_calib.measurements.residuals import Block, pack, unit_whitening, unpack
 from fg_calib.robot.kernels import LANES
 from fg_calib.robot.kinematics import build_chain
@@ -194,9 +194,9 @@ def seen_by_camera(n, rng):
 
 def test_pixels_have_the_derivatives_of_central_differences():
     at, data, board = seen_by_camera(40, np.random.default_rng(23))
-    check_derivatives(Pixel(CAMERA), at, data, board)
+    check_rows(Pixel(CAMERA), at, data, board)
     in_room = Frames(at.rotation, 0.3 * at.position + [0.0, 0.0, 4.0])
-    check_derivatives(RoomPixel(CAMERA), in_room, data, np.zeros((40, 0)))
+    check_rows(RoomPixel(CAMERA), in_room, data, np.zeros((40, 0)))
 
 
 def test_a_camera_in_the_room_and_one_on_the_tool_see_the_same_board():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fg_calib import Robot
-from fg_calib.measurements.limits import limit_hint
+from fg_calib.measurements.validation import limit_hint
 
 WIDEN = "widen the joint's limits if the reading is right"
 GANTRY = Robot.from_dh(

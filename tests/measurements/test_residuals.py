@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
 from fg_calib.graph.error_states import SchurComplement, State, WhitenedBlock, WhitenedSeries
-from fg_calib.measurements import residuals
-from fg_calib.measurements.kinds import stack
+from fg_calib.measurements import residuals, stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.kinds.pose import Orientation
 from fg_calib.measurements.residuals import Block, pack

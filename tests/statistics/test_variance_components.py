@@ -120,7 +120,7 @@ def dense_model(solution):
     L = of_joints.reshape(len(r), -1)
     own = C - L @ L.T
     kinds = np.concatenate([
-        np.tile([name.partition(".")[0] for name in s.kind.names], len(s.train)) for s in problem.data.series
+        np.tile([name.partition(".")[0] for name in s.kind.names], len(s.train)) for s in problem.data.blocks
     ])  # fmt: skip
     parts = [own * np.equal.outer(kinds, [k])[:, 0, None] for k in dict.fromkeys(kinds)]
     residual, rows = prior_rows(problem.variables, x)

@@ -5,24 +5,10 @@
 
 from importlib import import_module
 
-from fg_calib.initialization import Camera
 from fg_calib.inputs import MODELS
-from fg_calib.measurements.kind import (
-    Frames,
-    Kind,
-    Rows,
-    check_derivatives,
-    check_kind,
-    check_start,
-    checked_figures,
-    checked_rows,
-    is_ours,
-)
+from fg_calib.measurements import UNKNOWN, LandmarkKind
 from fg_calib.measurements.kinds.contact import POINT
-from fg_calib.measurements.kinds.custom import UNKNOWN
 from fg_calib.measurements.kinds.instrument import Column, Instrument
-from fg_calib.measurements.kinds.stacked import stack
-from fg_calib.measurements.landmarks import LandmarkKind
 
 INSTRUMENTS: dict[str, Instrument] = {
     instrument.model: instrument
@@ -43,23 +29,3 @@ GENERIC_COLUMNS: dict[str, Column] = {
     if column.names[0] in i.generic_columns
 }
 """Columns that `Measurements.columns` holds, which are kinds of noise too."""
-
-__all__ = [
-    "GENERIC_COLUMNS",
-    "INSTRUMENTS",
-    "LANDMARKS",
-    "Camera",
-    "Column",
-    "Frames",
-    "Instrument",
-    "Kind",
-    "LandmarkKind",
-    "Rows",
-    "check_derivatives",
-    "check_kind",
-    "check_start",
-    "checked_figures",
-    "checked_rows",
-    "is_ours",
-    "stack",
-]

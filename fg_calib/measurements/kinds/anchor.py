@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization import anchors_from_lengths, offset_from_lengths
 from fg_calib.inputs import Floats, ProblemError
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Frames, Kind, Rows, between
-from fg_calib.measurements.kinds.contact import Contact
-from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
-from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
-from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot import Poses
+from fg_calib.measurements import Coincidence, Landmark, LandmarkKind, Landmarks, Length, Table
+from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Kinds, Quantity
 
 ANCHOR = LandmarkKind(
     "A",
@@ -24,6 +17,7 @@ ANCHOR = LandmarkKind(
     "the unknown anchors",
     "Anchors (in the base frame), mm",
     key="anchors",
+    away=2.0,
     n_configurations=4,
     stays=True,
 )
@@ -37,30 +31,17 @@ OFFSET = LandmarkKind(
 )
 
 LEAST_LENGTHS = 4
-"""Lengths that tell an anchor from its mirror image."""
+"""Lengths that distinguish an anchor from its mirror image."""
 
 
-class AnchorDistance(Kind):
-    """`|p - a| + offset - measured`, [m]; its derivative is `u . (dp - da) + doffset`, u from the anchor a to p.
+class AnchorDistance(Length):
+    """The length from an anchor to the tool point.
 
     Data: the length, [m]. Nuisances: the anchor in the frame that the chain starts in, and what the instrument adds to
     every length, 4 coordinates, [m].
     """
 
-    names, units = ("distance",), ("m",)
-    ends, residual_dim, width, n_nuisances = 1, 1, 1, 4
-
-    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
-        """See `Kind.rows`."""
-        length, u = between(nuisances[:, :3], at.position[:, 0])
-        D = np.zeros((len(u), 1, 1, 6))
-        D[:, 0, 0, 3:] = u
-        N = np.concatenate([-u, np.ones((len(u), 1))], axis=1)[:, None]
-        return Rows((length + nuisances[:, 3])[:, None] - data[:, :1], D, N)
-
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """See `Kind.simulate`."""
-        return np.abs(super().simulate(at, data, nuisances, noise))
+    ends, n_nuisances = 1, 4
 
     def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
         """The anchor mirrored in the plane that its tool points are nearest to; None of few. See `Kind.mirrored`."""
@@ -71,65 +52,42 @@ class AnchorDistance(Kind):
         return np.append(place - 2.0 * across * (across @ (place - middle)), nuisances[3:])
 
 
-class AnchorContact(Contact):
-    """`p - a` in the frame that the chain starts in, [m]: a distance of zero, which has no direction.
+class AnchorContact(Coincidence):
+    """The tool point minus an anchor, in the frame that the chain starts in. Nuisances: the anchor, [m]."""
 
-    Data: none. Nuisances: the anchor a, 3 coordinates, [m].
-    """
-
-    names = ("distance.x", "distance.y", "distance.z")
+    ends, n_nuisances = 1, 3
 
 
 class AnchorGauge(Instrument):
-    """Lengths to anchors."""
+    """Lengths to anchors; where one was measured as 0 the tool is at the anchor, unless the offset is unknown."""
 
     model, words = "anchor", "lengths to anchors"
-    columns = (
-        Column(("anchor",), "", "Which anchor the distance is to"),
-        Column(("distance",), "length", "To the anchor (0: contact), or from the plane (0 without)"),
-        Column(("sigma_distance",), "length", "1 sigma of that"),
-    )
+    quantities = (Quantity("length", "distance", "distance", "lengths to the anchors"),)
+    columns = (Column(("anchor",), "", "Which anchor the distance is to"), *LENGTH_COLUMNS)
     labels = optional_labels = ("anchor",)
     noise, landmarks, options = ("distance",), (ANCHOR, OFFSET), ("offset",)
     sees_landmarks = True
 
-    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
-        """Lengths; where one was measured as 0 the tool is at the anchor, unless the instrument adds something unknown.
-
-        Raises:
-            ProblemError: A column or a sigma is missing.
-        """
+    def kinds(self, table: Table) -> Kinds:
+        """See `Instrument.kinds`."""
         m = table.measurements
-        labels = self.require_labels(table, "anchor")
-        length = self.require(table, m.length, "distance", "lengths to the anchors")
-        rows = np.flatnonzero((labels.index >= 0) & np.isfinite(length))
-        sigma = self.require_sigma(table, m.sigma_length, "distance", rows)
-        fitted = rows[~m.test[rows]]
-        if table.offset and len(fitted) and not length[fitted].any():
+        there = self.names(m, ANCHOR).index >= 0
+        contact = np.zeros(len(there), dtype=np.bool_) if m.length is None else m.length == 0.0
+        fitted = there & ~m.test
+        if table.offset and fitted.any() and contact[fitted].all():
             raise ProblemError(m.source, "contacts alone: all distances are 0", "lengths, or no offset to be estimated")
-        anchors = add_points(landmarks, ANCHOR, table, labels.names)
-        start = np.full((1, 1), np.nan if table.offset else 0.0)
-        added = landmarks.add(OFFSET, (OFFSET.of(m.source),), start, m.source, number, known=[not table.offset])
-        contact = (length[rows] == 0.0) & (not table.offset)
-        nuisances = np.hstack([anchors[labels.index[rows]], np.repeat(added, len(rows), axis=0)])
-        return [
-            MeasurementBlock.of_rows(
-                kind,
-                table,
-                number,
-                rows[chosen],
-                length[rows[chosen], None][:, : kind.width],
-                np.repeat(sigma[chosen, None], kind.residual_dim, axis=1),
-                nuisances=np.ascontiguousarray(nuisances[chosen, : kind.n_nuisances]),
-                of=labels.of(rows[chosen]),
-            )
-            for kind, chosen in ((AnchorDistance(), ~contact), (AnchorContact(), contact))
-            if chosen.any()
-        ]
+        contact &= not table.offset
+        return [(AnchorDistance(), there & ~contact), (AnchorContact(), there & contact)]
+
+    def landmark(self, table: Table, kind: LandmarkKind, name: str) -> Landmark:
+        """See `Instrument.landmark`; the offset is 0 where it is not estimated."""
+        if kind is OFFSET and not table.offset:
+            return Landmark(kind, name, np.zeros(1), known=True)
+        return super().landmark(table, kind, name)
 
     def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """What each table adds, from its rows alone; then anchors from all tables. See `Instrument.start_landmarks`."""
-        at = np.concatenate(landmarks.starts)
+        at = landmarks.start
         lengths = []
         for block, there in zip(blocks, points, strict=True):
             length = np.zeros(block.n) if block.kind.is_contact else block.data[:, 0]
@@ -139,25 +97,14 @@ class AnchorGauge(Instrument):
                     places, anchor = np.unique(block.nuisances[:, 0], return_inverse=True)
                     known = at[places[:, None] + np.arange(3)]
                     at[offset] = offset_from_lengths(there, length, anchor.ravel(), known)
-                    landmarks.start(offset, at[[offset]])
+                    landmarks.start_at(offset, at[[offset]])
                 length = length - at[offset]
             lengths.append(length)
         places, anchor = np.unique(np.concatenate([block.nuisances[:, 0] for block in blocks]), return_inverse=True)
         known = at[places[:, None] + np.arange(3)]
         found = anchors_from_lengths(np.concatenate(points), np.concatenate(lengths), anchor.ravel(), known)
         for coordinate, place in zip(places.tolist(), found, strict=True):
-            landmarks.start(coordinate, place)
-
-    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
-        """See `Instrument.predict`."""
-        there = places_of_rows(places, ANCHOR, m.labels["anchor"])
-        offset = float(places(OFFSET, OFFSET.of(m.source))[0])
-        return replace(m, length=np.linalg.norm(poses.position - there, axis=1) + offset)
-
-    def default_places(self, names: Sequence[str], middle: Floats, reach: float) -> dict[tuple[str, str], Floats]:
-        """See `Instrument.default_places`."""
-        away = 2.0 * reach * Rotation.random(len(names), random_state=0).as_matrix()[:, :, 2]
-        return {(ANCHOR.letter, name): middle + step for name, step in zip(names, away, strict=True)}
+            landmarks.start_at(coordinate, place)
 
 
 INSTRUMENTS = (AnchorGauge(),)

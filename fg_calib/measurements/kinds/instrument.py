@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from fg_calib.initialization import FrameStart
-from fg_calib.inputs import Floats, Integers, ProblemError
-from fg_calib.measurements.dataset import Labels, Measurements
-from fg_calib.measurements.kind import Frames, Kind
-from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
-from fg_calib.measurements.table import MeasurementBlock, Table
+from fg_calib.inputs import Booleans, Floats, ProblemError
+from fg_calib.measurements import (
+    Frames,
+    Kind,
+    Labels,
+    Landmark,
+    LandmarkKind,
+    Landmarks,
+    MeasurementBlock,
+    Measurements,
+    Table,
+)
 from fg_calib.robot import Poses
 
 Blocks = Sequence[MeasurementBlock]
+Kinds = Sequence[tuple[Kind, Booleans]]
+"""Kinds of measurement, each with the rows that it has, shape (n_configurations,)."""
+
 Places = Callable[[LandmarkKind, str], Floats]
 """Coordinates of a landmark, by its kind and name."""
 
@@ -44,33 +53,61 @@ class Column(NamedTuple):
         return {"length": "m", "angle": "rad", "pixel": "px"}.get(self.unit, "")
 
 
-class Instrument(ABC):
+LENGTH_COLUMNS = (
+    Column(("distance",), "length", "To the anchor (0: contact), or from the plane (0 without)"),
+    Column(("sigma_distance",), "length", "1 sigma of that"),
+)
+
+
+class Quantity(NamedTuple):
+    """What an instrument measures at a configuration.
+
+    Attributes:
+        field: Field of `Measurements`, or column, that holds it.
+        noise: Kind of its noise.
+        columns: Its columns, for messages.
+        words: What it is, for messages.
+        shape: Of one measurement.
+    """
+
+    field: str
+    noise: str
+    columns: str
+    words: str
+    shape: tuple[int, ...] = ()
+
+
+class Instrument:
     """An instrument: what a table of its model holds, and what it says of the arm.
 
     Attributes:
         model: Model of its tables.
+        kind: What it measures, of one configuration; those with several kinds override `kinds`.
+        quantities: The data of its kinds, in their order; its generic columns if empty.
         columns: Columns beside those of every table.
         labels: Those of names: what a row is of.
         optional_labels: Those of `labels` whose cells may be empty.
         noise: Keys of `noise` that it needs.
-        landmarks: What it depends on besides the arm.
+        landmarks: What it depends on besides the arm, in the order of its kinds' nuisances.
         options: Fields of `Table` that say something to it alone.
         words: What it measures, for reports.
         uses_pairs: Whether it measures between configurations.
         is_pose: Whether it measures the tool's pose, or part of it, in a measurement frame.
         sees_position: Whether its rows depend on where the tool point is.
-        sees_orientation: Whether they depend on how the tool is turned.
+        sees_orientation: Whether they depend on how the tool is rotated.
         sees_landmarks: Whether it measures from landmarks in the room: what it says is relative unless they are known.
         n_landmarks: Landmarks with which it shows all that it can see, where no table names them.
     """
 
     model: str
     words: str
+    kind: ClassVar[Kind]
+    quantities: tuple[Quantity, ...] = ()
     columns: ClassVar[tuple[Column, ...]] = ()
     labels: ClassVar[tuple[str, ...]] = ()
     optional_labels: ClassVar[tuple[str, ...]] = ()
     noise: tuple[str, ...] = ()
-    landmarks: ClassVar[tuple[LandmarkKind, ...]] = ()
+    landmarks: tuple[LandmarkKind, ...] = ()
     options: ClassVar[tuple[str, ...]] = ()
     uses_pairs: ClassVar[bool] = False
     is_pose: ClassVar[bool] = False
@@ -84,7 +121,73 @@ class Instrument(ABC):
         """Names of the columns that `Measurements.columns` holds."""
         return tuple(c.names[0] for c in self.columns if c.generic and not c.names[0].startswith("sigma_"))
 
-    @abstractmethod
+    @property
+    def measured(self) -> tuple[Quantity, ...]:
+        """Its quantities, or those of its generic columns."""
+        return self.quantities or tuple(Quantity(name, name, name, self.words) for name in self.generic_columns)
+
+    def kinds(self, table: Table) -> Kinds:
+        """Kinds of measurement, each with the rows that it has, shape (n_configurations,): those with a landmark.
+
+        Raises:
+            ProblemError: The table lacks something.
+        """
+        of = [self.names(table.measurements, kind).index >= 0 for kind in self.landmarks]
+        return [(self.kind, np.all([np.ones(table.measurements.n_configurations, dtype=np.bool_), *of], axis=0))]
+
+    def names(self, m: Measurements, kind: LandmarkKind) -> Labels:
+        """Names of the landmarks of a kind, and which of them each row is of.
+
+        Raises:
+            ProblemError: A column that must say so is missing.
+        """
+        n, column = m.n_configurations, kind.label
+        if kind.is_one or (column not in m.labels and column not in self.optional_labels):
+            return Labels((kind.of(m.source) if kind.is_one else kind.name,), np.zeros(n, dtype=np.int64))
+        if column in m.labels:
+            return m.labels[column]
+        if self.sees_landmarks:
+            found, expected = f"no column {column}", f"the name of a {column} for model {self.model}"
+            raise ProblemError(m.source, found, expected)
+        return Labels((), np.full(n, -1))
+
+    def landmark(self, table: Table, kind: LandmarkKind, name: str) -> Landmark:
+        """A landmark as a table has it."""
+        known = table.known.get(name) if kind.key else None
+        if known is None:
+            return Landmark(kind, name, np.full(kind.size, np.nan), known=kind.is_constant)
+        return Landmark(kind, name, known.xyz, known.tolerance, known.tolerance is None)
+
+    def values(self, table: Table) -> Floats:
+        """What was measured, in the order of `measured`, shape (n_configurations, width).
+
+        Raises:
+            ProblemError: A column is missing.
+        """
+        m, found = table.measurements, []
+        for of in self.measured:
+            values = m.value(of.field)
+            if values is None:
+                words = f"no column{'s' * (',' in of.columns)} {of.columns}"
+                raise ProblemError(m.source, words, f"{of.words} for model {self.model}")
+            found.append(values.reshape(m.n_configurations, -1))
+        return np.hstack(found)
+
+    def sigma(self, m: Measurements, rows: Any) -> Floats:
+        """1 sigma of rows, in the order of `measured`.
+
+        Raises:
+            ProblemError: It is not specified.
+        """
+        found = []
+        for of in self.measured:
+            sigma = m.sigma(of.noise)
+            if sigma is None or not np.isfinite(sigma[rows]).all():
+                expected = f"noise.{of.noise} or a column sigma_{of.noise}"
+                raise ProblemError(m.source, f"no sigma for {of.noise}", expected)
+            found.append(sigma[rows].reshape(len(rows), -1))
+        return np.hstack(found)
+
     def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
         """Blocks of a table, kind by kind.
 
@@ -96,8 +199,58 @@ class Instrument(ABC):
         Raises:
             ProblemError: A column or a sigma is missing.
         """
+        m, found = table.measurements, []
+        data, kinds = self.values(table), self.kinds(table)
 
-    def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:  # noqa: B027
+        def add(kind: LandmarkKind, names: Sequence[str]) -> Any:
+            new = [self.landmark(table, kind, name) for name in names]
+            return landmarks.add(new, m.source, number if kind.is_one else -1)
+
+        nuisances = self._nuisances(m, kinds, add).astype(np.int64)
+        for kind, chosen in kinds:
+            rows = np.flatnonzero(chosen & np.isfinite(data).all(axis=1))
+            if len(rows):
+                arrays = data[rows, : kind.width], self.sigma(m, rows), nuisances[rows, : kind.n_nuisances]
+                found.append(MeasurementBlock.of_rows(kind, table, number, rows, *arrays, **self.more(table, rows)))
+        return found
+
+    def more(self, table: Table, rows: Any) -> dict[str, Any]:
+        """Other fields of a block of rows of a table: what each is of, by name."""
+        labels = table.measurements.labels.get(self.landmarks[0].label) if self.landmarks else None
+        return {} if labels is None else {"of": labels.of(rows)}
+
+    def _nuisances(self, m: Measurements, kinds: Kinds, of: Callable[[LandmarkKind, Sequence[str]], Any]) -> Floats:
+        """What landmarks have, by kind and names, for each row, shape (n_configurations, n_nuisances)."""
+        found = [np.zeros((m.n_configurations, 0))]
+        for kind in self.landmarks if any(kind.n_nuisances for kind, _ in kinds) else ():
+            labels = self.names(m, kind)
+            each = np.zeros((len(labels.names) + 1, kind.size))  # the last is of rows that are of none
+            if labels.names:
+                each[:-1] = of(kind, labels.names)
+            found.append(each[labels.index])
+        return np.hstack(found)
+
+    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
+        """Measurements as tool frames and landmarks make them, without noise.
+
+        Args:
+            m: Configurations, and names of landmarks.
+            poses: Tool frames in the base frame.
+            places: Where the landmarks are.
+        """
+        kinds, n = self.kinds(Table(m, self.model)), m.n_configurations
+        nuisances = self._nuisances(m, kinds, lambda kind, names: np.array([places(kind, name) for name in names]))
+        sizes = [math.prod(of.shape) for of in self.measured]
+        data = np.zeros((n, sum(sizes)))
+        for kind, chosen in kinds:
+            rows = np.flatnonzero(chosen)
+            at = Frames(poses.rotation[rows, None], poses.position[rows, None])
+            nothing, noise = np.zeros((len(rows), kind.width)), np.zeros((len(rows), kind.residual_dim))
+            data[rows, : kind.width] = kind.simulate(at, nothing, nuisances[rows, : kind.n_nuisances], noise)
+        parts = np.split(data, np.cumsum(sizes)[:-1], axis=1) if sizes else []
+        return m.with_values({of.field: v.reshape(n, *of.shape) for of, v in zip(self.measured, parts, strict=True)})
+
+    def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """Start landmarks that tool points and data say, of all tables of the instrument together.
 
         Args:
@@ -106,7 +259,7 @@ class Instrument(ABC):
             landmarks: Where the starts are put.
         """
 
-    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:  # noqa: B027
+    def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """Start measurement frame, tool, and landmarks that depend on them.
 
         Args:
@@ -116,103 +269,6 @@ class Instrument(ABC):
             landmarks: Which coordinates in `start.places` are of which.
         """
 
-    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
-        """Measurements as tool frames and landmarks make them, without noise.
-
-        Args:
-            m: Configurations with the poses as measured, and names of landmarks.
-            poses: Tool frames in the base frame.
-            places: Where the landmarks are.
-        """
-        return m
-
     def random_model(self, table: Table) -> str:
         """Model of what it would measure at random configurations: contacts and points in sight are none."""
         return self.model
-
-    def default_places(self, names: Sequence[str], middle: Floats, reach: float) -> dict[tuple[str, str], Floats]:
-        """Places of landmarks where nothing is measured yet, by letter and name.
-
-        Args:
-            names: What they are called.
-            middle: Of the tool points, shape (3,), [m].
-            reach: How far these are from there, [m].
-        """
-        return {}
-
-    def require_labels(self, table: Table, column: str) -> Labels:
-        """What each row is of, by the column of that name.
-
-        Raises:
-            ProblemError: There is no such column.
-        """
-        labels = table.measurements.labels.get(column)
-        if labels is None:
-            found, expected = f"no column {column}", f"the name of a {column} for model {self.model}"
-            raise ProblemError(table.measurements.source, found, expected)
-        return labels
-
-    def require(self, table: Table, values: Floats | None, columns: str, what: str) -> Floats:
-        """What was measured.
-
-        Raises:
-            ProblemError: It was not.
-        """
-        if values is None:
-            found = f"no column{'s' * (',' in columns)} {columns}"
-            raise ProblemError(table.measurements.source, found, f"{what} for model {self.model}")
-        return values
-
-    def require_sigma(self, table: Table, sigma: Floats | None, noise: str, rows: Integers) -> Floats:
-        """1 sigma of rows of a table.
-
-        Raises:
-            ProblemError: It is not specified.
-        """
-        if sigma is None or not np.isfinite(sigma[rows]).all():
-            expected = f"noise.{noise} or a column sigma_{noise}"
-            raise ProblemError(table.measurements.source, f"no sigma for {noise}", expected)
-        return sigma[rows]
-
-
-class ColumnInstrument(Instrument):
-    """An instrument with one kind, one generic column and no landmarks; an empty cell is not measured.
-
-    Attributes:
-        kind: What it measures, one number of one configuration.
-    """
-
-    kind: Kind
-
-    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
-        """See `Instrument.blocks`."""
-        m, (name,) = table.measurements, self.generic_columns
-        values = self.require(table, m.columns.get(name), name, self.words)
-        rows = np.flatnonzero(np.isfinite(values))
-        sigma = self.require_sigma(table, m.sigmas.get(name), name, rows)
-        return [MeasurementBlock.of_rows(self.kind, table, number, rows, values[rows, None], sigma[:, None])]
-
-    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
-        """See `Instrument.predict`."""
-        n, (name,) = len(poses.position), self.generic_columns
-        at = Frames(poses.rotation[:, None], poses.position[:, None])
-        values = self.kind.simulate(at, np.zeros((n, 1)), np.zeros((n, 0)), np.zeros((n, 1)))
-        return replace(m, columns={name: values[:, 0]})
-
-
-def add_points(landmarks: Landmarks, kind: LandmarkKind, table: Table, names: Sequence[str]) -> Integers:
-    """Add points by name, where the table says that they are; their coordinates, shape (n, 3)."""
-    known, nowhere = [table.known.get(name) for name in names], np.full(3, np.nan)
-    return landmarks.add(
-        kind,
-        names,
-        np.array([nowhere if k is None else k.xyz for k in known]).reshape(-1, 3),
-        table.measurements.source,
-        tolerances=[None if k is None else k.tolerance for k in known],
-        known=[k is not None and k.tolerance is None for k in known],
-    )
-
-
-def places_of_rows(places: Places, kind: LandmarkKind, labels: Labels) -> Floats:
-    """Coordinates of each row's landmark, shape (n, size)."""
-    return np.array([places(kind, name) for name in labels.names])[labels.index]

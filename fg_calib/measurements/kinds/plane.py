@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization import plane_from_distances
 from fg_calib.inputs import Floats
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Frames, Kind, Rows, between
-from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, places_of_rows
-from fg_calib.measurements.landmarks import Estimate, LandmarkKind, Landmarks
-from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot import Poses
+from fg_calib.measurements import Estimate, Frames, Kind, LandmarkKind, Landmarks, Rows, Table, directions
+from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Quantity
 
 
 def normal_and_distance(behind: Floats, through: Floats, covariance: Floats) -> Estimate:
@@ -28,12 +22,13 @@ def normal_and_distance(behind: Floats, through: Floats, covariance: Floats) -> 
     return np.append(n, n @ through), J @ covariance @ J.T, ("", "", "", "m")
 
 
-BEHIND = LandmarkKind("C", "point behind a plane", "", "")
+BEHIND = LandmarkKind("C", "point behind a plane", "", "", column="plane", away=-3.0, is_constant=True)
 PLANE = LandmarkKind(
     "F",
     "plane",
     "the unknown planes",
     "Planes (unit normal in the base frame, distance from the base in mm)",
+    away=-2.0,
     n_configurations=4,
     reference=BEHIND,
     estimate=normal_and_distance,
@@ -55,7 +50,7 @@ class PlaneDistance(Kind):
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
-        length, n = between(nuisances[:, :3], nuisances[:, 3:])
+        length, n = directions(nuisances[:, 3:] - nuisances[:, :3])
         step = at.position[:, 0] - nuisances[:, 3:]
         height = np.einsum("ni,ni->n", n, step)
         D = np.zeros((len(n), 1, 1, 6))
@@ -79,35 +74,17 @@ class PlaneDistance(Kind):
 class PlaneGauge(Instrument):
     """Distances from planes."""
 
-    model, words = "plane", "distances from planes"
-    columns = (
-        Column(("plane",), "", "Which plane the tool point is on, or at a distance from"),
-        Column(("distance",), "length", "To the anchor (0: contact), or from the plane (0 without)"),
-        Column(("sigma_distance",), "length", "1 sigma of that"),
-    )
+    model, words, kind = "plane", "distances from planes", PlaneDistance()
+    quantities = (Quantity("length", "distance", "distance", "distances from the planes"),)
+    columns = (Column(("plane",), "", "Which plane the tool point is on, or at a distance from"), *LENGTH_COLUMNS)
     labels = optional_labels = ("plane",)
     noise, landmarks = ("distance",), (BEHIND, PLANE)
     sees_landmarks = True
 
-    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
-        """Distances from planes; 0, on the plane, where no column says them. See `Instrument.blocks`."""
+    def values(self, table: Table) -> Floats:
+        """Distances from planes; 0, on the plane, where no column says them. See `Instrument.values`."""
         m = table.measurements
-        labels = self.require_labels(table, "plane")
-        distance = np.zeros(m.n_configurations) if m.length is None else m.length
-        rows = np.flatnonzero((labels.index >= 0) & np.isfinite(distance))
-        sigma = self.require_sigma(table, m.sigma_length, "distance", rows)
-        nowhere = np.full((len(labels.names), 3), np.nan)
-        places = [
-            landmarks.add(kind, labels.names, nowhere, m.source, known=[kind is BEHIND] * len(labels.names))
-            for kind in (BEHIND, PLANE)
-        ]
-        nuisances = np.hstack([place[labels.index[rows]] for place in places])
-        of, data = labels.of(rows), distance[rows, None]
-        return [
-            MeasurementBlock.of_rows(
-                PlaneDistance(), table, number, rows, data, sigma[:, None], nuisances=nuisances, of=of
-            )
-        ]
+        return np.zeros((m.n_configurations, 1)) if m.length is None else super().values(table)
 
     def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """See `Instrument.start_landmarks`."""
@@ -116,21 +93,8 @@ class PlaneGauge(Instrument):
         for behind, through in np.unique(nuisances[:, [0, 3]], axis=0).tolist():
             chosen = nuisances[:, 0] == behind
             c, f = plane_from_distances(there[chosen], distance[chosen])
-            landmarks.start(behind, c)
-            landmarks.start(through, f)
-
-    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
-        """See `Instrument.predict`."""
-        behind, there = (places_of_rows(places, kind, m.labels["plane"]) for kind in (BEHIND, PLANE))
-        normal = between(behind, there)[1]
-        return replace(m, length=np.einsum("ni,ni->n", normal, poses.position - there))
-
-    def default_places(self, names: Sequence[str], middle: Floats, reach: float) -> dict[tuple[str, str], Floats]:
-        """See `Instrument.default_places`."""
-        normals = Rotation.random(len(names), random_state=0).as_matrix()[:, :, 2]
-        through = {(PLANE.letter, name): middle - 2.0 * reach * n for name, n in zip(names, normals, strict=True)}
-        behind = {(BEHIND.letter, name): middle - 3.0 * reach * n for name, n in zip(names, normals, strict=True)}
-        return through | behind
+            landmarks.start_at(behind, c)
+            landmarks.start_at(through, f)
 
 
 INSTRUMENTS = (PlaneGauge(),)

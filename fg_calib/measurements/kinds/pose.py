@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization import Frame, FrameStart, targets_from_positions
-from fg_calib.inputs import Floats, Integers
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.kind import Frames, Kind, Rows
-from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, add_points, places_of_rows
-from fg_calib.measurements.kinds.stacked import stack
-from fg_calib.measurements.landmarks import LandmarkKind, Landmarks
-from fg_calib.measurements.table import MeasurementBlock, Table
-from fg_calib.robot import Poses, cross_matrix, inverse_right_jacobian, kernels
+from fg_calib.inputs import Floats
+from fg_calib.measurements import Frames, Kind, LandmarkKind, Landmarks, Rows, Table, stack
+from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Kinds, Quantity
+from fg_calib.robot import cross_matrix, inverse_right_jacobian, kernels
 
 TARGET = LandmarkKind(
     "P",
@@ -41,6 +35,18 @@ POSE_COLUMNS = (
 ANGLES = "qx, qy, qz, qw or roll, pitch, yaw"
 
 
+POSITION = Quantity("position", "position", "x, y, z", "measured positions", (3,))
+ORIENTATION = Quantity("rotation", "orientation", ANGLES, "measured orientations", (3, 3))
+
+
+def point_on_tool(at: Frames, t: Floats) -> tuple[Floats, Floats]:
+    """Where points t of the tool are, `p + R t`, shape (n, 3), and `dp + w x R t`, shape (n, 1, 3, 6)."""
+    arm = np.einsum("nij,nj->ni", at.rotation[:, 0], t)
+    D = np.zeros((len(t), 1, 3, 6))
+    D[:, 0, :, :3], D[:, 0, :, 3:] = -cross_matrix(arm), np.eye(3)
+    return at.position[:, 0] + arm, D
+
+
 class Position(Kind):
     """`p - measured` in the frame that the chain starts in, [m]; its derivative is `dp`.
 
@@ -49,31 +55,26 @@ class Position(Kind):
 
     names, units = ("position.x", "position.y", "position.z"), ("m", "m", "m")
     ends, residual_dim, width = 1, 3, 3
-    code = kernels.POSITION
+    code: int | None = kernels.POSITION
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
-        D = np.zeros((len(data), 1, 3, 6))
-        D[:, 0, :, 3:] = np.eye(3)
-        return Rows(at.position[:, 0] - data[:, :3], D)
+        p, D = point_on_tool(at, np.zeros((len(data), 3)))
+        return Rows(p - data, D)
 
 
-class TargetPosition(Kind):
+class TargetPosition(Position):
     """`p + R t - measured` in the frame that the chain starts in, [m]; its derivative is `dp + w x R t + R dt`.
 
     Data: the position, 3 columns, [m]. Nuisances: the target t in the tool frame, 3 coordinates, [m].
     """
 
-    names, units = ("position.x", "position.y", "position.z"), ("m", "m", "m")
-    ends, residual_dim, width, n_nuisances = 1, 3, 3, 3
+    n_nuisances, code = 3, None
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
-        R = at.rotation[:, 0]
-        arm = np.einsum("nij,nj->ni", R, nuisances)
-        D = np.zeros((len(data), 1, 3, 6))
-        D[:, 0, :, :3], D[:, 0, :, 3:] = -cross_matrix(arm), np.eye(3)
-        return Rows(at.position[:, 0] + arm - data[:, :3], D, R)
+        p, D = point_on_tool(at, nuisances)
+        return Rows(p - data, D, at.rotation[:, 0])
 
 
 class Orientation(Kind):
@@ -116,52 +117,22 @@ class PoseTracker(Instrument):
         Column(("target",), "", "Which point of the tool was seen; empty: the tool itself"),
         Column(("station",), "", "Where it was seen from; each has a frame of its own with frame unknown"),
     )
-    landmarks = (TARGET,)
     is_pose = True
 
     def __init__(self, model: str, orientation: bool, position: bool) -> None:
         self.model, self.words = model, f"measured {model}s"
         self.sees_orientation, self.sees_position = orientation, position
+        self.quantities = (ORIENTATION,) * orientation + (POSITION,) * position
         self.noise = ("position",) * position + ("orientation",) * orientation
+        self.landmarks = (TARGET,) * position
 
-    def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
-        """See `Instrument.blocks`."""
-        m = table.measurements
-        labels = m.labels.get("target")
-        if labels is None or not self.sees_position:
-            return [self._block(table, number, np.arange(m.n_configurations), Position(), None)]
-        place = add_points(landmarks, TARGET, table, labels.names)[labels.index]
-        return [
-            self._block(table, number, rows, kind, place[rows] if kind.n_nuisances else None)
-            for kind, chosen in ((Position(), labels.index < 0), (TargetPosition(), labels.index >= 0))
-            if len(rows := np.flatnonzero(chosen))
-        ]
-
-    def _block(
-        self, table: Table, number: int, rows: Integers, position: Kind, nuisances: Integers | None
-    ) -> MeasurementBlock:
-        """Rows of a table, with the kind of their positions and what these depend on."""
-        m = table.measurements
-        parts: list[tuple[Kind, Floats, Floats]] = []
-        for wanted, kind, values, sigma, columns, noise in (
-            (self.sees_orientation, Orientation(), m.rotation, m.sigma_orientation, ANGLES, "orientation"),
-            (self.sees_position, position, m.position, m.sigma_position, "x, y, z", "position"),
-        ):
-            if wanted:
-                measured = self.require(table, values, columns, f"measured {noise}s")
-                measured = measured.reshape(m.n_configurations, kind.width)[rows]
-                parts.append((kind, measured, self.require_sigma(table, sigma, noise, rows)))
-        kinds, data, sigmas = zip(*parts, strict=True)
-        return MeasurementBlock.of_rows(
-            stack(*kinds),
-            table,
-            number,
-            rows,
-            np.hstack(data),
-            np.hstack(sigmas),
-            nuisances=np.zeros((len(rows), 0), dtype=np.int64) if nuisances is None else nuisances,
-            of=m.labels["target"].of(rows) if "target" in m.labels and self.sees_position else None,
-        )
+    def kinds(self, table: Table) -> Kinds:
+        """See `Instrument.kinds`."""
+        rotated = (Orientation(),) * self.sees_orientation
+        if not self.sees_position:
+            return [(Orientation(), ~np.zeros_like(table.measurements.test))]
+        of_target = self.names(table.measurements, TARGET).index >= 0
+        return [(stack(*rotated, Position()), ~of_target), (stack(*rotated, TargetPosition()), of_target)]
 
     def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """Frame and tool from poses; of targets only their orientations say something of the tool."""
@@ -181,14 +152,6 @@ class PoseTracker(Instrument):
         frame, places = targets_from_positions(tool, p, target, known, world, start.unknown_frame)
         start.places[coordinates] = places[:-1]
         start.set_frame(frame)
-
-    def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
-        """See `Instrument.predict`."""
-        if "target" not in m.labels:
-            return m
-        labels = m.labels["target"]
-        there = np.where(labels.index[:, None] < 0, 0.0, places_of_rows(places, TARGET, labels))
-        return replace(m, position=poses.position + np.einsum("nij,nj->ni", poses.rotation, there))
 
 
 INSTRUMENTS = (
