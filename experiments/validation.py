@@ -216,7 +216,8 @@ def draw(task: Task) -> Row:
         "warned": bool(found.verdict.errors or found.verdict.warnings),
     }
     if seed % BOUND_EVERY == 0:
-        bound = cramer_rao(true, simulation.tables, **options)
+        of_bound = {key: value for key, value in options.items() if key != "gauge"}
+        bound = cramer_rao(true, simulation.tables, prior=options.get("gauge", "prior") == "prior", **of_bound)
         row["bound"] = bound.position(q, fitted=True) ** 2
     return row
 

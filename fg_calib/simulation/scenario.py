@@ -236,17 +236,11 @@ def schema(cls: type[Class]) -> type[Class]:
     return cast("type[Class]", made)
 
 
-class _Xyz(Schema):
-    x: Number = 0.0
-    y: Number = 0.0
-    z: Number = 0.0
-
-
 def _array(given: Any, context: FileContext | None) -> Floats:
     """Three numbers; in a file those of x, y and z, or a list."""
     if context is not None and isinstance(given, Mapping):
-        xyz = validate(_Xyz, given, "")
-        given = (xyz.x, xyz.y, xyz.z)
+        refuse_unknown_keys(*"xyz")(given)
+        given = [given.get(axis, 0.0) for axis in "xyz"]
     return as_floats("", given, "(3,)")
 
 

@@ -315,13 +315,8 @@ class Measuring:
             labels["station"] = Labels(tuple(f"s{s + 1}" for s in range(i.stations)), station)
         known = self.model in PAIR_MODELS or frame_knowledge(i.frame or self.scenario.frame) == "known"
         frame: FrameKnowledge = "known" if known else "unknown"
-        table = Table(
-            self.rows(k, labels=labels, **measured),
-            self.model,
-            i.pairing or Pairing(),
-            frame,
-            known=self.known(targets),
-        )
+        m, pairing = self.rows(k, labels=labels, **measured), i.pairing or Pairing()
+        table = Table(m, self.model, pairing, frame, known=self.known(targets))
         return table, {"targets": targets, "frames": dict(zip(names, frames, strict=True))}
 
     def plain(self) -> tuple[Table, Truth]:
@@ -338,9 +333,8 @@ class Measuring:
         assert self.instrument.pairs is not None
         true = form_pairs(self.rows(position=at.position, rotation=at.rotation), self.instrument.pairs)
         n = true.n_pairs
-        found: dict[str, Any] = dict.fromkeys(
-            ("distance", "angle", "sigma_distance", "sigma_angle"), np.full(n, np.nan)
-        )
+        unmeasured = np.full(n, np.nan)
+        found: dict[str, Any] = dict.fromkeys(("distance", "angle", "sigma_distance", "sigma_angle"), unmeasured)
         if distances:
             found["distance"] = np.abs(true.distance + self.noise("distance", n))
             found["sigma_distance"] = self.sigma("distance", n)
@@ -545,11 +539,6 @@ class Simulation(Brief):
         """What the first instrument measured."""
         return self.tables[0].measurements
 
-    @property
-    def job(self) -> dict[str, Any]:
-        """The keys of the calibration job that are not files or values: model, pairing, frame, ..."""
-        return {**self.scenario.job, "frame": frame_knowledge(self.scenario.frame)}
-
     def n_configurations(self, *, test: bool) -> int:
         """Number of different configurations of train or of test rows."""
         tables = [table.measurements for table in self.tables]
@@ -567,10 +556,9 @@ class Simulation(Brief):
         counts = {"n_configurations": n_train + n_test, "n_train": n_train, "n_test": n_test}
         found = {"scenario": self.scenario.name, "seed": self.seed, **counts, "truth": truth}
         if self.scenario.instruments:
-            rows = [(t, t.measurements.source, t.measurements.test) for t in self.tables]
             found["tables"] = [
-                {"table": name, "model": t.model, "n_train": int(np.sum(~test)), "n_test": int(np.sum(test))}
-                for t, name, test in rows
+                {"table": m.source, "model": t.model, "n_train": int(np.sum(~m.test)), "n_test": int(np.sum(m.test))}
+                for t, m in ((t, t.measurements) for t in self.tables)
             ]
         return found
 

@@ -18,7 +18,7 @@ from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, checked
 from fg_calib.io import NOISE_UNITS, Units, fill_folder, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
 from fg_calib.robot import Robot
-from fg_calib.simulation.scenario import Placement, Plane, Spot
+from fg_calib.simulation.scenario import Placement, Plane, Spot, frame_knowledge
 from fg_calib.simulation.simulator import Simulation
 
 Columns = Mapping[str, Any]
@@ -162,7 +162,8 @@ def _job_text(simulation: Simulation, units: Units) -> str:
     if scenario.instruments:
         job |= {**scenario.job, "units": asdict(units), "noise": noise} | instrument_keys(simulation.tables, units)
     else:
-        job |= {"measurements": m.source, **simulation.job, "units": asdict(units), "noise": _noise(m, units) | noise}
+        keys = {**scenario.job, "frame": frame_knowledge(scenario.frame)}
+        job |= {"measurements": m.source, **keys, "units": asdict(units), "noise": _noise(m, units) | noise}
     return f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n" + _yaml(job)
 
 

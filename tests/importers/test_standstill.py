@@ -59,20 +59,19 @@ def test_a_specified_offset_is_used_and_a_large_one_refused(motion):
 
 
 @pytest.mark.slow
-def test_of_motions_that_repeat_themselves_the_offset_nearest_to_receipt_is_taken():
+@pytest.mark.parametrize("turns", [0, 1, -1])
+def test_of_motions_that_repeat_themselves_the_offset_nearest_to_receipt_is_taken(turns):
     once = record(5, n_stops=4, sigma_position=1e-5, sigma_orientation=1e-5)
-    period = once.joint_time[-1] + 1.0
     joints, poses = once.streams()
-    many = 6
-    readings = np.concatenate([joints.readings] * many)
-    time = np.concatenate([joints.time + k * period for k in range(many)])
-    pose_time = np.concatenate([poses.time + k * period for k in range(many)])
-    position, rotation = (np.concatenate([x] * many) for x in (poses.position, poses.rotation))
-    for turns in (0, 1, -1):
-        source = Source("/pose", "", lag=-(0.137 + turns * period))
-        shifted = PoseStream(pose_time + turns * period, position, rotation, source)
-        found = average_stops(JointStream(time, readings, joints.source), shifted, arm()).offset
-        assert found.seconds == pytest.approx(0.137 + turns * period, abs=1e-3)
+    period, many = once.joint_time[-1] + 1.0, 6
+    time, pose_time = (np.concatenate([t + k * period for k in range(many)]) for t in (joints.time, poses.time))
+    readings, position, rotation = (
+        np.concatenate([x] * many) for x in (joints.readings, poses.position, poses.rotation)
+    )
+    source = Source("/pose", "", lag=-(0.137 + turns * period))
+    shifted = PoseStream(pose_time + turns * period, position, rotation, source)
+    found = average_stops(JointStream(time, readings, joints.source), shifted, arm()).offset
+    assert found.seconds == pytest.approx(0.137 + turns * period, abs=1e-3)
 
 
 def test_poses_of_something_else_are_refused():
@@ -82,6 +81,8 @@ def test_poses_of_something_else_are_refused():
         InputError, match=r"the poses do not move as the joints do \(correlation .*\), expected poses of"
     ):
         average_stops(joints, poses, arm())
+    with pytest.raises(InputError, match=r"no standstill of 2 s, expected the arm at rest.*; the longest pause is"):
+        averaged(record(11, rest=0.6), still=2.0)
 
 
 def test_stops_that_scatter_far_more_than_others_are_skipped(motion):
@@ -93,12 +94,6 @@ def test_stops_that_scatter_far_more_than_others_are_skipped(motion):
     stops = average_stops(joints, PoseStream(poses.time, position, poses.rotation, poses.source), arm(1e-3))
     assert [s.id for s in stops.skipped] == ["stop6"]
     assert re.fullmatch("the position scatters .* times as much as usual", stops.skipped[0].reason)
-
-
-def test_an_arm_that_never_rests_is_refused():
-    motion = record(11, rest=0.6)
-    with pytest.raises(InputError, match=r"no standstill of 2 s, expected the arm at rest.*; the longest pause is"):
-        averaged(motion, still=2.0)
 
 
 @pytest.mark.parametrize(("phi", "n"), [(0.0, 100), (0.5, 100), (0.5, 400), (0.8, 100), (0.95, 100)])

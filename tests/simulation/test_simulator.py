@@ -8,7 +8,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from oracle import random_robot, tool_pose
+from oracle import tool_pose
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 from simulated import planar_robot
@@ -68,22 +68,6 @@ def measured(simulation):
 # --- truth ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_urdf_robot_is_simulated_and_given_errors_reach_fixed_parameters():
-    robot = random_robot("urdf", 5, np.random.default_rng(1))
-    scenario = Scenario(
-        robot=robot,
-        errors=Errors("values", {p.name: 0.01 * i for i, p in enumerate(robot.parameters)}),
-        configurations=RandomReadings(10),
-        noise=Noise(0.0, 0.0),
-        stated_noise=Noise(1.0, 1.0),
-    )
-    s = simulate(scenario)
-    _, position, turn = measured(s)
-    assert np.abs(position).max() < rounding(10.0)
-    assert np.abs(turn).max() < rounding(10.0)
-    assert s.true_robot.nominal - robot.nominal == pytest.approx(0.01 * np.arange(len(robot.parameters)))
-
-
 # --- noise ------------------------------------------------------------------------------------------------------------
 
 
@@ -124,18 +108,15 @@ def test_drawn_errors_have_their_size_and_spare_fixed_parameters(shipped, law, v
 
 def test_the_camera_looks_at_the_centre_from_a_and_from_the_half_sphere(simulation):
     """At the nominal robot, by 4x4 products, to 1e-9; and within the limits."""
-    q = simulation.measurements.readings[:52]
+    q, test = np.split(simulation.measurements.readings, [52])
     T = poses_of(simulation.robot, q)
-    p, z = T[:, :3, 3], T[:, :3, 2]
-    A = np.array([0.0, 6.5, 3.05])
+    p, z, A = T[:, :3, 3], T[:, :3, 2], np.array([0.0, 6.5, 3.05])
     assert p[0] == pytest.approx(A, abs=rounding(1, 10))
     assert np.linalg.norm(p[1:] - A, axis=1) == pytest.approx(0.5, abs=rounding(1, 1e3))
     assert (p[1:, 2] > A[2]).all()
-    away = BOARD - p
-    assert np.abs(np.cross(z, away)).max() < 1e-9
-    assert (np.sum(z * away, axis=1) > 0).all()
+    assert np.abs(np.cross(z, BOARD - p)).max() < 1e-9
+    assert (np.sum(z * (BOARD - p), axis=1) > 0).all()
     assert np.abs(q).max() <= np.pi
-    test = simulation.measurements.readings[52:]
     assert test.shape == (500, 7)
     assert 0.99 * np.pi < np.abs(test).max() <= np.pi
 
@@ -240,26 +221,31 @@ def test_the_command_writes_a_job_that_runs(fg_calib, tmp_path):
     assert fg_calib("calibrate", out / "calibration.yaml", "--out", out / "result").code == 0
 
 
-def test_a_urdf_robot_is_written_with_its_urdf(tmp_path):
-    (tmp_path / "arm.urdf").write_text(
-        '<robot name="arm"><link name="a"/><link name="b"/><link name="c"/>'
-        '<joint name="j1" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.3"/>'
-        '<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
-        '<joint name="j2" type="prismatic"><parent link="b"/><child link="c"/><origin xyz="0.2 0 0" rpy="1.5 0 0"/>'
-        '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>'
-    )
+URDF = (
+    '<robot name="arm"><link name="a"/><link name="b"/><link name="c"/>'
+    '<joint name="j1" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.3"/>'
+    '<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
+    '<joint name="j2" type="prismatic"><parent link="b"/><child link="c"/><origin xyz="0.2 0 0" rpy="1.5 0 0"/>'
+    '<axis xyz="0 0 1"/><limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>'
+)
+
+
+def test_a_urdf_robot_is_written_with_its_urdf_and_given_errors_reach_fixed_parameters(tmp_path):
+    (tmp_path / "arm.urdf").write_text(URDF)
     (tmp_path / "s.yaml").write_text(
-        "robot: {urdf: arm.urdf, tool: {z: 0.1}, estimate: [tool.z]}\nerrors: {uniform: {x: 0.01, tool: 0.02}}\n"
+        "robot: {urdf: arm.urdf, tool: {z: 0.1}, estimate: [tool.z]}\nerrors: {values: {tool.z: 0.01, base.x: 0.02}}\n"
         "configurations: {random: {count: 9}}\nnoise: {position: 0.001, orientation: 0.001, joint: [0.01, 0.002]}\n"
     )
     s = simulate(read_scenario(tmp_path / "s.yaml"))
+    assert max(np.abs(off).max() for off in measured(s)[1:]) < 0.01
     names = write_simulation(tmp_path / "job", s)
     assert names == (*FILES[:2], "robot_nominal.urdf", "robot_nominal.yaml", "robot_true.urdf", "robot_true.yaml")
     job = read_job(tmp_path / "job" / "calibration.yaml")
     assert job.robot.nominal == pytest.approx(s.robot.nominal, abs=rounding(10.0))
     assert job.truth.nominal == pytest.approx(s.true_robot.nominal, abs=rounding(10.0))
     assert job.measurements.sigma_joint == pytest.approx([0.01, 0.002])
-    assert s.true_robot.nominal[s.robot.index("tool.z")] != 0.1
+    errors = s.true_robot.nominal - s.robot.nominal
+    assert [errors[s.robot.index(name)] for name in ("tool.z", "base.x")] == pytest.approx([0.01, 0.02])
 
 
 def test_a_scenario_that_makes_no_sense_is_one_line(shipped):
