@@ -66,7 +66,7 @@ MAX_PRIOR_SCALE = 10.0
 NAMED = 3
 """Configurations, rows or parameters that a statement names."""
 
-_TOO_LARGE = frozenset(("too small", "both", "many"))
+_TOO_LARGE = frozenset(("too small", "both"))
 """Verdicts on a kind of noise specified too small."""
 
 

@@ -40,7 +40,7 @@ from fg_calib.robot import SPAN
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, RowModel, square_root
-from fg_calib.statistics.residual_table import ALARM, MAX_OUTLIER_SHARE, ResidualTable, suspect_level
+from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
 
 Codes = NDArray[np.int8]
 
@@ -90,7 +90,6 @@ class KindFit:
         expected: Its mean, were the noise as taken: the rows' redundancy.
         p_value: Probability of a sum as large, were the noise as taken; None where it is not known.
         typical: Noise seen over noise taken, from the median, which a few rows do not move.
-        largest: The largest |studentised residual|; nan where it is not known.
         degrees: Degrees of freedom of chi-square.
         table: Number of its table.
         n_beyond: Rows with a |studentised residual| that none of a clean table has (`suspect_level`).
@@ -110,7 +109,6 @@ class KindFit:
     expected: Figure
     p_value: float | None
     typical: Figure
-    largest: Figure
     degrees: Figure
     table: int = 0
     n_beyond: int = 0
@@ -132,21 +130,12 @@ class KindFit:
             unlikely = min(p, 1.0 - p) < ALARM / 2.0
         if not unlikely or abs(ratio - 1.0) < 0.05:
             return "as stated"
-        return "too large" if ratio < 1.0 else self._why_too_small(ratio)
-
-    def _why_too_small(self, ratio: float) -> str:
-        """The verdict on residuals that are too large."""
-        rest = self.rest
-        if rest is not None and rest.verdict in ("as stated", "too large"):
+        if ratio < 1.0 or self.rest is None:
+            return "too large" if ratio < 1.0 else "too small"
+        if self.rest.verdict in ("as stated", "too large"):
             return "outliers" if self.spoilt else "others"
-        if rest is not None and rest.seen_over_stated**2 - 1.0 < LEAST_GAIN * (self.seen_over_stated**2 - 1.0):
-            return "both"
-        share = (self.typical**2 - 1.0) / (ratio**2 - 1.0)  # of the excess that rows have in common
-        far = self.largest > suspect_level(self.n) * np.sqrt(max(self.typical, 1.0) * ratio)
-        if share > 0.65 or not far:
-            return "too small"  # the median of few rows varies: perhaps none of them is far from the others
-        many = self.n_beyond > MAX_OUTLIER_SHARE * self.n
-        return "many" if many else "outliers" if share < 0.35 else "both"
+        excess, left = self.seen_over_stated**2 - 1.0, self.rest.seen_over_stated**2 - 1.0
+        return "both" if left < LEAST_GAIN * excess else "too small"
 
 
 VERDICTS = {
@@ -156,7 +145,6 @@ VERDICTS = {
     "outliers": "few rows far too large: outliers",
     "others": "as specified once the outliers are left out",
     "both": "noise specified too small or effects not modelled, and outliers",
-    "many": "many rows far too large: something changed between them, or effects not modelled",
     "unknown": "too few rows to tell",
 }
 """What a fit by kind means, in words."""
@@ -164,11 +152,7 @@ VERDICTS = {
 PREDICTION_VERDICTS = VERDICTS | {
     "as stated": "as expected",
     "too large": "smaller than expected",
-    "too small": "most rows too large",
-    "outliers": "few rows far too large",
-    "others": "too large because of outliers of another kind",
-    "both": "many rows too large, and few far too large",
-    "many": "many rows far too large",
+    "too small": "larger than expected",
 }
 """The same of predicted rows."""
 
@@ -531,7 +515,6 @@ class RowStatistics:
                     expected=max(float(expected), 0.0),
                     p_value=upper_probability(total / mean, degrees, of_noise) if enough and known else None,
                     typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
-                    largest=float(np.nanmax(size)) if enough else np.nan,
                     degrees=degrees,
                     table=number,
                     n_beyond=int(np.sum(size > suspect_level(len(rows)))),

@@ -195,14 +195,6 @@ def test_robust_weights_count_rows_and_flag_outliers():
     assert [fit.seen_over_stated for fit in goodness.kinds] == pytest.approx([1.0, 1.0], abs=0.3)
 
 
-def test_noise_too_small_is_not_called_outliers():
-    """The median of few rows varies: only where some row is far from the others may it speak of outliers."""
-    clean = {"seen_over_stated": 1.8, "factor": 1.0, "p_value": 1e-4, "n": 45, "kind": "position", "unit": "m"}
-    fit = {**clean, "stated_sigma_rms": 1e-4, "chi2": 146.0, "expected": 45.0, "degrees": 45.0}
-    assert KindFit(**fit, typical=1.3, largest=4.9).verdict == "too small"
-    assert KindFit(**fit, typical=1.1, largest=20.0).verdict == "outliers"
-
-
 def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
     """Some 12 degrees of freedom see noise within a fifth: 0.75 times the noise stated is no news, 0.3 times is."""
     fit = {
@@ -212,7 +204,6 @@ def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
         "stated_sigma_rms": 1e-4,
         "factor": 1.0,
         "chi2": 20.0,
-        "largest": 2.0,
     }
     known = {**fit, "expected": 40.0, "p_value": None, "typical": 0.7, "degrees": 12.0}
     assert KindFit(**known, seen_over_stated=0.75).verdict == "as stated"
@@ -367,7 +358,10 @@ def test_degrees_of_freedom_count_core_and_landmarks():
     problem = build_problem(robot, touch(true, corners(true, 5, rng), 8, rng), model="distance")
     n_estimated = sum(p.estimated for p in robot.parameters)
     assert problem.n_residuals == 5 * 8 * 3
-    assert assess(solve(problem)).fit.chi_square.dof == 5 * 8 * 3 + n_estimated - n_estimated - 5 * 3
+    fit = assess(solve(problem)).fit
+    assert fit.chi_square.dof == 5 * 8 * 3 + n_estimated - n_estimated - 5 * 3
+    (points,) = fit.goodness.kinds
+    assert points.expected + fit.priors.expected == pytest.approx(fit.chi_square.dof, rel=1e-9)
 
 
 def test_estimated_noise_is_its_factor_times_the_specified_noise():
