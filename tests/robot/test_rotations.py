@@ -8,6 +8,8 @@ from tolerances import rounding
 from fg_calib.robot.rotations import (
     inverse_right_jacobian,
     left_jacobian,
+    nearest_rotation,
+    rotation_angle,
     rotation_of,
     rotation_vector,
     yaw_pitch_roll,
@@ -54,3 +56,18 @@ def test_jacobians_are_central_differences(length):
         assert left_jacobian(v[None])[0, :, k] == pytest.approx(numeric, abs=1e-8)
         logs = [rotation_vector((R * Rotation.from_rotvec(s * dv)).as_matrix()[None])[0] for s in (1, -1)]
         assert inverse_right_jacobian(v[None])[0, :, k] == pytest.approx((logs[0] - logs[1]) / (2 * h), abs=1e-8)
+
+
+def test_angle_axis_and_nearest_rotation_are_those_that_a_matrix_was_made_of():
+    rng = np.random.default_rng(0)
+    axis = rng.normal(size=(20, 3))
+    axis /= np.linalg.norm(axis, axis=1)[:, None]
+    angle = np.append(rng.uniform(0.0, np.pi, 17), [1e-9, np.pi - 1e-9, 0.0])
+    R = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+    found, of_axis = rotation_angle(R)
+    assert found == pytest.approx(angle, abs=1e-15, rel=1e-12)
+    assert of_axis == pytest.approx(np.sin(angle)[:, None] * axis, abs=1e-15)
+    A = rng.normal(size=(20, 3, 3))
+    stretch = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(3)
+    assert nearest_rotation(R @ stretch) == pytest.approx(R, abs=1e-9)
+    assert nearest_rotation(np.diag([2.0, 1.0, -0.5])) == pytest.approx(np.eye(3), abs=1e-12)
