@@ -15,19 +15,18 @@ from fg_calib.robot.kinematics import forward
 STEP, WEIGHTS = 5e-4, np.array([45.0, -9.0, 1.0]) / 60.0
 """Central differences of sixth order."""
 
-PRIVATE_SHARE, REDUNDANT = 1e-3, 100.0
-"""Least private share of a pair's variance; factor on second-order variance where pairs are more than their errors."""
+PRIVATE_SHARE = 1e-3
+"""Least private share of a pair's variance."""
 
 
 class SeriesRows:
     """The rows of a series at some parameters, and how they follow from errors of configurations.
 
     Attributes:
-        r: Residuals, shape (n, residual_dim); those of the readings where joint values are estimated.
+        r: Residuals, shape (n, residual_dim).
         J: Their derivatives in all columns, shape (n, residual_dim, n_columns + n_nuisance).
         sources: Derivatives times sigma by the error's name, shape (n, residual_dim, ends, errors), of the rows.
         own, total: Covariance of private noise, and of all noise, shape (n, residual_dim, residual_dim).
-        second_order: Variance beyond the first order, shape (n, residual_dim).
     """
 
     def __init__(self, problem, parameters, number):
@@ -37,8 +36,7 @@ class SeriesRows:
         at = problem.variables.at(parameters)
         self.chain = at.chains[s.table]
         self.points = at.coordinates[s.nuisances]
-        self.errors = None if state.joint_errors is None else state.joint_errors[self.place]
-        self.q = self.m.readings + (0.0 if self.errors is None else self.errors)
+        self.q = self.m.readings
         names = [name.split(".")[0] for name in s.kind.names]
         self.factors = np.array([state.factors.get((s.table, name), 1.0) for name in names])
         self.r = self._rows(self._ends(self._arm(self.q)))
@@ -59,17 +57,13 @@ class SeriesRows:
             private = s.covariance
             self.own = self._diagonal(s.sigma**2) if private is None else private
             self.own = self.own * np.outer(self.factors, self.factors)
-            self.second_order = np.zeros(self.r.shape)
-        if self.errors is not None:
-            self.r = self.r - np.einsum("nhew,new->nh", self.joints, self.errors[s.ends])
         self.total = self.own + sum(self._variance(G) for G in self.sources.values())
 
     def _pairs(self):
         """Mean, slope and variance of lengths and angles under what noise there is along and across their vectors."""
         s, m = self.series, self.m
-        estimated = self.errors is not None
         square, zero = (s.sigma * self.factors) ** 2, np.zeros(self.r.shape)
-        of_joints = zero if estimated else np.sum(self.sources["joints"] ** 2, axis=(2, 3))
+        of_joints = np.sum(self.sources["joints"] ** 2, axis=(2, 3))
         trace, of_poses, poses = zero.copy(), zero, None
         if s.formed:
             poses = np.zeros((s.n, s.kind.residual_dim, 2, 3 * s.kind.residual_dim))
@@ -81,7 +75,7 @@ class SeriesRows:
                 trace[:, i] += self.factors[i] ** 2 * np.sum(sigma[s.ends] ** 2, axis=(1, 2))
             of_poses = np.sum(poses**2, axis=(2, 3))
         for i, part in enumerate(s.kind.parts):
-            trace[:, i] += 0.0 if estimated else self.joint_factor**2 * self._trace_of_joints(part)
+            trace[:, i] += self.joint_factor**2 * self._trace_of_joints(part)
         value, along = self.r + s.data, of_poses + of_joints
         across = np.maximum(trace - along, 0.0) / 2.0
         own = zero if s.formed else square
@@ -97,17 +91,9 @@ class SeriesRows:
         self.r, self.J = self.r + excess, self.J * slope[:, :, None]
         self.joints = self.joints * slope[:, :, None, None]
         self.sources["joints"] = self.sources["joints"] * slope[:, :, None, None]
-        first_order = slope**2 * (of_poses + own + of_joints)
-        self.second_order = np.maximum(variance - first_order, 0.0)
-        left = variance - slope**2 * (of_joints + of_poses)
-        if s.formed:  # half of the second-order variance is its poses', a quarter either one's
-            squares = np.zeros((s.n, s.kind.residual_dim, 2, s.kind.residual_dim))
-            for i in range(s.kind.residual_dim):
-                squares[:, i, :, i] = np.sqrt(self.second_order[:, i, None] / 4.0)
-            poses = poses * slope[:, :, None, None]
-            self.sources[f"poses of {s.table}"] = np.concatenate([poses, squares], axis=3)
-            left = left - self.second_order / 2.0
-        self.own = self._diagonal(left)
+        if s.formed:
+            self.sources[f"poses of {s.table}"] = poses * slope[:, :, None, None]
+        self.own = self._diagonal(np.maximum(variance - slope**2 * (of_joints + of_poses), 0.0))
 
     def _arm(self, q):
         at = forward(self.chain.without_columns(), self.problem.robot.trig(q))
@@ -196,15 +182,11 @@ def dense(problem, parameters):
         train, residual_dim = rows.series.train, rows.series.kind.residual_dim
         ends = rows.place[rows.series.ends]
         shared = [name for name in rows.sources if name in reached and (reached[name][ends[train]] > 1).any()]
-        if problem.state.joint_errors is not None and "joints" not in shared:
+        if problem.joints_estimated and "joints" not in shared:
             shared.append("joints")
-        shared = [name for name in shared if sharing or (name == "joints" and problem.state.joint_errors is not None)]
+        shared = [name for name in shared if sharing or (name == "joints" and problem.joints_estimated)]
         own = rows.own.copy()
         if shared and is_pairs(rows.series.kind):
-            of_each = sum(rows.sources[name].shape[3] for name in shared)
-            many = len(train) * residual_dim > len(np.unique(rows.series.ends[train])) * of_each
-            if rows.series.formed and many and any(name != "joints" for name in shared):
-                own += rows._diagonal(0.5 * (REDUNDANT - 1.0) * rows.second_order)
             diagonal = np.einsum("nii->ni", own)
             least = PRIVATE_SHARE * np.einsum("nii->ni", rows.total)
             own += rows._diagonal(np.maximum(least - diagonal, 0.0))

@@ -135,7 +135,7 @@ class Pool(Brief):
         if len(poses) or before is None:
             places = places_of(self.problem, self.problem.start)
             problem = true_problem(self.robot, self.select_tables(poses, pairing), self.problem.options, places)
-        if before is not None and (problem is None or not problem.rows):  # nothing, or one end of a pair
+        if before is not None and (problem is None or not problem.rows.parts):  # nothing, or one end of a pair
             return Posterior(before, square_root(before, before.start, with_loss=True)[:, :-1])
         assert problem is not None
         rows = square_root(problem, problem.start)[:, :-1]
@@ -261,7 +261,7 @@ def build_pool(
     places = None if before is None else places_of(before, before.start)
     problem = true_problem(scenario.robot, tables, options, places)
     data = problem.data
-    if not problem.rows:
+    if not problem.rows.parts:
         n = data.n_configurations
         reason = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
         raise InputError("candidates", reason, "more configurations")

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fg_calib.graph import SIGNAL_FLOOR, Problem, WhitenedBlock, eliminate, prior_rows, unknown_prior_rows
+from fg_calib.graph import SIGNAL_FLOOR, Problem, eliminate, prior_rows, unknown_prior_rows
 from fg_calib.inputs import Brief, Floats, FrozenArrays, InputError, Integers
 from fg_calib.observability import Observability, observability_of_rows
 from fg_calib.prediction import PoseRms, errors_at
@@ -83,9 +83,7 @@ def gather_rows(
     v = problem.variables
     references = np.zeros(0, dtype=np.int64) if references is None else references
     n_columns, n_poses = v.n_columns + v.n_nuisance, int(pose_of.max(initial=-1)) + 1
-    width = max((rows.states.width for rows in problem.rows if rows.states is not None), default=0)
-    parts = [_derivatives(problem, rows, pose_of, references, width) for rows in problem.rows]
-    whole, private, which = (np.concatenate(one) for one in zip(*parts, strict=True))
+    whole, private, which = _derivatives(problem, pose_of, references)
     n_shared = whole.shape[1] - n_columns
     stacked = _stack(np.hstack([whole, private]), which, n_poses)
     rows = _whiten(stacked[:, :, : whole.shape[1]], stacked[:, :, whole.shape[1] :])
@@ -99,17 +97,15 @@ def gather_rows(
     return PoseRows(rows, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns)
 
 
-def _derivatives(
-    problem: Problem, rows: WhitenedBlock, pose_of: Integers, references: Integers, width: int
-) -> tuple[Floats, Floats, Integers]:
+def _derivatives(problem: Problem, pose_of: Integers, references: Integers) -> tuple[Floats, Floats, Integers]:
     """Derivatives of rows, with the errors of reference poses; in the errors of their own pose; and their pose."""
+    rows, width = problem.rows, len(problem.rows.slots)
     J = rows.private(problem.variables.at(problem.start))[:, :-1]
     which = np.concatenate([_poses_of(problem, part.series, part.block.residual_dim, pose_of) for part in rows.parts])
     private, of_references = np.zeros((len(J), width)), np.zeros((len(J), len(references) * width))
-    if rows.states is not None:
+    if width:
         L = rows.states.loadings.tocoo()
-        configuration = rows.configurations[L.col // rows.states.width]
-        k = L.col % rows.states.width
+        configuration, k = rows.configurations[L.col // width], L.col % width
         for number, reference in enumerate(references.tolist()):
             mask = configuration == reference
             of_references[L.row[mask], number * width + k[mask]] = L.data[mask]

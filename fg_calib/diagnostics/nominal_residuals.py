@@ -24,7 +24,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
@@ -33,12 +32,11 @@ from fg_calib.graph import (
     Problem,
     RowNoise,
     build_variables,
-    levenberg_marquardt_params,
     noises_at,
     problem_of_tables,
-    reduced_graph,
     relinearized_at,
     tables_of,
+    take_steps,
     whitening_of,
 )
 from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
@@ -197,13 +195,7 @@ def fit_landmarks(problem: Problem) -> Floats:
     Args:
         problem: A problem of the arm as it is (see `Problem.evaluated`).
     """
-    if not problem.variables.keys:
-        return problem.start
-    params = levenberg_marquardt_params()
-    params.setMaxIterations(MAX_STEPS)
-    params.setRelativeErrorTol(1e-3)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(reduced_graph(problem), problem.initial, params)
-    return problem.variables.parameters(optimizer.optimize())
+    return take_steps(problem, MAX_STEPS)
 
 
 def residuals_at(
@@ -222,8 +214,8 @@ def residuals_at(
     sampled = replace(problem, data=replace(problem.data, blocks=some))
     found: list[TypicalResidual] = []
     for noise, of_arm in with_arm_errors(sampled, parameters, robot):
-        residual, _, sigma = noise.figures()
-        found += _by_kind(noise, residual**2, np.einsum("nii->ni", of_arm) + sigma**2)
+        variance = np.einsum("nii->ni", of_arm) + noise.sigma**2
+        found += _by_kind(noise, noise.residual() ** 2, variance)
     return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
 
 
@@ -244,7 +236,7 @@ def with_arm_errors(problem: Problem, parameters: Floats, robot: Robot) -> Itera
     values = np.concatenate([parameters[problem.variables.robot_span], parameters[problem.variables.frame_span]])
     for noise in noises_at(problem, parameters):
         chain = variables.chains[noise.series.table].at(values)
-        J = residuals.linearise(noise.rows, chain)[1][:, :, : len(scale)] * scale
+        J = residuals.linearise(noise.rows_at(slice(None)), chain)[1][:, :, : len(scale)] * scale
         yield noise, J @ np.swapaxes(J, 1, 2)
 
 
@@ -373,13 +365,14 @@ def _distances(problem: Problem, parameters: Floats, robot: Robot) -> _Rows:
     """The rows of each series, with covariance, distance over the typical one, and part of the noise in it."""
     found: _Rows = []
     for noise, of_arm in with_arm_errors(problem, parameters, robot):
-        total, used = noise.total + of_arm, noise.series.used
+        of_noise, used = noise.total_at(slice(None)), noise.series.used
+        total = of_noise + of_arm
         n_rows = used.sum(axis=1)
         r = np.where(used, noise.residual(), 0.0)
         z = np.linalg.norm(whitening_of(total, used) @ r[:, :, None], axis=(1, 2))
         expected = np.sqrt(special.chdtri(np.maximum(n_rows, 1), 0.5))
         typical = max(1.0, float(np.median((z / expected)[n_rows > 0]))) if n_rows.any() else 1.0
-        share = np.einsum("nii->n", noise.total) / np.einsum("nii->n", total)
+        share = np.einsum("nii->n", of_noise) / np.einsum("nii->n", total)
         found.append((noise, total, z / np.sqrt(np.maximum(n_rows, 1)) / typical, share))
     return found
 

@@ -166,7 +166,7 @@ def probability_of_noise(solution: Solution) -> float | None:
 
 def _is_plain(problem: Problem) -> bool:
     """Whether there are few enough rows, each of which counts as its noise says."""
-    weighted = problem.state.weights is not None or problem.state.joint_errors is not None
+    weighted = problem.state.weights is not None or problem.joints_estimated
     return not (problem.has_more or weighted or problem.n_residuals > MAX_ROWS)
 
 
@@ -177,8 +177,8 @@ def find_change(solution: Solution) -> Change | None:
         It is looked for in one table of poses, positions or orientations, without robust losses.
     """
     problem = solution.problem
-    blocks = [part.block for rows in problem.rows for part in rows.parts]
-    several = len(problem.data.tables) > 1 or any(rows.states is not None for rows in problem.rows)
+    blocks = [part.block for part in problem.rows.parts]
+    several = len(problem.data.tables) > 1 or problem.rows.states.n_states > 0
     if several or not _is_plain(problem) or problem.data.landmarks.names or any(b.kind.ends != 1 for b in blocks):
         return None
     fit, J, names = regress(solution)
@@ -260,12 +260,10 @@ def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
     columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)
     columns[list(offsets)] = len(core) + at.n_nuisance + np.arange(len(offsets))
     wide = replace(at, chains=chains, n_columns=len(core), columns=columns, n_nuisance=at.n_nuisance + len(offsets))
-    parts = list[Floats]()
-    for rows in problem.rows:
-        of_joints = [_by_joint_errors(part.at(wide), chains[part.table], errors[part.table]) for part in rows.parts]
-        private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
-        parts.append(private if rows.states is None else rows.states.whiten(private))
-    J, r = np.split(np.concatenate(parts), [-1], axis=1)
+    rows = problem.rows
+    of_joints = [_by_joint_errors(part.at(wide), chains[part.table], errors[part.table]) for part in rows.parts]
+    private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
+    J, r = np.split(rows.states.whiten(private), [-1], axis=1)
     names = [f"{STAGE}{stage}" for stage in np.repeat(_STAGES, problem.robot.n_joints)]
     names += [name if name.startswith(LINK) else "" for name in core] + [""] * at.n_nuisance
     all_names = np.array(names + [f"{OFFSET}{table}" for table in offsets.values()])

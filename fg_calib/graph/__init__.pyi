@@ -10,10 +10,10 @@ from .build import (
     random_problem,
     true_problem,
 )
-from .error_states import ErrorStates, State, WhitenedBlock, WhitenedSeries, block_diagonal, whitener_of
+from .error_states import PRIVATE_SHARE, State, WhitenedRows, WhitenedSeries, block_diagonal, whitener_of
 from .factors import DistanceFactor, RotationAngleFactor
 from .knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
-from .noise_models import JOINT_NOISE, PRIVATE_SHARE, NoiseName, NoiseState, RowNoise, whitening_of
+from .noise_models import JOINT_NOISE, NoiseName, NoiseState, RowNoise, reach, whitening_of
 from .normal_system import (
     RANK_TOLERANCE,
     SIGNAL_FLOOR,
@@ -30,14 +30,13 @@ from .problem import (
     correlation,
     directions,
     felt,
+    joint_errors,
     linear_system,
     mahalanobis_distances,
     named_triangle,
     noises_at,
     problem_at,
-    reduced_graph,
     relinearized_at,
-    row_triangles,
     says_where,
     square_root,
     start_of,
@@ -54,6 +53,7 @@ from .solver import (
     ToleranceScales,
     levenberg_marquardt_params,
     solve,
+    take_steps,
     unsolved,
 )
 from .variables import (
@@ -77,7 +77,6 @@ __all__ = [
     "STRUCTURAL_FLOOR",
     "SUPPORT_TOLERANCE",
     "DistanceFactor",
-    "ErrorStates",
     "Knowledge",
     "Name",
     "NoiseName",
@@ -93,7 +92,7 @@ __all__ = [
     "ToleranceScale",
     "ToleranceScales",
     "Variables",
-    "WhitenedBlock",
+    "WhitenedRows",
     "WhitenedSeries",
     "at_parameters",
     "block_diagonal",
@@ -110,6 +109,7 @@ __all__ = [
     "felt",
     "first_independent",
     "frame_of",
+    "joint_errors",
     "kept_of",
     "levenberg_marquardt_params",
     "linear_system",
@@ -125,15 +125,15 @@ __all__ = [
     "problem_of",
     "problem_of_tables",
     "random_problem",
-    "reduced_graph",
+    "reach",
     "relinearized_at",
-    "row_triangles",
     "says_where",
     "solve",
     "square_root",
     "start_of",
     "subsampled",
     "tables_of",
+    "take_steps",
     "true_problem",
     "tuning",
     "unknown_prior_rows",

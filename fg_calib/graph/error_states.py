@@ -8,15 +8,14 @@ mean of z for rows y is `Z = S^-1 L^T y`, and
 
 so [y - L Z; Z] are rows of unit covariance that say the same. S is factored in the quickest of four ways: a dense
 Cholesky factor of 1 + L L^T or of S, whichever is smaller; or a sparse factor, configurations ordered so that trees do
-not fill and reference poses come last, or by minimum degree.
+not fill and reference poses come last, or by minimum degree. Errors that reach one measurement only are private noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
-from hashlib import sha256
 from typing import Literal
 
 import numpy as np
@@ -25,7 +24,7 @@ import scipy.sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
-from fg_calib.graph.noise_models import NoiseSource, RowNoise, whitening_of
+from fg_calib.graph.noise_models import RowNoise, reach, whitening_of
 from fg_calib.inputs import Booleans, Brief, Floats, Integers, SolverError
 from fg_calib.measurements import Block, pack, residuals, unpack
 from fg_calib.robot import SPAN, Chain, over_spans
@@ -50,9 +49,8 @@ BATCH = 512
 N_PROBES = 64
 """Random vectors that estimate the trace of a large matrix; the estimate's sigma is below sqrt(2 n / 64) of n rows."""
 
-
-CACHED_TRIANGLES = 4
-"""Triangles of a set of rows that are kept: many ask what rows say at the start, at nominal and at the estimate."""
+PRIVATE_SHARE = 1e-3
+"""Share of a row's variance that counts as private at least: the errors that measurements share are not all."""
 
 MIN_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
@@ -71,10 +69,9 @@ class SchurComplement:
     width: int = 1
 
     @property
-    def n(self) -> int:
-        """Number of rows that `whiten` returns."""
-        n_rows, n_states = self.loadings.shape
-        return n_rows if self._has_few_rows else n_rows + n_states
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.loadings.shape[1])
 
     def whiten(self, rows: Floats) -> Floats:
         """Rows of unit covariance that say the same as `rows`, shape (n_rows, k), do: shape (n, k)."""
@@ -102,26 +99,22 @@ class SchurComplement:
     @cached_property
     def variances(self) -> Floats:
         """Posterior variances of the states, the diagonal of S^-1, shape (n_states,); many take a solution each."""
-        n = self.loadings.shape[1]
-        out = np.empty(n)
-        for start in range(0, n, BATCH):
-            chosen = np.arange(start, min(start + BATCH, n))
-            unit = np.zeros((n, len(chosen)))
-            unit[chosen, chosen - start] = 1.0
-            out[chosen] = self.solve(unit)[chosen, chosen - start]
+        out = np.empty(self.n_states)
+        for start in range(0, self.n_states, BATCH):
+            unit = np.eye(self.n_states, min(BATCH, self.n_states - start), -start)
+            out[start : start + BATCH] = np.sum(self.solve(unit) * unit, axis=0)
         return out
 
     def trace(self, E: Sparse) -> float:
         """`tr E^T C^-1 E` of a sparse E, shape (n_rows, k); of large systems an estimate, see `N_PROBES`."""
-        if min(self.loadings.shape) <= MAX_DENSE:
-            common = scipy.sparse.csc_array(self.loadings.T @ E)
-            total = float(E.power(2).sum())
-            for start in range(0, common.shape[1], BATCH):
-                D = common[:, start : start + BATCH].toarray()
-                total -= float(np.vdot(D, self.solve(D)))
-            return total
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(E.shape[1], N_PROBES))
-        return float(np.sum(self.whiten(E @ signs) ** 2)) / N_PROBES
+        if min(self.loadings.shape) > MAX_DENSE:
+            signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(E.shape[1], N_PROBES))
+            return float(np.sum(self.whiten(E @ signs) ** 2)) / N_PROBES
+        common, total = scipy.sparse.csc_array(self.loadings.T @ E), float(E.power(2).sum())
+        for start in range(0, common.shape[1], BATCH):
+            D = common[:, start : start + BATCH].toarray()
+            total -= float(np.vdot(D, self.solve(D)))
+        return total
 
     @property
     def _has_few_rows(self) -> bool:
@@ -140,6 +133,8 @@ class SchurComplement:
     def _factor(self) -> tuple[bool, Callable[[Floats], Floats]]:
         """Whether C is factored, not S; and what multiplies by the inverse."""
         L, width, (n_rows, n_states) = self.loadings, self.width, self.loadings.shape
+        if not n_states:
+            return False, lambda b: b
         if self._has_few_rows:
             return True, lambda b: self._unit.T @ (self._unit @ b)
         if n_states <= MAX_DENSE or n_states**2 <= MAX_FILL * L.nnz:
@@ -152,7 +147,9 @@ class SchurComplement:
             order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
             return False, _sparse_solver(L.T @ L, (order[:, None] * width + np.arange(width)).ravel())
         if min(n_rows, n_states) > MAX_SPARSE:
-            raise _too_many(n_states)
+            found = f"{n_states} errors that pairs share in loops are too many to eliminate"
+            way_out = "use model pose with frame unknown, which holds the same, or a star or chain"
+            raise SolverError(f"pairs: {found}; {way_out}")
         return n_rows < n_states, _sparse_solver(L @ L.T if n_rows < n_states else L.T @ L)
 
 
@@ -181,11 +178,6 @@ def _sparse_solver(M: Sparse, order: Integers | None = None) -> Callable[[Floats
     return solve
 
 
-def _too_many(n_states: int) -> SolverError:
-    found = f"{n_states} errors that pairs share in loops are too many to eliminate"
-    return SolverError(f"pairs: {found}; use model pose with frame unknown, which holds the same, or a star or chain")
-
-
 def _configuration_graph(L: Sparse, width: int) -> Sparse:
     """Which configurations measurements couple, shape (n, n), the diagonal included."""
     shape = (L.shape[0], L.shape[1] // width)
@@ -212,13 +204,6 @@ class State(Brief):
     n_columns: int
     n_nuisance: int
 
-    @cached_property
-    def mark(self) -> bytes:
-        """What tells it from others."""
-        arrays = [array for chain in self.chains for array in (*chain.arrays[:7], *chain.arrays[9:])]
-        marks = [array.tobytes() for array in (*arrays, self.coordinates, self.columns)]
-        return sha256(b"|".join([*marks, repr((self.n_columns, self.n_nuisance)).encode()])).digest()
-
     def without_columns(self) -> State:
         """The same without derivatives."""
         return replace(self, chains=tuple(chain.without_columns() for chain in self.chains), n_columns=0, n_nuisance=0)
@@ -233,14 +218,12 @@ class WhitenedSeries(Brief):
         table: Which table they are from.
         series: Which series.
         nuisances: Nuisance coordinates of each measurement, shape (n, kind.n_nuisances).
-        offset: Taken from the whitened residuals before anything else, shape (n, residual_dim); None for zero.
     """
 
     block: Block
     table: int
     series: int
     nuisances: Integers
-    offset: Floats | None = None
 
     @property
     def n_rows(self) -> int:
@@ -249,237 +232,162 @@ class WhitenedSeries(Brief):
 
     def only(self, k: int) -> WhitenedSeries:
         """One of its measurements."""
-        chunk = slice(k, k + 1)
-        offset = None if self.offset is None else self.offset[chunk]
-        return WhitenedSeries(
-            residuals.rows_of(self.block, chunk), self.table, self.series, self.nuisances[chunk], offset
-        )
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether its rows depend on the core alone, as the kernel computes them."""
-        return self.nuisances.shape[1] == 0 and self.offset is None
+        one = slice(k, k + 1)
+        return replace(self, block=residuals.rows_of(self.block, one), nuisances=self.nuisances[one])
 
     def at(self, at: State) -> Block:
         """The block with its nuisances' values."""
-        if not self.nuisances.shape[1]:
-            return self.block
-        return replace(self.block, nuisances=at.coordinates[self.nuisances])
+        return replace(self.block, nuisances=at.coordinates[self.nuisances]) if self.nuisances.size else self.block
 
     def linearise(self, at: State) -> Iterator[Floats]:
         """[J r] by all columns, nuisances' among them, chunk by chunk, shape (rows, n_columns + n_nuisance + 1)."""
-        chain, block = at.chains[self.table], self.at(at)
-        wide = at.n_columns + at.n_nuisance
+        chain, block, n = at.chains[self.table], self.at(at), at.n_columns
         for start in range(0, block.n, SPAN):
             chunk = slice(start, start + SPAN)
             r, J = residuals.linearise(residuals.rows_of(block, chunk), chain)
-            if self.offset is not None:
-                r = r - self.offset[chunk]
-            out = np.zeros((*r.shape, wide + 1))
-            out[:, :, : at.n_columns], out[:, :, -1] = J[:, :, : at.n_columns], r
-            if at.n_nuisance and self.nuisances.shape[1]:
-                _scatter(out, J[:, :, at.n_columns :], at.columns[self.nuisances[chunk]])
+            out = np.zeros((*r.shape, n + at.n_nuisance + 1))
+            out[:, :, :n], out[:, :, -1] = J[:, :, :n], r
+            for k, places in enumerate(self.nuisances[chunk].T if at.n_nuisance else ()):
+                rows = np.flatnonzero(at.columns[places] >= 0)
+                out[rows, :, at.columns[places[rows]]] = J[rows, :, n + k]
             yield out.reshape(r.size, -1)
 
-
-def _scatter(out: Floats, N: Floats, columns: Integers) -> None:
-    """Put derivatives in nuisances, shape (n, residual_dim, k), in their columns, shape (n, k), of rows."""
-    for k in range(N.shape[2]):
-        there = np.flatnonzero(columns[:, k] >= 0)
-        out[there, :, columns[there, k]] = N[there, :, k]
+    def reduce(self, at: State) -> Iterator[Floats]:
+        """Rows with the Gram matrix of [J r], few at a time."""
+        if self.nuisances.size:
+            yield from self.linearise(at)
+            return
+        R = residuals.triangle(self.block, at.chains[self.table])
+        out = np.zeros((len(R), at.n_columns + at.n_nuisance + 1))
+        out[:, : at.n_columns], out[:, -1] = R[:, :-1], R[:, -1]
+        yield out
 
 
 @dataclass(frozen=True)
-class WhitenedBlock(Brief):
-    """Whitened train rows; every row counts as one measurement where they share errors.
+class WhitenedRows(Brief):
+    """All train rows, whitened by their private noise.
 
     Attributes:
-        parts: The rows of each series.
-        states: How all their rows follow from error states; None if nothing is shared.
-        configurations: Configurations whose errors are shared, in the order of the errors.
-        joints: Place of the joints' errors among those of a configuration.
-        spare: E with E E^T what of the rows' own noise is there for numerical safety alone; None if nothing is.
+        parts: The rows of each series that has any, one after the other.
+        states: How they follow from error states.
+        configurations: Configurations that have error states, in the order of these.
+        slots: Slots of the errors of a configuration (see `noise_models`), in the order of the states.
+        shared: Which of all errors are states, shape (n_errors,).
+        spare: E with E E^T the part of their private noise that is there for numerical safety alone.
+        counted_as_private: Whether measurements share errors that count as private of each.
     """
 
     parts: tuple[WhitenedSeries, ...]
-    states: SchurComplement | None = None
-    configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    joints: int = 0
-    spare: Sparse | None = None
-    _triangles: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False, compare=False)
+    states: SchurComplement
+    configurations: Integers
+    slots: Integers
+    shared: Booleans
+    spare: Sparse
+    counted_as_private: bool = False
 
-    @property
-    def n_rows(self) -> int:
-        """Number of rows that `linearise` returns."""
-        return sum(part.n_rows for part in self.parts) if self.states is None else self.states.n
-
-    @property
+    @cached_property
     def n_spare(self) -> float:
         """How many degrees of freedom the rows have by `spare` alone: its trace over the rows' covariance."""
-        if self.spare is None:
-            return 0.0
-        return float(self.spare.power(2).sum()) if self.states is None else self.states.trace(self.spare)
-
-    @property
-    def coordinates(self) -> Integers:
-        """Nuisance coordinates that the rows depend on."""
-        return np.unique(np.concatenate([part.nuisances.ravel() for part in self.parts]))
+        return self.states.trace(self.spare) if self.spare.nnz else 0.0
 
     def private(self, at: State) -> Floats:
-        """[J r] before correlation is dealt with, shape (all rows, n_columns + n_nuisance + 1)."""
-        return np.concatenate([chunk for part in self.parts for chunk in part.linearise(at)])
+        """[J r] before shared errors are dealt with, shape (n_rows, n_columns + n_nuisance + 1)."""
+        empty = np.zeros((0, at.n_columns + at.n_nuisance + 1))
+        return np.concatenate([empty, *(chunk for part in self.parts for chunk in part.linearise(at))])
 
     def linearise(self, at: State) -> tuple[Floats, Floats]:
-        """Whitened residuals, shape (n_rows,), and their derivatives, shape (n_rows, n_columns + n_nuisance)."""
-        rows = self.private(at)
-        if self.states is not None:
-            rows = self.states.whiten(rows)
+        """Whitened residuals, shape (n,), and their derivatives, shape (n, n_columns + n_nuisance)."""
+        rows = self.states.whiten(self.private(at))
         return rows[:, -1], rows[:, :-1]
 
-    def squared_norm(self, at: State) -> float:
-        """Sum of squared whitened residuals."""
-        free = at.without_columns()
-        if self._kernel_alone:
-            return residuals.squared_norm(self.parts[0].block, free.chains[self.parts[0].table])
-        r, _ = self.linearise(free)
-        return float(r @ r)
-
-    def triangle(self, at: State) -> Floats:
-        """R of a thin QR of [J r], shape (n_columns + n_nuisance + 1,) * 2; the last ones are remembered."""
-        if at.mark not in self._triangles:
-            for mark in list(self._triangles)[: 1 - CACHED_TRIANGLES]:
-                self._triangles.pop(mark, None)
-            self._triangles[at.mark] = self._triangle(at)
-        return self._triangles[at.mark].copy()
-
-    def _triangle(self, at: State) -> Floats:
-        if self._kernel_alone:
-            return _padded(residuals.triangle(self.parts[0].block, at.chains[self.parts[0].table]), at.n_nuisance)
-        chunks = self.parts[0].linearise(at) if self._one_by_one else iter([self._whitened(at)])
-        R = np.zeros((at.n_columns + at.n_nuisance + 1,) * 2)
+    def square_root(self, at: State) -> Floats:
+        """Rows with the Gram matrix of the whitened [J r], at most as many as columns."""
+        if self.states.n_states:
+            chunks = [self.states.whiten(self.private(at))]
+        else:
+            chunks = (chunk for part in self.parts for chunk in part.reduce(at))  # type: ignore[assignment]
+        R = np.zeros((0, at.n_columns + at.n_nuisance + 1))
         for chunk in chunks:
             for start in range(0, len(chunk), 4 * SPAN):
                 R = np.linalg.qr(np.vstack([R, chunk[start : start + 4 * SPAN]]), mode="r")  # type: ignore[assignment]
         return R
 
     def posterior_mean(self, at: State) -> Floats:
-        """Posterior mean of the error states, shape (n_configurations, width)."""
-        if self.states is None:
-            return np.zeros((0, 0))
+        """Posterior mean of the error states, shape (n_configurations, n_slots), [sigma]."""
         r = self.private(at.without_columns())[:, -1:]
-        return self.states.posterior_mean(r)[:, 0].reshape(len(self.configurations), -1)
-
-    def weighed(self, at: State) -> Floats:
-        """C^-1 J, C the covariance of all rows whitened by their private noise, shape (all rows, n_all_columns)."""
-        J = self.private(at)[:, :-1]
-        return J if self.states is None else J - self.states.loadings @ self.states.posterior_mean(J)
-
-    def _whitened(self, at: State) -> Floats:
-        rows = self.private(at)
-        return rows if self.states is None else self.states.whiten(rows)
-
-    @property
-    def _one_by_one(self) -> bool:
-        return self.states is None and len(self.parts) == 1
-
-    @property
-    def _kernel_alone(self) -> bool:
-        return self._one_by_one and self.parts[0].is_plain
-
-
-def _padded(R: Floats, n_nuisance: int) -> Floats:
-    """A square matrix of [J r] with columns and rows of zeros for the nuisances before its last."""
-    if not n_nuisance:
-        return R
-    keep = np.append(np.arange(len(R) - 1), len(R) + n_nuisance - 1)
-    out = np.zeros((len(R) + n_nuisance,) * 2)
-    out[np.ix_(keep, keep)] = R
-    return out
+        return self.states.posterior_mean(r).reshape(len(self.configurations), len(self.slots))
 
 
 def whitened_rows(
-    noises: Sequence[RowNoise], *, sharing: bool, joint_errors: Floats | None, weights: Sequence[Floats] | None
-) -> tuple[WhitenedBlock, ...]:
+    noises: Sequence[RowNoise], *, sharing: bool, joints: bool, weights: Sequence[Floats] | None
+) -> WhitenedRows:
     """The train rows of series, whitened.
 
     Args:
         noises: The rows and their noise.
         sharing: Whether measurements share the errors of their configurations, or each counts as having its own.
-        joint_errors: Errors of the readings that the rows are linearised about, where they are estimated, shape
-            (n_configurations, n_joints); then they count as shared although only one measurement has them.
+        joints: Whether errors of joint readings are states although only one measurement has them.
         weights: Robust weight of each measurement of each series; None for 1.
     """
-    shares = ErrorStates(noises, sharing, joint_errors is not None)
-    gathered = [
-        _whiten(i, noise, shares, joint_errors, None if weights is None else weights[i])
+    reached = reach(noises)
+    width = noises[0].place.width if noises else 1
+    of_joints = np.arange(len(reached)) % width < (noises[0].place.chain.n_joints if noises else 0)
+    shared = (reached > 1) & sharing | of_joints & joints
+    found = [
+        _whiten(i, noise, shared, None if weights is None else weights[i])
         for i, noise in enumerate(noises)
         if len(noise.series.train)
     ]
-    together = [(part, *shared) for part, shared in gathered if shared and shared[0].nnz]
-    alone = [WhitenedBlock((part,)) for part, shared in gathered if not (shared and shared[0].nnz)]
-    return (*alone, shares.row_set(together)) if together else tuple(alone)
+    L = _stacked([L for _, L, _ in found])
+    configuration, slot = np.divmod(L.indices, width)
+    configurations, at = _ranks(configuration)
+    slots, k = _ranks(slot)
+    L = Sparse((L.data, at * len(slots) + k, L.indptr), shape=(L.shape[0], len(configurations) * len(slots)))
+    return WhitenedRows(
+        parts=tuple(part for part, _, _ in found),
+        states=SchurComplement(L, max(len(slots), 1)),
+        configurations=configurations,
+        slots=slots,
+        shared=shared,
+        spare=Sparse(scipy.sparse.block_diag([Sparse((0, 0)), *(E for _, _, E in found)])),
+        counted_as_private=bool(np.any((reached > 1) & ~shared)),
+    )
 
 
-def share_errors(noises: Sequence[RowNoise]) -> bool:
-    """Whether errors of configurations that are not estimated reach more than one train measurement."""
-    shares = ErrorStates(noises, sharing=True, estimated=False)
-    return any(shares.mask(source)[noise.series.train].any() for noise in noises for source in _not_estimated(noise))
+def _ranks(numbers: Integers) -> tuple[Integers, Integers]:
+    """The different numbers, ascending, and the place of each number among them."""
+    present = np.bincount(numbers) > 0
+    return np.flatnonzero(present), (np.cumsum(present) - 1)[numbers]
 
 
-def _not_estimated(noise: RowNoise) -> tuple[NoiseSource, ...]:
-    """The sources of a series' noise but for estimated joint errors, which count as shared whatever is asked."""
-    return tuple(s for s in noise.sources if not (noise.place.joints_estimated and s.name == "joints"))
+def _stacked(matrices: Sequence[Sparse]) -> Sparse:
+    return Sparse(scipy.sparse.vstack(matrices)) if matrices else Sparse((0, 0))
 
 
-def correlation_of(noises: Sequence[RowNoise], rows: Sequence[WhitenedBlock], at: State, follow: Floats) -> Floats:
+def correlation_of(noises: Sequence[RowNoise], rows: WhitenedRows, J: Floats) -> Floats:
     """J^T (C - 1) J of rows that share errors but are whitened as if they did not, shape (n_columns, n_columns).
 
     Args:
         noises: The rows of all series and their noise.
         rows: The whitened train rows.
-        at: Where the derivatives J are wanted; C is the covariance of the whitened rows.
-        follow: How the nuisance variables follow the core, shape (n_nuisance, n_columns): in J they do.
+        J: Their derivatives, shape (n_rows, n_columns); C is the covariance of the whitened rows.
     """
-    shares = ErrorStates(noises, sharing=True, estimated=False)
-    n, own = at.n_columns, np.zeros((at.n_columns, at.n_columns))
-    common = np.zeros((shares.n_errors, n))
-    for part in (part for row_set in rows for part in row_set.parts):
-        noise = noises[part.series]
-        sources, train, residual_dim = _not_estimated(noise), noise.series.train, noise.series.kind.residual_dim
-        wide = np.concatenate(list(part.linearise(at)))
-        J = wide[:, :n] + wide[:, n:-1] @ follow
-        W = whitener_of(noise, part)
-        masks = {source.name: shares.mask(source)[train] for source in sources}
-        common += shares.loading(noise, train, W, masks, sources).T @ J
-        for source in sources:
-            G = np.einsum("nhk,nkew->nhew", W, source.loading[train] * masks[source.name][:, None, :, None])
-            each = np.einsum("nhew,nhp->newp", G, J.reshape(len(train), residual_dim, n)).reshape(-1, n)
-            own += each.T @ each
+    own, start = np.zeros((J.shape[1], J.shape[1])), 0
+    for part in rows.parts:
+        noise, train = noises[part.series], noises[part.series].series.train
+        of_part = J[start : start + part.n_rows].reshape(part.block.n, part.block.residual_dim, -1)
+        G = np.swapaxes(whitener_of(noise, part) @ noise.loading[train], 1, 2)
+        each = (G @ of_part).reshape(-1, J.shape[1])
+        own, start = own + each.T @ each, start + part.n_rows
+    common = all_errors(noises, rows).T @ J
     out: Floats = common.T @ common - own
     return out
 
 
-def felt_errors(
-    noises: Sequence[RowNoise], rows: Sequence[WhitenedBlock], at: State, errors: ErrorStates, wanted: Integers
-) -> Floats:
-    """J^T C^-1 L: what errors of 1 sigma make of the right-hand side, shape (n_columns + n_nuisance, len(wanted)).
-
-    Args:
-        noises: The rows of all series and their noise.
-        rows: The whitened train rows.
-        at: Where the derivatives J are wanted; C is the covariance that the rows are weighted by.
-        errors: The errors of all configurations.
-        wanted: Numbers of those that are asked for.
-    """
-    out = np.zeros((at.n_columns + at.n_nuisance, len(wanted)))
-    for row_set in rows:
-        J, start = row_set.weighed(at), 0
-        for part in row_set.parts:
-            noise = noises[part.series]
-            L = errors.loading(noise, noise.series.train, whitener_of(noise, part))[:, wanted]
-            out += (L.T @ J[start : start + part.n_rows]).T
-            start += part.n_rows
-    return out
+def all_errors(noises: Sequence[RowNoise], rows: WhitenedRows) -> Sparse:
+    """How whitened rows follow from all errors, states or not, shape (n_rows, n_errors)."""
+    pairs = [(noises[part.series], part) for part in rows.parts]
+    return _stacked([noise.errors_at(noise.series.train, whitener_of(noise, part)) for noise, part in pairs])
 
 
 def whitener_of(noise: RowNoise, part: WhitenedSeries) -> Floats:
@@ -490,184 +398,48 @@ def whitener_of(noise: RowNoise, part: WhitenedSeries) -> Floats:
 
 
 def _whiten(
-    number: int, noise: RowNoise, states: ErrorStates, joint_errors: Floats | None, weights: Floats | None
-) -> tuple[WhitenedSeries, tuple[Sparse, Sparse] | None]:
-    """The train rows of a series; how they follow from error states, if they do, and E of `WhitenedBlock.spare`."""
+    number: int, noise: RowNoise, shared: Booleans, weights: Floats | None
+) -> tuple[WhitenedSeries, Sparse, Sparse]:
+    """The train rows of a series; how they follow from all errors that are states; and E of `WhitenedRows.spare`."""
     series, train = noise.series, noise.series.train
-    n, residual_dim = len(train), series.kind.residual_dim
-    masks = {source.name: states.mask(source)[train] for source in noise.sources}
-    carried = frozenset(name for name, mask in masks.items() if mask.any())
-    diagonal, artificial = noise.private_diagonal(train, carried) if carried else (np.zeros((0, 0)),) * 2
-    W_is_wanted = bool(carried) or joint_errors is not None
-    W = np.empty((n * W_is_wanted, residual_dim, residual_dim))
+    n, h = len(train), series.kind.residual_dim
     rows: Integers | slice = slice(None) if n == series.n else train
-    used, measured = series.used[rows], residuals.rows_of(noise.as_measured, rows)
+    used, is_state = series.used[rows], shared[noise.columns[rows]]
+    measured = residuals.rows_of(noise.as_measured, rows)
     data, whitening = np.empty(measured.data.shape), np.empty(measured.whitening.shape)
+    carried = bool(is_state.any())
+    W, artificial = np.empty((n * carried, h, h)), np.zeros((n * carried, h))
+    if carried and noise.slope is not None:
+        artificial = np.maximum(PRIVATE_SHARE * noise.sigma[rows] ** 2 - noise.variance[rows], 0.0)
 
     def whiten(start: int, stop: int) -> None:
         span = slice(start, stop)
         these = span if n == series.n else train[span]
-        moments = noise.moments_at(these)
-        plain = noise.rows_at(these, moments)
-        private = noise.own_at(these, moments)
+        private, plain = noise.private_at(these), noise.rows_at(these)
+        own = np.where(is_state[span][:, None], 0.0, noise.loading[these])
+        private = private + own @ np.swapaxes(own, 1, 2)
         if carried:
-            private = private + (diagonal[span] - moments.variance)[:, :, None] * np.eye(residual_dim)
-        for source in noise.sources:
-            own = np.where(masks[source.name][span][:, None, :, None], 0.0, source.loading[these])
-            own = own.reshape(stop - start, residual_dim, -1)
-            private = private + own @ np.swapaxes(own, 1, 2)
+            private = private + artificial[span][:, :, None] * np.eye(h)
         if weights is not None:  # private noise on top, so much that a measurement says no more than its weight
             more = 1.0 / np.maximum(weights[these], MIN_WEIGHT) - 1.0
             private = private + more[:, None, None] * noise.total_at(these)
         white = whitening_of(private, used[span])
-        data[span], whitening[span] = plain.data, pack(white @ unpack(plain.whitening, residual_dim))
-        if W_is_wanted:
+        data[span], whitening[span] = plain.data, pack(white @ unpack(plain.whitening, h))
+        if carried:
             W[span] = white
 
     for _ in over_spans(whiten, n):
         pass
-    offset = None if joint_errors is None else _offset(noise, train, W, joint_errors)
     block = replace(measured, data=data, whitening=whitening)
-    part = WhitenedSeries(block, series.table, number, series.nuisances[train], offset)
+    part = WhitenedSeries(block, series.table, number, series.nuisances[train])
     if not carried:
-        return part, None
-    E = scipy.sparse.csr_array((n * residual_dim, 0))
-    if any(name != "joints" for name in carried):
-        E = block_diagonal(W * np.sqrt(artificial)[:, None])
-    return part, (states.loading(noise, train, W, masks), E)
-
-
-def _offset(noise: RowNoise, train: Integers, W: Floats, joint_errors: Floats) -> Floats:
-    """What the errors of the readings alone make of whitened rows, to first order, shape (n, residual_dim)."""
-    out = np.zeros((len(train), noise.series.kind.residual_dim))
-    joints, sigma = noise.place.joints, noise.place.measurements.sigma_joint * noise.joint_factor
-    for source in noise.sources:
-        if source.name == "joints":
-            J = source.loading[train] / sigma[joints]
-            out += np.einsum("nhew,new->nh", J, joint_errors[source.ends[train]][..., joints])
-    moved: Floats = (W @ out[:, :, None])[:, :, 0]
-    return moved
+        return part, Sparse((n * h, noise.place.n_errors)), Sparse((n * h, 0))
+    E = W * np.sqrt(artificial)[:, None]
+    return part, noise.errors_at(train, W, is_state[:, None]), block_diagonal(E) if E.any() else Sparse((n * h, 0))
 
 
 def block_diagonal(blocks: Floats) -> Sparse:
     """Small matrices, shape (n, h, k), one after the other along the diagonal: shape (n h, n k)."""
     n, h, k = blocks.shape
     columns = np.broadcast_to(np.arange(n)[:, None, None] * k + np.arange(k), blocks.shape)
-    return scipy.sparse.csr_array((blocks.ravel(), columns.ravel(), np.arange(n * h + 1) * k), shape=(n * h, n * k))
-
-
-class ErrorStates:
-    """The errors of all configurations, those of a configuration side by side, and which are shared.
-
-    Args:
-        noises: The rows of all series and their noise.
-        sharing: Whether errors are shared at all.
-        estimated: Whether those of the joints are estimated, and so count as shared.
-    """
-
-    def __init__(self, noises: Sequence[RowNoise], sharing: bool = True, estimated: bool = False) -> None:
-        self._sharing, self._estimated = sharing, estimated
-        self._first: dict[str, int] = {}
-        self._reached: dict[str, Integers] = {}
-        self.width = 0
-        self._n = 1 + max((int(s.ends.max(initial=-1)) for noise in noises for s in noise.sources), default=-1)
-        for noise in noises:
-            train = noise.series.train
-            for source in noise.sources:
-                if source.name not in self._first:
-                    self._first[source.name] = self.width
-                    self._reached[source.name] = np.zeros(self._n, dtype=np.int64)
-                    self.width += source.loading.shape[3]
-                for end in source.ends[train].T:
-                    self._reached[source.name] += np.bincount(end, minlength=self._n)
-
-    @property
-    def n_errors(self) -> int:
-        """Number of errors of all configurations."""
-        return self._n * self.width
-
-    def mask(self, source: NoiseSource) -> Booleans:
-        """Of which ends the errors are shared, shape (n, ends)."""
-        if self._estimated and source.name == "joints":
-            return np.ones(source.ends.shape, dtype=np.bool_)
-        return (self._reached[source.name][source.ends] > 1) & self._sharing
-
-    def predicted(self, noises: Sequence[RowNoise]) -> Integers:
-        """Numbers of the errors that reach both train and test measurements."""
-        found = [np.zeros(0, dtype=np.int64)]
-        for noise in noises:
-            for source in noise.sources:
-                ends = np.unique(source.ends[noise.series.test])
-                ends = ends[self._reached[source.name][ends] > 0]
-                first = ends * self.width + self._first[source.name]
-                found.append((first[:, None] + np.arange(source.loading.shape[3])).ravel())
-        return np.unique(np.concatenate(found))
-
-    def loading(
-        self,
-        noise: RowNoise,
-        rows: Integers,
-        W: Floats | None = None,
-        masks: Mapping[str, Booleans] | None = None,
-        sources: Sequence[NoiseSource] | None = None,
-    ) -> Sparse:
-        """How rows of a series follow from all errors, sparse, shape (n residual_dim, n_errors).
-
-        Args:
-            noise: The series' rows and their noise.
-            rows: The measurements.
-            W: What their rows are multiplied by, shape (n, residual_dim, residual_dim); nothing if None.
-            masks: By source, of which ends errors are wanted, shape (n, ends); of all if None.
-            sources: Those of the noise's sources that are wanted, of some of the rows perhaps; all if None.
-        """
-        n, residual_dim = len(rows), noise.series.kind.residual_dim
-        found, columns = list[Floats](), list[Integers]()  # of each source, as many in each row
-        for source in noise.sources if sources is None else sources:
-            if masks is not None and not masks[source.name].any():
-                continue
-            ends, w = source.loading.shape[2:]
-            G = source.loading[rows]
-            if masks is not None:
-                G = np.where(masks[source.name][:, None, :, None], G, 0.0)
-            flat = G.reshape(n, residual_dim, ends * w)
-            found.append((flat if W is None else W @ flat).reshape(-1, ends * w))
-            first = source.ends[rows] * self.width + self._first[source.name]  # (n, ends)
-            mine = (first[:, :, None] + np.arange(w)).reshape(n, 1, ends * w)
-            columns.append(np.broadcast_to(mine, flat.shape).reshape(-1, ends * w))
-        shape = (n * residual_dim, self.n_errors)
-        if not found:
-            return scipy.sparse.csr_array(shape)
-        figures = np.hstack(found)
-        chosen = figures != 0.0
-        starts = np.concatenate([[0], np.cumsum(np.sum(chosen, axis=1))])
-        out = scipy.sparse.csr_array((figures[chosen], np.hstack(columns)[chosen], starts), shape=shape)
-        out.sum_duplicates()
-        return out
-
-    def row_set(self, together: Sequence[tuple[WhitenedSeries, Sparse, Sparse]]) -> WhitenedBlock:
-        """The rows of several series that share errors."""
-        L = _stacked([L for _, L, _ in together])
-        place = np.zeros(self._n, dtype=L.indices.dtype)
-        place[L.indices // self.width] = 1
-        used = np.flatnonzero(place)
-        place[used] = np.arange(len(used))
-        columns = place[L.indices // self.width] * self.width + L.indices % self.width
-        L = scipy.sparse.csr_array((L.data, columns, L.indptr), shape=(L.shape[0], len(used) * self.width))
-        spare = _stacked([E for _, _, E in together], apart=True)
-        joints = self._first.get("joints", 0)
-        parts = tuple(part for part, _, _ in together)
-        return WhitenedBlock(parts, SchurComplement(L, self.width), used, joints, spare if spare.nnz else None)
-
-
-def _stacked(matrices: Sequence[Sparse], *, apart: bool = False) -> Sparse:
-    """Sparse matrices one below the other, with the same columns or, `apart`, each with its own."""
-    if len(matrices) == 1:
-        return matrices[0]
-    widths = [M.shape[1] * apart for M in matrices]
-    rows, figures, first = (
-        [0, *np.cumsum(n)] for n in ([M.shape[0] for M in matrices], [M.nnz for M in matrices], widths)
-    )
-    columns = np.concatenate([M.indices + c for M, c in zip(matrices, first, strict=False)])
-    starts = np.concatenate([[0], *(M.indptr[1:] + k for M, k in zip(matrices, figures, strict=False))])
-    shape = (rows[-1], first[-1] if apart else matrices[0].shape[1])
-    return scipy.sparse.csr_array((np.concatenate([M.data for M in matrices]), columns, starts), shape=shape)
+    return Sparse((blocks.ravel(), columns.ravel(), np.arange(n * h + 1) * k), shape=(n * h, n * k))

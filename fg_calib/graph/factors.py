@@ -1,8 +1,8 @@
-"""GTSAM factors: one a measurement, as in `problem.graph`, and one a block, as the solver's damped steps take them.
+"""GTSAM factors: one a measurement, as in `problem.graph`.
 
-In `problem.graph` a pair has one `DistanceFactor` and one `RotationAngleFactor`, any other measurement one factor. What
-measurements share are variables `E(k)`, the errors of configuration k in units of their sigma, each with a prior; where
-the distance and the angle of one pair are correlated they share a variable `e(i)`.
+A pair has one `DistanceFactor` and one `RotationAngleFactor`, any other measurement one factor; so has a pair whose
+distance and angle are correlated by a robust weight. What measurements share are variables `E(k)`, the errors of
+configuration k in units of their sigma, each with a prior.
 
 GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or gets its rows wrong, and returns the
 initial values without a word when it gets the columns wrong. So `CheckedFactor` alone fills its lists, after checks.
@@ -10,7 +10,7 @@ initial values without a word when it gets the columns wrong. So `CheckedFactor`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from numbers import Real
@@ -20,13 +20,12 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike
 
-from fg_calib.graph.error_states import State, WhitenedBlock, WhitenedSeries
+from fg_calib.graph.error_states import State, WhitenedRows, WhitenedSeries
 from fg_calib.graph.variables import Variable, Variables, prior_rows
 from fg_calib.inputs import (
     CalibrationError,
     Floats,
     InputError,
-    Integers,
     ProblemError,
     SolverError,
     as_floats,
@@ -36,10 +35,6 @@ from fg_calib.inputs import (
 from fg_calib.measurements import Block, Distance, Kind, RotationAngle, unpack
 
 Sparse = scipy.sparse.csr_array
-Linearise = Callable[[gtsam.Values], tuple[Floats, Floats]]
-
-UNCORRELATED = 1e-12
-"""Correlation of a pair's distance and angle below which they share no error."""
 
 
 class CheckedFactor(gtsam.CustomFactor):
@@ -49,37 +44,30 @@ class CheckedFactor(gtsam.CustomFactor):
         variables: The variables it depends on; their columns follow each other.
         n_rows: Number of residuals.
         linearise: Whitened residuals at some values, shape (n_rows,), and their derivatives, shape (n_rows, n_columns).
-        residual: The residuals alone, where that is quicker.
 
     Raises:
-        SolverError: On linearising, if shapes are wrong or a derivative is not finite.
+        SolverError: On linearising, if shapes are wrong or a number is not finite.
     """
 
     def __init__(
         self,
         variables: Sequence[Variable],
         n_rows: int,
-        linearise: Linearise,
-        residual: Callable[[gtsam.Values], Floats] | None = None,
+        linearise: Callable[[gtsam.Values], tuple[Floats, Floats]],
     ) -> None:
         spans = [v.columns for v in variables]
         n_columns = max(s.stop for s in spans)
         symbols = ", ".join(v.symbol for v in variables)
 
         def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
-            if H is None:
-                r = linearise(values)[0] if residual is None else residual(values)
-                if r.shape != (n_rows,):
-                    raise SolverError(f"factor on {symbols}: residual of shape {r.shape}, expected ({n_rows},)")
-                return r
             r, J = linearise(values)
             if r.shape != (n_rows,) or J.shape != (n_rows, n_columns):
                 expected = f"({n_rows},), ({n_rows}, {n_columns})"
                 raise SolverError(f"factor on {symbols}: shapes {r.shape}, {J.shape}, expected {expected}")
             if not (np.isfinite(r).all() and np.isfinite(J).all()):
                 raise SolverError(f"factor on {symbols}: a residual or derivative is not finite")
-            for i, span in enumerate(spans):
-                H[i] = J[:, span]
+            for i, span in enumerate(spans if H is not None else ()):
+                H[i] = J[:, span]  # type: ignore[index]
             return r
 
         super().__init__(gtsam.noiseModel.Unit.Create(n_rows), [v.key for v in variables], evaluate)
@@ -97,10 +85,14 @@ class MeasurementFactor(CheckedFactor):
     def __init__(
         self, variables: Variables, series: WhitenedSeries, errors: Sequence[tuple[int, str, Floats]] = ()
     ) -> None:
-        local, chosen, ours = factor_columns(variables, series.nuisances, with_core=series.block.kind.ends > 0)
-        start, shared = len(chosen), list[Variable]()
-        for key, symbol, loading in errors:
-            shared.append(Variable(key, symbol, "own", (), slice(start, start := start + loading.shape[1])))
+        places = set(variables.coordinates[series.nuisances.ravel()].tolist())
+        ours = [*(variables.items if series.block.kind.ends else ())]
+        ours += [v for v in variables.nuisance if places.intersection(v.parameters)]
+        chosen = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v in ours)])
+        widths = [v.columns.stop - v.columns.start for v in ours] + [loading.shape[1] for _, _, loading in errors]
+        shared = [Variable(key, symbol, "own", (), slice(0)) for key, symbol, _ in errors]
+        ends = np.cumsum([0, *widths]).tolist()
+        local = [replace(v, columns=slice(*ends[i : i + 2])) for i, v in enumerate([*ours, *shared])]
         G = np.hstack([np.zeros((series.n_rows, 0)), *(loading for _, _, loading in errors)])
 
         def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
@@ -108,7 +100,7 @@ class MeasurementFactor(CheckedFactor):
             z = np.concatenate([np.zeros(0), *(values.atVector(v.key) for v in shared)])
             return found[:, -1] - G @ z, np.hstack([found[:, chosen], -G])
 
-        super().__init__([*local, *shared], series.n_rows, linearise)
+        super().__init__(local, series.n_rows, linearise)
 
 
 class DistanceFactor(MeasurementFactor):
@@ -154,142 +146,48 @@ def _of_readings(
 
 
 def measurement_factors(
-    blocks: Sequence[WhitenedBlock], variables: Variables, at: State
+    rows: WhitenedRows, variables: Variables, at: State
 ) -> tuple[list[gtsam.NonlinearFactor], gtsam.Values]:
     """Factors of one measurement each with the priors of the error variables that they share, and these' estimates.
 
     Args:
-        blocks: The whitened rows.
+        rows: The whitened rows.
         variables: The problem's variables.
         at: Where the error variables are estimated.
     """
-    factors, values, number = list[gtsam.NonlinearFactor](), gtsam.Values(), 0
-
-    def add_error(key: int, z: Floats) -> None:
-        factors.append(gtsam.PriorFactorVector(key, np.zeros(len(z)), gtsam.noiseModel.Unit.Create(len(z))))
-        values.insert(key, z)
-
-    for block in blocks:
-        z, first = block.posterior_mean(at), 0
-        u = block.private(at.without_columns())[:, -1]
-        if block.states is not None:
-            u = u - block.states.loadings @ z.ravel()
-        for part in block.parts:
-            h = part.block.residual_dim
-            for k in range(part.block.n):
-                one, rows = part.only(k), slice(first, first := first + h)
-                errors = [] if block.states is None else _errors_of(block, block.states.loadings[rows])
-                number += 1
-                if not (variables.items or np.any(variables.coordinates[one.nuisances] >= 0)):
-                    continue  # nothing that it depends on is estimated
-                if all(type(kind) in _PAIR_FACTORS for kind in one.block.kind.parts):
-                    made, shared = _pair_factors(one, variables, errors, number)
-                    factors += made
-                    if shared.any():
-                        add_error(gtsam.symbol("e", number), np.array([shared @ u[rows]]))
-                else:
-                    factors.append(MeasurementFactor(variables, one, errors))
-        for k, of_k in zip(block.configurations.tolist(), z, strict=True):
-            add_error(gtsam.symbol("E", k), of_k)
+    factors, values, first, n = list[gtsam.NonlinearFactor](), gtsam.Values(), 0, len(rows.slots)
+    for part in rows.parts:
+        h = part.block.residual_dim
+        for one, L in ((part.only(k), rows.states.loadings[first + k * h :][:h]) for k in range(part.block.n)):
+            used = np.unique(L.indices // max(n, 1))
+            keys = [(gtsam.symbol("E", k), f"E({k})") for k in rows.configurations[used].tolist()]
+            G = [L[:, i * n : (i + 1) * n].toarray() for i in used.tolist()]
+            if variables.items or np.any(variables.coordinates[one.nuisances] >= 0):  # else nothing of it is estimated
+                factors += _factors_of(one, variables, [(*key, of_key) for key, of_key in zip(keys, G, strict=True)])
+        first += part.n_rows
+    for k, z in zip(rows.configurations.tolist(), rows.posterior_mean(at), strict=True):
+        factors.append(gtsam.PriorFactorVector(gtsam.symbol("E", k), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
+        values.insert(gtsam.symbol("E", k), z)
     return factors, values
 
 
-Errors = list[tuple[int, str, Floats]]
-
-
-def _errors_of(block: WhitenedBlock, L: Sparse) -> Errors:
-    """The error variables that some rows depend on, and their derivatives."""
-    assert block.states is not None
-    width = block.states.width
-    used = np.unique(L.indices // width)
-    G = L[:, (used[:, None] * width + np.arange(width)).ravel()].toarray()
-    keys = block.configurations[used].tolist()
-    return [(gtsam.symbol("E", k), f"E({k})", G[:, i * width : (i + 1) * width]) for i, k in enumerate(keys)]
-
-
-def _pair_factors(
-    pair: WhitenedSeries, variables: Variables, errors: Errors, number: int
-) -> tuple[list[MeasurementFactor], Floats]:
-    """The factors of one pair's distance and angle, with a variable `e(number)` for what correlates them.
-
-    Their private covariance is `diag(private) + common common^T`, with the same share of either variance in common.
-
-    Returns:
-        The factors, and the posterior mean of `e(number)` per private whitened residual, zeros where there is none.
-    """
-    kinds, found = pair.block.kind.parts, list[MeasurementFactor]()
-    W = unpack(pair.block.whitening, len(kinds))[0]
-    used = np.flatnonzero(np.diag(W))
-    inverse = np.linalg.inv(W[np.ix_(used, used)])
-    C = inverse @ inverse.T
-    private, common, mean = np.diag(C).copy(), np.zeros(len(used)), np.zeros(len(kinds))
-    if len(used) == 2 and abs(C[0, 1]) > UNCORRELATED * np.sqrt(C[0, 0] * C[1, 1]):
-        common = np.sqrt(abs(C[0, 1])) * np.array([1.0, np.sign(C[0, 1])]) * (private / private[::-1]) ** 0.25
-        private -= common**2
-        mean = W @ common
-    for i, k in enumerate(used.tolist()):
-        weight = 1.0 / np.sqrt(private[i])
-        row = inverse[i] * weight
-        of_errors = [(key, symbol, (row @ G[used])[None]) for key, symbol, G in errors]
-        if common[i]:
-            of_errors.append((gtsam.symbol("e", number), f"e({number})", np.array([[common[i] * weight]])))
-        block = replace(pair.block, kind=kinds[k], data=pair.block.data[:, k : k + 1], whitening=np.array([[weight]]))
-        offset = None if pair.offset is None else (pair.offset[:, used] @ row)[:, None]
+def _factors_of(
+    one: WhitenedSeries, variables: Variables, errors: list[tuple[int, str, Floats]]
+) -> Iterator[MeasurementFactor]:
+    """The factor of a measurement; of a pair with an uncorrelated distance and angle one of each."""
+    kinds, W = one.block.kind.parts, unpack(one.block.whitening, one.block.residual_dim)[0]
+    if any(type(kind) not in _PAIR_FACTORS for kind in kinds) or np.any(np.diag(np.diag(W)) != W):
+        yield MeasurementFactor(variables, one, errors)
+        return
+    for k in np.flatnonzero(np.diag(W)).tolist():
+        block = replace(one.block, kind=kinds[k], data=one.block.data[:, [k]], whitening=W[[k]][:, [k]])
         factor = _PAIR_FACTORS[type(kinds[k])]
-        found.append(factor.__new__(factor))
-        MeasurementFactor.__init__(found[-1], variables, replace(pair, block=block, offset=offset), of_errors)
-    return found, mean
+        made = factor.__new__(factor)
+        MeasurementFactor.__init__(made, variables, replace(one, block=block), [(*e[:2], e[2][[k]]) for e in errors])
+        yield made
 
 
 _PAIR_FACTORS: dict[type, type[MeasurementFactor]] = {Distance: DistanceFactor, RotationAngle: RotationAngleFactor}
-
-
-def reduced_factor(block: WhitenedBlock, variables: Variables) -> CheckedFactor:
-    """A block as one factor: the triangular factor of [J r] has the same cost, gradient and Gauss-Newton Hessian.
-
-    With `[J r] = Q [[R, z], [0, rho]]` the residual is (z, rho) and the Jacobian (R, 0): n_columns + 1 rows.
-    """
-    with_core = any(part.block.kind.ends for part in block.parts)
-    local, chosen, ours = factor_columns(variables, block.coordinates, with_core=with_core)
-    n_rows = len(chosen) + 1
-    with_right = np.append(chosen, variables.n_columns + variables.n_nuisance)
-
-    def at(values: gtsam.Values) -> State:
-        return variables.at(variables.parameters(values, ours))
-
-    def residual(values: gtsam.Values) -> Floats:
-        r = np.zeros(n_rows)
-        r[0] = np.sqrt(block.squared_norm(at(values)))
-        return r
-
-    def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-        R = block.triangle(at(values))[:, with_right]
-        if len(R) > n_rows:
-            R = np.linalg.qr(R, mode="r")  # type: ignore[assignment]
-        return R[:, -1], R[:, :-1]
-
-    return CheckedFactor(local, n_rows, linearise, residual)
-
-
-def factor_columns(
-    variables: Variables, coordinates: Integers, *, with_core: bool
-) -> tuple[list[Variable], Integers, tuple[Variable, ...]]:
-    """The variables of a factor on the core and some landmark coordinates.
-
-    Returns:
-        Its variables with columns of their own, one after the other; which of all columns these are; the variables.
-    """
-    there = set(variables.coordinates[coordinates.ravel()].tolist())
-    nuisance = tuple(v for v in variables.nuisance if there.intersection(v.parameters))
-    core = variables.items if with_core else ()
-    column = variables.n_columns if with_core else 0
-    local, chosen = list(core), [np.arange(column)]  # the core's columns come first
-    for v in nuisance:
-        width = v.columns.stop - v.columns.start
-        local.append(replace(v, columns=slice(column, column + width)))
-        chosen.append(np.arange(v.columns.start, v.columns.stop))
-        column += width
-    return local, np.concatenate(chosen), core + nuisance
 
 
 def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
@@ -329,88 +227,67 @@ def linearize_factors(
     graph = gtsam.NonlinearFactorGraph()
     for factor in factors:
         graph.add(factor)
-    present, ordering = set(graph.keyVector()), gtsam.Ordering()
-    chosen = [v for v in variables.items + variables.nuisance if v.key in present]
+    chosen = [v for v in variables.items + variables.nuisance if v.key in graph.keyVector()]
+    ordering = gtsam.Ordering()
     for v in chosen:
         ordering.push_back(v.key)
     A, b = graph.linearize(values).jacobian(ordering)
     wide = np.zeros((len(b), n))
-    wide[:, np.concatenate([np.arange(n)[v.columns] for v in chosen])] = A
+    wide[:, np.concatenate([np.r_[v.columns] for v in chosen])] = A
     return -b, wide
 
 
-def check_added(
-    factors: Sequence[gtsam.NonlinearFactor], initial: gtsam.Values, variables: Variables, errors: gtsam.Values
-) -> gtsam.Values:
-    """Check factors that a user added to a problem's graph, and the initial values.
+def with_added(
+    variables: Variables, factors: Sequence[gtsam.NonlinearFactor], initial: gtsam.Values, errors: gtsam.Values
+) -> tuple[Variables, Floats]:
+    """The variables with those that added factors bring with them, and the parameter vector where all start.
 
     Args:
-        factors: All that were added.
+        variables: The problem's variables.
+        factors: All factors that were added.
         initial: The initial values.
-        variables: The problem's own variables.
-        errors: Its error variables.
-
-    Returns:
-        The start of the variables that the factors bring with them.
+        errors: The problem's error variables.
 
     Raises:
         ProblemError: A factor has no finite weight, error or derivative, or values and variables do not match.
     """
+    variables = variables.without_added()
+    found = set(chain.from_iterable(factor.keys() for factor in factors if factor is not None))
+    if on_errors := found.intersection(errors.keys()):
+        added = f"an added factor on the error variable {_symbol(min(on_errors))}"
+        raise ProblemError("problem.graph", added, "factors on other variables")
+    known, given = found.union(variables.keys), set(initial.keys()).difference(errors.keys())
+    for key in sorted(known - given):
+        raise ProblemError("problem.initial", f"no value of {_symbol(key)}", "one for every variable of the graph")
+    for key in sorted(given - known):
+        raise ProblemError("problem.initial", f"a value of {_symbol(key)}", "none without a factor on it")
     for factor in factors:
-        _check_noise(factor)
-    _check_initial(initial, variables)
-    added = gtsam.Values(initial)
-    keys_of_errors = list(errors.keys())
-    for key in [*variables.keys, *filter(initial.exists, keys_of_errors)]:
-        added.erase(key)
-    found = set(chain.from_iterable(factor.keys() for factor in factors))
-    on_errors = found.intersection(keys_of_errors)
-    if on_errors:
-        place, symbol = "problem.graph", str(gtsam.Symbol(min(on_errors))).strip()
-        raise ProblemError(place, f"an added factor on the error variable {symbol}", "factors on other variables")
-    for key in sorted(found.difference(variables.keys).symmetric_difference(added.keys())):
-        symbol = str(gtsam.Symbol(key)).strip()
-        if key in found:
-            raise ProblemError("problem.initial", f"no value of {symbol}", "one for every variable of an added factor")
-        raise ProblemError("problem.initial", f"a value of {symbol}", "none without a factor on it in problem.graph")
-    for factor in factors:
-        _check_start(factor, initial)
-    return added
-
-
-def _check_initial(initial: gtsam.Values, variables: Variables) -> None:
-    """Check that every variable of the problem has an initial value, of its own type and size."""
-    for v in variables.items + variables.nuisance:
-        if not initial.exists(v.key):
-            raise ProblemError("problem.initial", f"no value of {v.symbol}", "one for every variable of the problem")
+        _check_factor(factor, initial)
+    for key in sorted(given.difference(variables.keys)):
+        variables = variables.with_added(key, _symbol(key), initial)
+    for v in (*variables.items, *variables.nuisance):
         expected = "a gtsam.Pose3" if v.is_pose else f"{len(v.parameters)} finite numbers"
         try:
             value = initial.atPose3(v.key).matrix() if v.is_pose else initial.atVector(v.key)
         except RuntimeError:
-            raise ProblemError(f"problem.initial: {v.symbol}", "a value of another type", expected) from None
-        if not v.is_pose and len(value) != len(v.parameters):
-            raise ProblemError(f"problem.initial: {v.symbol}", f"{len(value)} numbers", expected)
-        if not np.isfinite(value).all():
-            raise ProblemError(f"problem.initial: {v.symbol}", "a number that is not finite", expected)
+            value = np.full(1, np.nan)
+        if not np.isfinite(value).all() or value.size != (16 if v.is_pose else len(v.parameters)):
+            expected = "a finite vector or a gtsam.Pose3" if v.kind == "own" else expected
+            raise ProblemError(f"problem.initial: {v.symbol}", "another value", expected)
+    return variables, variables.parameters(initial)
 
 
-def _check_noise(factor: gtsam.NonlinearFactor | None) -> None:
-    """Check that the rows of an added factor have finite weights: else nothing could be counted or whitened."""
-    if factor is None:
-        raise ProblemError("problem.graph", "None among its factors", "factors")
+def _symbol(key: int) -> str:
+    return str(gtsam.Symbol(key)).strip()
+
+
+def _check_factor(factor: gtsam.NonlinearFactor | None, initial: gtsam.Values) -> None:
+    """Check that an added factor has rows of finite weight, and an error and a derivative where it starts."""
     name, model = type(factor).__name__, factor.noiseModel() if isinstance(factor, gtsam.NoiseModelFactor) else None
-    if model is None:
-        expected = "one with a noise model, such as PriorFactorVector, BetweenFactorPose3 or CustomFactor"
+    if factor is None or model is None or model.isConstrained():
+        expected = "a factor with a noise model of sigmas above 0, such as PriorFactorVector or CustomFactor"
         raise ProblemError("problem.graph", f"an added {name}", expected)
-    if model.isConstrained():
-        expected = "sigmas above 0: a thousandth of what matters is as good as 0"
-        raise ProblemError("problem.graph", f"an added {name} with a constrained noise model", expected)
-
-
-def _check_start(factor: gtsam.NonlinearFactor, initial: gtsam.Values) -> None:
-    """Check that an added factor has an error where it starts, and a derivative that fits its variables."""
-    symbols = ", ".join(str(gtsam.Symbol(key)).strip() for key in list(factor.keys()))
-    place = f"problem.graph: added {type(factor).__name__} on {symbols}"
+    place = f"problem.graph: added {name} on {', '.join(map(_symbol, factor.keys()))}"
     try:
         error = factor.error(initial)
         factor.linearize(initial)

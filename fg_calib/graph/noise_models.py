@@ -2,7 +2,8 @@
 
 Three sources of noise reach a row: the measurement's own; the measured poses, where a pair was formed from poses; and
 the joint readings, through the row's derivatives in the joints. The last two belong to a configuration and are the same
-in every measurement that it takes part in.
+in every measurement that it takes part in: *errors* of 1 sigma, numbered `configuration * width + slot`, with a slot a
+joint, then six for the poses of each table (position, then orientation).
 
 Noise acts on a length or an angle to second order: rows of pairs are `M - measured`, M the mean of what would be
 measured, with its slope and variance (see `measurements.moments`): at given parameters a row, scaled and shifted.
@@ -10,35 +11,26 @@ measured, with its slope and variance (see `measurements.moments`): at given par
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse
 
 from fg_calib.inputs import Booleans, Floats, InputError, Integers
 from fg_calib.measurements import (
     Block,
     MeasurementBlock,
     Measurements,
-    Moments,
     angle_moments,
     length_moments,
     residuals,
     unit_whitening,
 )
-from fg_calib.robot import (
-    SPAN,
-    Chain,
-    Poses,
-    forward,
-    kernels,
-    nearest_rotation,
-    over_spans,
-    rotation_angle,
-    whiten_small,
-)
+from fg_calib.robot import Chain, forward, kernels, nearest_rotation, over_spans, rotation_angle, whiten_small
+
+Sparse = scipy.sparse.csr_array
 
 NoiseName = tuple[int, str]
 """Noise that is known up to a factor: its table and kind, or `JOINT_NOISE`."""
@@ -49,12 +41,11 @@ JOINT_NOISE: NoiseName = (-1, "joint")
 MIN_SLOPE = 1e-3
 """Slope of a mean near a length of 0, at least: such a row says next to nothing."""
 
-PRIVATE_SHARE = 1e-3
-"""Share of a pair's variance that counts as private at least: errors of the poses are not all that there is."""
+POSE_SLOTS = 6
+"""Errors of a measured pose: of its position along the axes, then of its orientation about them."""
 
-SECOND_ORDER_WEIGHT = 100.0
-"""Factor on the second-order variance of pairs that are more than the errors they share: it is all that they have left
-to say, and its distribution is not normal."""
+_MOMENTS = {kernels.DISTANCE: (0, length_moments), kernels.ROTATION_ANGLE: (1, angle_moments)}
+"""Whether a part of a pair is a length (0) or an angle (1), and its moments, by the code of its kind."""
 
 
 @dataclass(frozen=True)
@@ -65,39 +56,10 @@ class NoiseState:
         weights: Robust weight of each measurement of each series, in [0, 1]; None for 1.
         factors: Factors on the specified sigmas, by table and kind those of the measurements (or of the measured poses
             that pairs were formed from), and those of the joint readings; 1 where none is given.
-        joint_errors: True joint values minus readings, where encoder noise is estimated, shape
-            (n_configurations, n_joints), [rad] (prismatic: [m]); None for 0.
     """
 
     weights: tuple[Floats, ...] | None = None
     factors: Mapping[NoiseName, float] = field(default_factory=dict)
-    joint_errors: Floats | None = None
-
-
-class NoiseSource(NamedTuple):
-    """How rows follow from errors of 1 sigma that belong to configurations.
-
-    Attributes:
-        name: `joints`, or `poses` of a table.
-        ends: Configuration of each end, among those of all tables, shape (n, ends).
-        loading: Change of the rows per error of each end, shape (n, residual_dim, ends, width).
-    """
-
-    name: str
-    ends: Integers
-    loading: Floats
-
-    @property
-    def variance(self) -> Floats:
-        """Covariance that the source gives each measurement's rows, shape (n, residual_dim, residual_dim)."""
-        n, residual_dim, ends, width = self.loading.shape
-        flat = self.loading.reshape(n, residual_dim, ends * width)
-        out: Floats = flat @ np.swapaxes(flat, 1, 2)
-        return out
-
-    def at(self, rows: Integers | slice) -> NoiseSource:
-        """The source of some of the rows."""
-        return self._replace(ends=self.ends[rows], loading=self.loading[rows])
 
 
 @dataclass(frozen=True)
@@ -106,28 +68,27 @@ class TableState:
 
     Attributes:
         measurements: The table.
+        number: Its number.
         configurations: Its configurations among those of all tables, shape (n_configurations,).
-        trig: Its readings, or the joint values that are estimated in their place, for the kernels.
+        trig: Its readings, for the kernels.
         chain: The chain from its measurement frame.
         coordinates: Values of all landmark coordinates.
-        joints_estimated: Whether true joint values are estimated: their errors then change no mean.
+        width: Errors of one configuration.
+        n_errors: Errors of all configurations of all tables.
     """
 
     measurements: Measurements
+    number: int
     configurations: Integers
     trig: Floats
     chain: Chain
     coordinates: Floats
-    joints_estimated: bool = False
-
-    @cached_property
-    def joints(self) -> Integers:
-        """Joints whose readings have noise."""
-        return np.flatnonzero(self.measurements.sigma_joint > 0.0)
+    width: int
+    n_errors: int
 
 
 class RowNoise:
-    """The rows of a series and their noise, to first order.
+    """The rows of a series and their noise: to second order of lengths and angles of pairs, else to first order.
 
     Args:
         series: The series.
@@ -135,95 +96,75 @@ class RowNoise:
         state: What has been learned of the noise.
 
     Attributes:
-        sources: Noise of the rows that belongs to configurations.
         factors: Factor on the specified sigma of each row's own kind, shape (residual_dim,).
-        joint_factor: Factor on that of the joint readings.
+        variance: Variance of each row's private noise, shape (n, residual_dim); of poses the diagonal of `private_at`.
+        loading: Change of the rows per 1 sigma of each error that they follow from, shape (n, residual_dim, k).
+        columns: Numbers of these errors, shape (n, k).
+        n_of_joints: How many of the k are errors of joint readings, the first ones; others are of measured poses.
+        excess: Mean of each row's noise, shape (n, residual_dim).
+        slope: Derivative of each row's mean in what it is without noise, shape (n, residual_dim); None for 1.
     """
 
     def __init__(self, series: MeasurementBlock, place: TableState, state: NoiseState) -> None:
-        self.series = series
-        self.place = place
+        self.series, self.place = series, place
         families = [name.partition(".")[0] for name in series.kind.names]
         self.factors: Floats = np.array([state.factors.get((series.table, family), 1.0) for family in families])
-        self.joint_factor = state.factors.get(JOINT_NOISE, 1.0)
-        self._prepare()
-
-    def _prepare(self) -> None:
-        self.sources = self._joint_source()
-
-    @cached_property
-    def rows(self) -> Block:
-        """All rows, not whitened, in [m] and [rad]."""
-        return self.rows_at(slice(None))
+        self._sigma_joint = place.measurements.sigma_joint * state.factors.get(JOINT_NOISE, 1.0)
+        self.variance: Floats = (series.sigma * self.factors) ** 2
+        self._of_pairs = [_MOMENTS[part.code] for part in series.kind.parts if part.code in _MOMENTS]
+        self.excess: Floats = np.broadcast_to(0.0, self.variance.shape)
+        self.slope: Floats | None = None
+        self.columns, self.loading = np.zeros((series.n, 0), np.int64), np.zeros((*self.variance.shape, 0))
+        if series.kind.ends and np.any(self._sigma_joint > 0.0):
+            self._add_errors(self._joint_loading(), 0)
+        self.n_of_joints = self.columns.shape[1]
+        if series.formed:
+            self._add_errors(self._pose_loading(), place.chain.n_joints + POSE_SLOTS * place.number)
+        if self._of_pairs:
+            self._take_moments()
 
     @cached_property
     def as_measured(self) -> Block:
-        """All rows as they were measured, to first order."""
+        """All rows as they were measured, to first order, not whitened."""
         s, p = self.series, self.place
         unit = unit_whitening(s.n, s.kind.residual_dim)
         return Block(s.kind, p.trig, s.ends, s.data, unit, p.coordinates[s.nuisances], s.source)
 
-    def rows_at(self, rows: Integers | slice, moments: Moments | None = None) -> Block:
-        """Some of the rows, not whitened.
+    def rows_at(self, rows: Integers | slice) -> Block:
+        """Some of the rows, not whitened, in [m] and [rad]; of pairs scaled and shifted as their means are."""
+        plain = residuals.rows_of(self.as_measured, rows)
+        if self.slope is None:
+            return plain
+        slope, h = np.maximum(self.slope[rows], MIN_SLOPE), self.series.kind.residual_dim
+        whitening = np.zeros(plain.whitening.shape)
+        whitening[:, np.cumsum(np.arange(1, 1 + h)) - 1] = slope
+        data = plain.data + self._off[rows] * (1.0 - 1.0 / slope) - self.excess[rows] / slope
+        return replace(plain, data=data, whitening=whitening)
 
-        Args:
-            rows: Which.
-            moments: Their `moments_at`, where they are known.
-        """
-        return residuals.rows_of(self.as_measured, rows)
-
-    def moments_at(self, rows: Integers | slice) -> Moments:
-        """Bias by noise, slope of the mean and variance of the private noise of some rows, shapes (m, residual_dim)."""
-        variance: Floats = (self.series.sigma[rows] * self.factors) ** 2
-        return Moments(np.zeros_like(variance), np.ones_like(variance), variance)
-
-    def own_at(self, rows: Integers | slice, moments: Moments | None = None) -> Floats:
-        """Covariance of the private noise of some measurements, shape (m, residual_dim, residual_dim).
-
-        Args:
-            rows: Which.
-            moments: Their `moments_at`, where they are known.
-        """
+    def private_at(self, rows: Integers | slice) -> Floats:
+        """Covariance of the private noise of some measurements, shape (m, residual_dim, residual_dim)."""
         if self.series.covariance is not None:
             covariance: Floats = self.series.covariance[rows] * np.outer(self.factors, self.factors)
             return covariance
-        variance = (moments or self.moments_at(rows)).variance
-        out: Floats = variance[:, :, None] * np.eye(variance.shape[1])
+        out: Floats = self.variance[rows][:, :, None] * np.eye(self.series.kind.residual_dim)
         return out
 
-    def total_at(self, rows: Integers | slice, moments: Moments | None = None) -> Floats:
+    def total_at(self, rows: Integers | slice) -> Floats:
         """Covariance of all noise of some measurements, shape (m, residual_dim, residual_dim)."""
-        out: Floats = self.own_at(rows, moments) + sum(source.at(rows).variance for source in self.sources)
+        G = self.loading[rows]
+        out: Floats = self.private_at(rows) + G @ np.swapaxes(G, 1, 2)
         return out
-
-    @cached_property
-    def total(self) -> Floats:
-        """Covariance of all noise of each measurement, shape (n, residual_dim, residual_dim)."""
-        return self.total_at(slice(None))
 
     @property
     def sigma(self) -> Floats:
         """1 sigma of each row, all noise together, shape (n, residual_dim), [m] and [rad]."""
-        return self.figures()[2]
+        out: Floats = np.sqrt(self.variance + np.einsum("nhk,nhk->nh", self.loading, self.loading))
+        return out
 
     def residual(self) -> Floats:
         """Residuals of all rows, shape (n, residual_dim), [m] and [rad]."""
-        return self.figures()[0]
-
-    def figures(self) -> tuple[Floats, Floats, Floats]:
-        """Residual of each row, its bias by noise, and its 1 sigma, shapes (n, residual_dim), [m] and [rad]."""
-        residual, excess, sigma = (np.empty((self.series.n, self.series.kind.residual_dim)) for _ in range(3))
-
-        def run(rows: slice) -> None:
-            moments = self.moments_at(rows)
-            residual[rows], excess[rows] = self._residual_at(rows, moments), moments.excess
-            sigma[rows] = np.sqrt(np.einsum("nii->ni", self.total_at(rows, moments)))
-
-        _over_rows(run, self.series.n)
-        return residual, excess, sigma
-
-    def _residual_at(self, rows: slice, moments: Moments) -> Floats:
-        return residuals.residual(self.rows_at(rows, moments), self.place.chain)
+        out: Floats = self._off + self.excess
+        return out
 
     def lengths(self) -> tuple[Floats, Integers]:
         """Mahalanobis length of each measurement's residual, and its number of rows, shapes (n,).
@@ -232,245 +173,116 @@ class RowNoise:
         """
         used = self.series.used
         r = np.where(used, self.residual(), 0.0)
-        W = whitening_of(self.total, used)
+        W = whitening_of(self.total_at(slice(None)), used)
         return np.linalg.norm(W @ r[:, :, None], axis=(1, 2)), used.sum(axis=1)
 
-    def private_diagonal(self, rows: Integers, carried: frozenset[str]) -> tuple[Floats, Floats]:
-        """Variance of private noise as rows are weighted by it, and the part of it that is artificial.
+    def errors_at(self, rows: Integers, W: Floats | None = None, chosen: Booleans | None = None) -> Sparse:
+        """How some rows follow from all errors, sparse, shape (m residual_dim, n_errors).
 
         Args:
-            rows: Measurements.
-            carried: Names of the sources whose errors measurements share.
-
-        Returns:
-            Shapes (m, residual_dim).
+            rows: The measurements.
+            W: What their rows are multiplied by, shape (m, residual_dim, residual_dim); nothing if None.
+            chosen: Which of the entries of `loading` are wanted, of a shape that goes with its rows; all if None.
         """
-        variance = self.moments_at(rows).variance
-        return variance, np.zeros_like(variance)
-
-    def _joint_source(self) -> tuple[NoiseSource, ...]:
-        p, s = self.place, self.series
-        if not len(p.joints) or not s.kind.ends:
-            return ()
-        chain = p.chain.without_columns().with_joint_columns()
-        sigma = p.measurements.sigma_joint[p.joints] * self.joint_factor
-        loading = np.empty((s.n, s.kind.residual_dim, s.kind.ends, len(sigma)))
-
-        def load(rows: slice) -> None:
-            block = residuals.rows_of(self.as_measured, rows)
-            J = residuals.linearise(block, chain)[1][:, :, : s.kind.ends * p.chain.n_joints]
-            loading[rows] = J.reshape(*loading[rows].shape[:3], p.chain.n_joints)[..., p.joints] * sigma
-
-        _over_rows(load, s.n)
-        return (NoiseSource("joints", p.configurations[s.ends], loading),)
-
-
-class PairNoise(RowNoise):
-    """The noise of distances and angles of pairs to second order (see `measurements.moments`).
-
-    Attributes:
-        predicted: Distance and angle as the arm predicts them, 0 where the kind has none, shape (n, 2).
-    """
-
-    def _prepare(self) -> None:
-        s = self.series
-        self._parts = [_COMPONENT[part.code] for part in s.kind.parts if part.code is not None]
-        self._both = np.ones(2)  # factors of distance and angle
-        self._both[self._parts] = self.factors
-        self.predicted = self._predict()
-        self._formed = np.nan_to_num(self._formed_variance()) * self._both**2 if s.formed else None
-        self._first_order = self._joint_source()
-        self._traces = self._joint_trace()
-        self.sources = ()
-        self._kept: tuple[Moments, Floats] | None = None
-        if s.n <= SPAN or s.formed or self._first_order:  # few, or asked for at once
-            moments, _ = self._kept = self._all_moments()
-            slope = moments.slope[:, :, None, None]
-            self.sources = tuple(source._replace(loading=source.loading * slope) for source in self._first_order)
-            if s.formed:
-                self.sources += (self._pose_source(moments.slope),)
-            self._first_order = ()
-
-    def _predict(self) -> Floats:
-        s, predicted = self.series, np.zeros((self.series.n, 2))
-
-        def predict(rows: slice) -> None:
-            block = residuals.rows_of(self.as_measured, rows)
-            predicted[rows, self._parts] = residuals.residual(block, self.place.chain) + s.data[rows]
-
-        _over_rows(predict, s.n)
-        return predicted
-
-    def moments_at(self, rows: Integers | slice) -> Moments:
-        """Bias, slope and variance of some rows; computed on demand where all would fill the memory."""
-        if self._kept is None:
-            return self._work_out(rows)[0]
-        moments = self._kept[0]
-        return Moments(moments.excess[rows], moments.slope[rows], moments.variance[rows])
-
-    def _all_moments(self) -> tuple[Moments, Floats]:
-        excess, slope, variance, second = (np.empty((self.series.n, len(self._parts))) for _ in range(4))
-
-        def run(rows: slice) -> None:
-            found, second[rows] = self._work_out(rows)
-            excess[rows], slope[rows], variance[rows] = found.excess, found.slope, found.variance
-
-        _over_rows(run, self.series.n)
-        return Moments(excess, slope, variance), second
-
-    def _work_out(self, rows: Integers | slice) -> tuple[Moments, Floats]:
-        """`moments_at`, and the second-order variance of pairs formed from poses (else 0)."""
-        moments = self._moments(rows)
-        excess, slope, left = moments.excess, moments.slope, moments.variance
-        second = np.zeros(left.shape if self.series.formed else (1, left.shape[1]))
-        if not self.place.joints_estimated:
-            for source in self._first_order:
-                left -= slope**2 * np.einsum("nii->ni", source.at(rows).variance)
-        if self.series.formed:
-            first = slope**2 * self._own(rows)[:, self._parts]
-            second = np.maximum(left - first, 0.0)
-            left -= first + 0.5 * second
-        return Moments(excess, slope, left), second
-
-    @property
-    def _second_order(self) -> Floats:
-        """Second-order variance of pairs formed from poses, shape (n, residual_dim)."""
-        assert self._kept is not None
-        return self._kept[1]
-
-    def rows_at(self, rows: Integers | slice, moments: Moments | None = None) -> Block:
-        """Some of the rows, not whitened, but scaled and shifted as their means are."""
-        moments, plain = moments or self.moments_at(rows), residuals.rows_of(self.as_measured, rows)
-        whitening = np.zeros(plain.whitening.shape)
-        diagonal = np.cumsum(np.arange(1, 1 + len(self._parts))) - 1
-        slope = np.maximum(moments.slope, MIN_SLOPE)
-        off = self._narrow(self.predicted[rows]) - plain.data
-        whitening[:, diagonal] = slope
-        return replace(plain, data=plain.data + off * (1.0 - 1.0 / slope) - moments.excess / slope, whitening=whitening)
-
-    def _residual_at(self, rows: slice, moments: Moments) -> Floats:
-        out: Floats = self._narrow(self.predicted[rows]) - self.series.data[rows] + moments.excess
+        G = self.loading[rows] if chosen is None else np.where(chosen, self.loading[rows], 0.0)
+        G = G if W is None else W @ G
+        taken, columns = G != 0.0, np.broadcast_to(self.columns[rows][:, None], G.shape)
+        starts = np.concatenate([[0], np.cumsum(taken.sum(axis=2))])
+        out = Sparse((G[taken], columns[taken], starts), shape=(G.shape[0] * G.shape[1], self.place.n_errors))
+        out.sum_duplicates()  # in place
         return out
 
-    def private_diagonal(self, rows: Integers, carried: frozenset[str]) -> tuple[Floats, Floats]:
-        """Variance of private noise as rows are weighted by it, and the part of it that is artificial."""
-        s, variance = self.series, self.moments_at(rows).variance
-        bare, more = variance, np.zeros_like(variance)
-        if s.formed:
-            bare = 0.5 * self._second_order[rows]
-            shared = [source for source in self.sources if source.name in carried]
-            n_errors = len(np.unique(s.ends[s.train])) * sum(source.loading.shape[3] for source in shared)
-            of_poses = any(source.name != "joints" for source in shared)
-            if of_poses and len(s.train) * s.kind.residual_dim > n_errors:
-                more = (SECOND_ORDER_WEIGHT - 1.0) * bare
-        diagonal = np.maximum(variance + more, PRIVATE_SHARE * np.einsum("nii->ni", self.total[rows]))
-        return diagonal, np.maximum(diagonal - bare, 0.0)
-
     @cached_property
-    def _poses(self) -> Poses:
-        """Predicted tool poses of the table's configurations."""
-        return forward(self.place.chain.without_columns(), self.place.trig)
+    def _off(self) -> Floats:
+        """Predicted minus measured, shape (n, residual_dim)."""
+        return residuals.residual(self.as_measured, self.place.chain)
 
-    def _narrow(self, both: Floats) -> Floats:
-        """Of (distance, angle) those that the kind has."""
-        return np.ascontiguousarray(both[:, self._parts])
+    def _add_errors(self, loading: Floats, first: int) -> None:
+        """Add errors, loading of shape (n, residual_dim, ends, w), in the slots from the first on."""
+        n, h, ends, w = loading.shape
+        columns = self.place.configurations[self.series.ends][:, :, None] * self.place.width + first + np.arange(w)
+        self.columns = np.hstack([self.columns, columns.reshape(n, ends * w)])
+        self.loading = np.concatenate([self.loading, loading.reshape(n, h, ends * w)], axis=2)
 
-    def _own(self, rows: Integers | slice) -> Floats:
-        """First-order variance of some distances and angles as measured, 0 where the kind has none, shape (m, 2)."""
-        if self._formed is not None:
-            return self._formed[rows]
-        sigma = self.series.sigma[rows]
-        own = np.zeros((len(sigma), 2))
-        own[:, self._parts] = np.where(np.isnan(sigma), 0.0, sigma**2 * self.factors**2)
-        return own
+    def _joint_loading(self) -> Floats:
+        s, chain = self.series, self.place.chain.without_columns().with_joint_columns()
+        loading = np.empty((s.n, s.kind.residual_dim, s.kind.ends, chain.n_joints))
 
-    def _moments(self, rows: Integers | slice) -> Moments:
-        """Mean and variance of the distances and angles that the kind has, shapes (n, residual_dim)."""
-        s, m, factors = self.series, self.place.measurements, self._both**2
-        ends, own = s.ends[rows], self._own(rows)
-        along, trace = np.zeros_like(own), np.zeros_like(own)
-        if s.formed:
-            along, own = own, np.zeros_like(own)
-            trace = np.stack([_trace(m.sigma_position, ends), _trace(m.sigma_orientation, ends)], axis=1) * factors
-        if len(self._traces):
-            trace = trace + self._traces[ends].sum(axis=1)
-            along = along.copy()
-            for source in self._first_order:
-                along[:, self._parts] += np.einsum("nii->ni", source.at(rows).variance)
-        across = np.maximum(trace - along, 0.0) / 2.0
-        given = (self.predicted[rows], along, across, own)
-        of = [_MOMENTS[k](*(v[:, k] for v in given)) for k in self._parts]
-        return Moments(*(np.stack([getattr(m, name) for m in of], axis=1) for name in ("excess", "slope", "variance")))
+        def load(rows: slice) -> None:
+            J = residuals.linearise(residuals.rows_of(self.as_measured, rows), chain)[1]
+            loading[rows] = J[:, :, : s.kind.ends * chain.n_joints].reshape(loading[rows].shape) * self._sigma_joint
 
-    def _formed_variance(self) -> Floats:
-        """Variance of distances and angles between measured poses, shape (n, 2); nan where not measured."""
-        m, ends, both = self.place.measurements, self.series.ends, np.full((self.series.n, 2), np.nan)
-        for k, sigma in enumerate((m.sigma_position, m.sigma_orientation)):
-            if sigma is not None:
-                both[:, k] = np.sum(self._directions[k] ** 2 * np.sum(sigma[ends] ** 2, axis=1), axis=1)
-        return both
+        _over_rows(load, s.n)
+        return loading
 
-    @cached_property
-    def _directions(self) -> tuple[Floats, Floats]:
-        """Unit vectors from a to b in the measurement frame, and axes of the rotation from a to b in a, shapes (n, 3).
+    def _pose_loading(self) -> Floats:
+        """Of distances and angles between measured poses: minus at the first end, plus at the second.
 
-        As predicted: directions of measured poses would depend on the errors whose effect they are to say.
+        Directions are those predicted: those of measured poses would depend on the errors whose effect they give.
         """
-        p, R, (a, b) = self._poses.position, self._poses.rotation, self.series.ends.T
-        along = _unit(p[b] - p[a]) @ self._world_R_base().T
-        return along, _unit(rotation_angle(np.swapaxes(R[a], 1, 2) @ R[b])[1])
+        m, s = self.place.measurements, self.series
+        poses = forward(self.place.chain.without_columns(), self.place.trig)
+        p, R, (a, b) = poses.position, poses.rotation, s.ends.T
+        axes = rotation_angle(np.swapaxes(R[a], 1, 2) @ R[b])[1]
+        directions = _unit(p[b] - p[a]) @ self._world_R_base(p).T, _unit(axes)
+        loading = np.zeros((s.n, s.kind.residual_dim, 2, POSE_SLOTS))
+        for i, (k, _) in enumerate(self._of_pairs):
+            sigma = (m.sigma_position, m.sigma_orientation)[k]
+            if sigma is not None:
+                both = directions[k][:, None] * np.array([1.0, -1.0])[:, None]  # of predicted minus measured
+                loading[:, i, :, 3 * k : 3 * k + 3] = self.factors[i] * both * sigma[s.ends]
+        return loading
 
-    def _world_R_base(self) -> Floats:  # noqa: N802 -- frames by their letters
+    def _world_R_base(self, p: Floats) -> Floats:  # noqa: N802 -- frames by their letters
         """The rotation that brings the predicted points nearest to the measured ones, shape (3, 3)."""
         m = self.place.measurements
         if m.position is None or m.test.all():
             return np.eye(3)
-        measured, p = m.position[~m.test], self._poses.position[~m.test]
+        measured, p = m.position[~m.test], p[~m.test]
         return nearest_rotation((measured - measured.mean(axis=0)).T @ (p - p.mean(axis=0)))
 
-    def _pose_source(self, slopes: Floats) -> NoiseSource:
-        """How the rows follow from the errors of the measured poses that the pairs were formed from.
+    def _take_moments(self) -> None:
+        """Bias, slope and variance of distances and angles of pairs, to second order."""
+        s, trace, off = self.series, self._traces(), self._off
+        first, private = self.loading, np.zeros_like(self.variance) if s.formed else np.nan_to_num(self.variance)
+        self.excess, slope, self.variance = (np.empty(self.variance.shape) for _ in range(3))
+        self.loading, self.slope = np.empty(first.shape), slope
 
-        Of each kind a pose has three errors, along the axes, and a fourth, the square of its errors across: the latter
-        lengthen all pairs of the pose. Half of the second-order variance of a pair is theirs, a quarter at either end;
-        the other half, of the product of the errors at both ends, is private.
+        def run(rows: slice) -> None:
+            predicted, G = off[rows] + s.data[rows], first[rows]
+            along, all_ways = np.einsum("nhk,nhk->nh", G, G), trace[s.ends[rows]].sum(axis=1)
+            for i, (k, moments) in enumerate(self._of_pairs):
+                across = np.maximum(all_ways[:, k] - along[:, i], 0.0) / 2.0
+                found = moments(predicted[:, i], along[:, i], across, private[rows, i])
+                self.excess[rows, i], slope[rows, i] = found.excess, found.slope
+                self.variance[rows, i] = np.maximum(found.variance - found.slope**2 * along[:, i], 0.0)
+            self.loading[rows] = G * slope[rows][:, :, None]
 
-        Args:
-            slopes: Slope of the mean of each row, shape (n, residual_dim).
-        """
-        m, s, n_parts = self.place.measurements, self.series, len(self._parts)
-        G = np.zeros((s.n, n_parts, 2, n_parts, 4))  # row, quantity, end, its source, (axes, square)
-        sign = np.array([1.0, -1.0])[:, None]  # of predicted minus measured in the error at a, at b
-        for i, k in enumerate(self._parts):
+        _over_rows(run, s.n)
+
+    def _traces(self) -> Floats:
+        """Variance of position and orientation at each configuration by shared errors, shape (n_configurations, 2)."""
+        s, m = self.series, self.place.measurements
+        trace = np.zeros((len(self.place.trig), 2))
+        if self.n_of_joints:
+            J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
+            J = J * self._sigma_joint
+            trace += np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
+        for i, (k, _) in enumerate(self._of_pairs if s.formed else ()):
             sigma = (m.sigma_position, m.sigma_orientation)[k]
-            slope = slopes[:, i, None, None]
             if sigma is not None:
-                G[:, i, :, i, :3] = self._both[k] * slope * sign * self._directions[k][:, None] * sigma[s.ends]
-            G[:, i, :, i, 3] = -0.5 * np.sqrt(self._second_order[:, i, None])
-        loading = G.reshape(s.n, n_parts, 2, 4 * n_parts)
-        return NoiseSource(f"poses of table {s.table}", self.place.configurations[s.ends], loading)
-
-    def _joint_trace(self) -> Floats:
-        """Variance that joint noise gives each vector at one end, all directions together, shape (n_configurations, 2).
-
-        No rows where there is none, or where true joint values are estimated.
-        """
-        if self.place.joints_estimated or not len(self.place.joints):
-            return np.zeros((0, 2))
-        J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
-        J = J * self.place.measurements.sigma_joint * self.joint_factor
-        return np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
+                trace[:, k] += np.sum(sigma**2, axis=1) * self.factors[i] ** 2
+        return trace
 
 
-_COMPONENT = {kernels.DISTANCE: 0, kernels.ROTATION_ANGLE: 1}
-"""Place of the moments of a pair's distance and angle, by the code of its kind."""
-
-_MOMENTS = (length_moments, angle_moments)
-
-
-def row_noise(series: MeasurementBlock, place: TableState, state: NoiseState) -> RowNoise:
-    """The rows of a series and their noise."""
-    return (PairNoise if _has_moments(series) else RowNoise)(series, place, state)
+def reach(noises: Sequence[RowNoise], *, test: bool = False) -> Integers:
+    """Number of train (or test) measurements that each error reaches, shape (n_errors,)."""
+    total = np.zeros(noises[0].place.n_errors if noises else 0, dtype=np.int64)
+    for noise in noises:
+        rows = np.flatnonzero(noise.series.test) if test else noise.series.train
+        present = noise.loading[rows].any(axis=1)
+        total += np.bincount(noise.columns[rows][present], minlength=len(total))
+    return total
 
 
 def same_everywhere(series: MeasurementBlock, sigma_joint: Floats) -> bool:
@@ -480,7 +292,7 @@ def same_everywhere(series: MeasurementBlock, sigma_joint: Floats) -> bool:
 
 def _has_moments(series: MeasurementBlock) -> bool:
     """Whether all its rows are distances and angles of pairs."""
-    return all(part.code in _COMPONENT for part in series.kind.parts)
+    return all(part.code in _MOMENTS for part in series.kind.parts)
 
 
 def whitening_of(covariance: Floats, used: Booleans) -> Floats:
@@ -509,14 +321,6 @@ def _over_rows(run: Callable[[slice], None], n: int) -> None:
     """Work on n rows in spans, so that intermediate results stay in the processor's cache."""
     for _ in over_spans(lambda start, stop: run(slice(start, stop)), n):
         pass
-
-
-def _trace(sigma: Floats | None, ends: Integers) -> Floats:
-    """Variance of a difference between two configurations, all directions together, shape (n,)."""
-    if sigma is None:
-        return np.zeros(len(ends))
-    both: Floats = np.sum(sigma**2, axis=1)[ends].sum(axis=1)
-    return both
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -20,14 +20,14 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 
 from fg_calib.graph.error_states import SchurComplement
-from fg_calib.inputs import Booleans, Brief, Floats, Integers
+from fg_calib.inputs import Booleans, Brief, Floats
 
 Sparse = scipy.sparse.csr_array
 
@@ -142,38 +142,6 @@ def _basis_of(A: Floats) -> tuple[Floats, Floats, Booleans]:
     return U[:, : len(s)][:, kept[: len(s)]], S, np.any(np.abs(Vt[~kept]) > SUPPORT_TOLERANCE, axis=0)
 
 
-@dataclass(frozen=True)
-class LinearRows(Brief):
-    """Linearised measurements, whitened by their private noise: `r + A s = L z + e`.
-
-    Attributes:
-        r: Predicted minus measured, shape (n,).
-        A: Derivatives in core and landmarks, shape (n, n_all).
-        measurement: Which measurement each row is of, from 0 and ascending, shape (n,).
-        states: How rows follow from the error states z; None where no measurements share errors.
-        used: Rows that count; a row that was not measured is zero, shape (n,).
-        configurations: Configurations that have error states, in the order of these.
-        joints: Place of the joint readings' errors among the error states of a configuration.
-    """
-
-    r: Floats
-    A: Floats
-    measurement: Integers
-    states: SchurComplement | None = None
-    used: Booleans | None = None
-    configurations: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    joints: int = 0
-
-    @property
-    def L(self) -> Sparse:  # noqa: N802 -- the matrix of the module's head
-        """How rows follow from the error states, shape (n, m)."""
-        return Sparse((len(self.r), 0)) if self.states is None else self.states.loadings
-
-    def weigh(self, rows: Floats) -> Floats:
-        """C^-1 rows, C = 1 + L L^T, shape (n, k)."""
-        return rows if self.states is None else self.states.weigh(rows)
-
-
 class NormalSystem:
     """Linearised measurements and priors, error states and landmarks eliminated.
 
@@ -183,7 +151,8 @@ class NormalSystem:
         n_core: Number of columns of the core, the first ones.
         scales: By how much each of them may be off, shape (n_core,): rank is judged in these.
         priors: Rows [K k] of priors on the core alone, shape (q, n_core + 1); none if None.
-        rows: Returns the measurements row by row, for statistics of residuals.
+        states: How measurements follow from error states; they share none if None.
+        rows: Returns [A r] of the measurements, whitened by their private noise, for statistics of residuals.
 
     Attributes:
         left: The rows with the landmarks eliminated, priors on the core not counted.
@@ -191,6 +160,8 @@ class NormalSystem:
         directions: The singular directions as rows, in the columns' own units, shape (n_core, n_core).
         rank: Number of directions of the core that rows and priors determine.
         root: R with R R^T the covariance of the core's determined directions, shape (n_core, rank).
+        coordinates: Gauss-Newton step in the columns of `full_root`, shape (rank + landmarks' rank,), [sigma].
+        weights: Singular value of each of these over the largest; 1 for landmarks.
         step: Gauss-Newton step of core and landmarks, of least norm in `scales`, shape (n_all,).
         decrement: Length of the step, [sigma].
         cost: Half the sum of squares of rows and priors before the step.
@@ -202,7 +173,8 @@ class NormalSystem:
         n_core: int,
         scales: Floats,
         priors: Floats | None = None,
-        rows: Callable[[], LinearRows] | None = None,
+        states: SchurComplement | None = None,
+        rows: Callable[[], Floats] | None = None,
     ) -> None:
         self.left = left = eliminate(square_root[:, :-1], -square_root[:, -1], n_core)
         k = np.zeros((0, n_core + 1)) if priors is None else priors
@@ -212,14 +184,13 @@ class NormalSystem:
         self.singular_values: Floats = s
         self.directions: Floats = Vt * scales
         self.rank = rank = determined(s)
-        along = U[: len(b), :rank].T @ b
         self.root: Floats = self.directions[:rank].T / s[:rank]
-        core = self.root @ along
-        self.step: Floats = np.concatenate([core, left.inverse @ left.own + left.follow @ core])
-        self.decrement = float(np.hypot(np.linalg.norm(left.own), np.linalg.norm(along)))
+        self.coordinates: Floats = np.concatenate([U[: len(b), :rank].T @ b, left.own])
+        self.weights: Floats = np.concatenate([s[:rank] / s.max(initial=1e-300), np.ones(left.rank)])
+        self.step: Floats = self.full_root @ self.coordinates
+        self.decrement = float(np.linalg.norm(self.coordinates))
         self.cost = 0.5 * float(np.sum(square_root[:, -1] ** 2) + np.sum(k[:, -1] ** 2))
-        self._scales, self._loose, self._gather = scales, Vt[rank:], rows
-        self._information = s[:rank, None] * Vt[:rank] / scales
+        self._gather, self._states = rows, states
 
     @property
     def covariance(self) -> Floats:
@@ -237,77 +208,64 @@ class NormalSystem:
         own = np.vstack([np.zeros((len(self.root), self.left.rank)), self.left.inverse])
         return np.hstack([np.vstack([self.root, self.left.follow @ self.root]), own])
 
-    def length(self, step: Floats) -> float:
-        """Length of a step of the core, [sigma]."""
-        return float(np.linalg.norm(self._information @ step[: len(self._scales)]))
-
-    def without_null_space(self, step: Floats) -> Floats:
-        """A step with the same effect on every row, but none along the core's undetermined directions."""
-        drift = self._scales * (self._loose.T @ (self._loose @ (step[: len(self._scales)] / self._scales)))
-        out: Floats = step - np.concatenate([drift, self.left.follow @ drift])
-        return out
-
     # Statistics of single rows and of error states.
 
     @cached_property
-    def rows(self) -> LinearRows:
-        """The measurements, row by row."""
-        assert self._gather is not None
-        return self._gather()
+    def A(self) -> Floats:  # noqa: N802 -- the matrix of the module's head
+        """Derivatives of the measurements in core and landmarks, whitened by private noise, shape (n, n_all)."""
+        return self._rows[:, :-1]
 
     @cached_property
     def residual(self) -> Floats:
         """Marginal residuals after the step, e = r + A s, in sigma of the private noise, shape (n,)."""
-        out: Floats = self.rows.r + self.rows.A @ self.step
+        out: Floats = self._rows[:, -1] + self.A @ self.step
         return out
 
     @cached_property
     def weighted_residual(self) -> Floats:
         """Private errors u = C^-1 e = e - L z, shape (n,)."""
-        return self.rows.weigh(self.residual[:, None])[:, 0]
+        return self.states.weigh(self.residual[:, None])[:, 0]
 
     @cached_property
     def z(self) -> Floats:
         """Posterior mean of the error states, shape (m,), [sigma]."""
-        states = self.rows.states
-        return np.zeros(0) if states is None else states.posterior_mean(self.residual[:, None])[:, 0]
+        return self.states.posterior_mean(self.residual[:, None])[:, 0]
 
     @cached_property
     def z_variance(self) -> Floats:
         """Posterior variance of the error states, shape (m,); their prior variance is 1."""
-        states = self.rows.states
-        if states is None:
-            return np.zeros(0)
-        out: Floats = states.variances + np.sum((self._follow @ self.full_root) ** 2, axis=1)
+        out: Floats = self.states.variances + np.sum((self._follow @ self.full_root) ** 2, axis=1)
         return out
+
+    @cached_property
+    def states(self) -> SchurComplement:
+        """How the measurements follow from the error states."""
+        return SchurComplement(Sparse((len(self._rows), 0))) if self._states is None else self._states
+
+    @cached_property
+    def _rows(self) -> Floats:
+        assert self._gather is not None
+        return self._gather()
 
     @cached_property
     def _follow(self) -> Floats:
         """Z = S^-1 L^T A, how error states follow the parameters, shape (m, n_all)."""
-        states = self.rows.states
-        return np.zeros((0, self.rows.A.shape[1])) if states is None else states.posterior_mean(self.rows.A)
-
-    def leverage(self, A: Floats) -> Floats:
-        """Variance that the estimate gives linear functions A s, shape (n,)."""
-        out: Floats = np.sum((A @ self.full_root) ** 2, axis=1)
-        return out
+        return self.states.posterior_mean(self.A)
 
     # Variance components.
 
     def project(self, f: Floats) -> Floats:
         """Data f, shape (n, k), times P = C^-1 - C^-1 A cov A^T C^-1; P r is `weighted_residual`."""
-        weighed = self.rows.weigh(f)
-        out: Floats = weighed - self._weighed_root @ (self.full_root.T @ (self.rows.A.T @ weighed))
+        weighed = self.states.weigh(f)
+        out: Floats = weighed - self._weighed_root @ (self.full_root.T @ (self.A.T @ weighed))
         return out
 
     @cached_property
     def _weighed_root(self) -> Floats:
         """C^-1 A R, shape (n, rank)."""
-        out: Floats = (self.rows.A - self.rows.L @ self._follow) @ self.full_root
+        out: Floats = (self.A - self.states.loadings @ self._follow) @ self.full_root
         return out
 
     def trace(self, E: Sparse) -> float:
         """Trace of E^T P E, E sparse, shape (n, k); of large systems an estimate (see `error_states.N_PROBES`)."""
-        states = self.rows.states
-        total = float(E.power(2).sum()) if states is None else states.trace(E)
-        return total - float(np.sum((E.T @ self._weighed_root) ** 2))
+        return self.states.trace(E) - float(np.sum((E.T @ self._weighed_root) ** 2))

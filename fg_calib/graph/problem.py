@@ -13,34 +13,21 @@ from typing import Any
 
 import gtsam
 import numpy as np
-import scipy.sparse
 
-from fg_calib.graph.error_states import (
-    ErrorStates,
-    SchurComplement,
-    State,
-    WhitenedBlock,
-    correlation_of,
-    felt_errors,
-    share_errors,
-    whitened_rows,
-)
-from fg_calib.graph.factors import (
-    check_added,
-    linearize_factors,
-    measurement_factors,
-    prior_factors,
-    reduced_factor,
-)
+from fg_calib.graph.error_states import State, WhitenedRows, all_errors, correlation_of, whitened_rows
+from fg_calib.graph.factors import linearize_factors, measurement_factors, prior_factors, with_added
 from fg_calib.graph.knowledge import Knowledge
-from fg_calib.graph.noise_models import JOINT_NOISE, NoiseState, RowNoise, TableState, row_noise, same_everywhere
-from fg_calib.graph.normal_system import RANK_TOLERANCE, LinearRows, NormalSystem
+from fg_calib.graph.noise_models import JOINT_NOISE, POSE_SLOTS, NoiseState, RowNoise, TableState, same_everywhere
+from fg_calib.graph.normal_system import RANK_TOLERANCE, NormalSystem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, Integers, Options, ProblemError, SolverError, shown
 from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, by_station, start_frames
 from fg_calib.robot import Chain, Parameter, Robot, forward
+
+N_REMEMBERED = 4
+"""Parameter vectors whose square root a problem remembers: the start, nominal and the estimate are asked for often."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +55,7 @@ class Problem(FrozenArrays):
     variables: Variables
     start: Floats
     state: NoiseState
-    rows: tuple[WhitenedBlock, ...]
+    rows: WhitenedRows
     whole: Problem | None = None
     added: tuple[gtsam.NonlinearFactor, ...] = ()
     evaluated: bool = False
@@ -99,17 +86,26 @@ class Problem(FrozenArrays):
     def initial(self) -> gtsam.Values:
         """GTSAM's initial values; a user inserts here those of variables that added factors bring with them."""
         values = self.variables.values(self.start)
-        values.insert(self._measured[1])
+        values.insert(self.error_variables)
         return values
 
     @cached_property
     def own_factors(self) -> tuple[gtsam.NonlinearFactor, ...]:
         """The factors that `graph` is made of."""
-        return (*self._measured[0], *prior_factors(self.variables), *known_factors(self), *self.added)
+        known = [] if self.known is None else [self.known.factor(self.variables, self.data.landmarks)]
+        return (*self._measured[0], *prior_factors(self.variables), *known, *self.added)
+
+    @property
+    def error_variables(self) -> gtsam.Values:
+        """The errors that measurements share, in units of their sigma, at their estimates."""
+        return self._measured[1]
 
     @cached_property
     def _measured(self) -> tuple[list[gtsam.NonlinearFactor], gtsam.Values]:
-        return measurement_factors(self.rows, self.variables, self.variables.at(self.start))
+        """Factors of the measurements; joint readings' errors are variables, so that rows of a pair are independent."""
+        joints = self.joints_estimated or self.options.pair_errors == "shared"
+        rows = whiten(self, noises_at(self, self.start, fitted=True), joints=joints)
+        return measurement_factors(rows, self.variables, self.variables.at(self.start))
 
     @property
     def _more_factors(self) -> tuple[gtsam.NonlinearFactor, ...]:
@@ -121,12 +117,11 @@ class Problem(FrozenArrays):
         graph = self.__dict__.get("graph")
         if graph is None:
             return ()
-        n, own = graph.size(), self.own_factors
-        kept = sum(graph.at(i) is own[i] for i in range(min(n, len(own))))
-        if kept < len(own):
-            found = f"{kept} of the problem's {len(own)} factors"
-            raise ProblemError("problem.graph", found, "all of them, in their places")
-        return tuple(graph.at(i) for i in range(len(own), n))
+        every = [graph.at(i) for i in range(graph.size())]
+        if any(a is not b for a, b in zip(every, self.own_factors, strict=False)) or len(every) < len(self.own_factors):
+            found = "factors removed or replaced"
+            raise ProblemError("problem.graph", found, f"all {len(self.own_factors)} of the problem, in their places")
+        return tuple(every[len(self.own_factors) :])
 
     def __repr__(self) -> str:
         v, models = self.variables, ", ".join(str(table.model) for table in self.data.tables)
@@ -179,8 +174,8 @@ class Problem(FrozenArrays):
     @property
     def estimated(self) -> list[Parameter]:
         """The robot's estimated parameters, in the order of the columns."""
-        parameters = {p.name: p for p in self.robot.parameters}
-        return [parameters[name] for name in self.variables.names[: self.variables.n_robot_columns]]
+        names = self.variables.names[: self.variables.n_robot_columns]
+        return [self.robot.parameters[self.robot.index(name)] for name in names]
 
     @property
     def pair_series(self) -> tuple[MeasurementBlock, ...]:
@@ -195,8 +190,10 @@ class Problem(FrozenArrays):
     @property
     def n_pairs(self) -> int:
         """Train pairs that give at least one row."""
-        tables = {s.table for s in self.pair_series}
-        return sum(_n_different([s.number[s.train] for s in self.pair_series if s.table == t]) for t in tables)
+        numbers = {s.table: list[Integers]() for s in self.pair_series}
+        for s in self.pair_series:
+            numbers[s.table].append(s.number[s.train])
+        return sum(int(np.sum(np.bincount(np.concatenate(each)) > 0)) for each in numbers.values())
 
     @property
     def n_configurations(self) -> int:
@@ -211,7 +208,7 @@ class Problem(FrozenArrays):
     @property
     def n_independent(self) -> int:
         """Residuals that the noise can make differ freely: pairs formed from poses hold no more than the poses do."""
-        return self.n_residuals - round(sum(rows.n_spare for rows in self.rows))
+        return self.n_residuals - round(self.rows.n_spare)
 
     @property
     def n_priors(self) -> int:
@@ -258,17 +255,27 @@ class Problem(FrozenArrays):
         return self.data.sigma_joint * self.state.factors.get(JOINT_NOISE, 1.0)
 
     @property
+    def joints_estimated(self) -> bool:
+        """Whether true joint values are estimated."""
+        return self.options.encoder == "estimated" and bool(np.any(self.data.sigma_joint > 0.0))
+
+    @property
     def missing_correlation(self) -> bool:
         """Whether measurements share errors but were asked to count as independent."""
-        return self.options.pair_errors == "independent" and share_errors(self.noises)
+        return self.rows.counted_as_private
 
+    @cached_property
+    def _square_roots(self) -> dict[bytes, Floats]:
+        return {}
 
-def _n_different(numbers: Sequence[Integers]) -> int:
-    """How many different numbers, from 0, there are."""
-    seen = np.zeros(1 + max((int(some.max(initial=-1)) for some in numbers), default=-1), dtype=np.bool_)
-    for some in numbers:
-        seen[some] = True
-    return int(np.sum(seen))
+    def square_root(self, parameters: Floats) -> Floats:
+        """Rows [A r] with the Gram matrix of the train rows, error states eliminated, all columns."""
+        known, key = self._square_roots, parameters.tobytes()
+        if key not in known:
+            for old in list(known)[: 1 - N_REMEMBERED]:
+                del known[old]
+            known[key] = self.rows.square_root(self.variables.at(parameters))
+        return known[key]
 
 
 def with_factors(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
@@ -281,7 +288,7 @@ def with_factors(problem: Problem, start: Floats, state: NoiseState | None = Non
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    return replace(p, rows=_whitened(p, noises_at(p, start, fitted=True)))
+    return replace(p, rows=whiten(p, noises_at(p, start, fitted=True), joints=p.joints_estimated))
 
 
 def with_user_factors(problem: Problem) -> Problem:
@@ -292,22 +299,14 @@ def with_user_factors(problem: Problem) -> Problem:
     """
     if not problem.__dict__.keys() & {"graph", "initial"}:
         return problem
-    more, variables = problem._more_factors, problem.variables.without_own()
-    own = check_added((*problem.added, *more), problem.initial, variables, problem._measured[1])
+    more = problem._more_factors
+    added = (*problem.added, *more)
     if more and problem.whole is not None:
         raise ProblemError("problem.graph", "added factors with gauge keep", "gauge prior or none")
-    if not more and problem.variables.values(problem.start).equals(_without_errors(problem), 0.0):
+    variables, start = with_added(problem.variables, added, problem.initial, problem.error_variables)
+    if not more and np.allclose(start, problem.start, rtol=0.0, atol=1e-12):
         return problem
-    variables = variables.with_own(own)
-    start = variables.parameters(problem.initial)
-    return with_factors(problem, start, variables=variables, added=(*problem.added, *more))
-
-
-def _without_errors(problem: Problem) -> gtsam.Values:
-    values = gtsam.Values(problem.initial)
-    for key in filter(values.exists, list(problem._measured[1].keys())):
-        values.erase(key)
-    return values
+    return with_factors(problem, start, variables=variables, added=added)
 
 
 def check_graph(problem: Problem) -> None:
@@ -321,80 +320,39 @@ def check_graph(problem: Problem) -> None:
         raise ProblemError("solution.problem.graph", f"{n} factors added since it was solved", "to be solved again")
 
 
-def reduced_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
-    """Every block of rows, whatever its size, as one factor, with priors and added factors, for damped steps."""
-    graph = gtsam.NonlinearFactorGraph()
-    for block in problem.rows:
-        if depends(block, problem.variables):
-            graph.add(reduced_factor(block, problem.variables))
-    for factor in (*prior_factors(problem.variables), *known_factors(problem), *problem.added):
-        graph.add(factor)
-    return graph
+def whiten(problem: Problem, noises: Sequence[RowNoise], *, joints: bool) -> WhitenedRows:
+    """The train rows whitened by their noise; `joints` makes all errors of joint readings states."""
+    weights, sharing = None, problem.options.pair_errors == "shared"
+    if problem.state.weights is not None:
+        weights = [w[s.train] for w, s in zip(problem.state.weights, problem.data.blocks, strict=True)]
+    return whitened_rows(noises, sharing=sharing, joints=joints, weights=weights)
 
 
-def depends(rows: WhitenedBlock, variables: Variables) -> bool:
-    """Whether rows depend on any variable: on the core, or on a landmark that is estimated."""
-    return bool(variables.items) or bool(np.any(variables.coordinates[rows.coordinates] >= 0))
-
-
-def known_factors(problem: Problem) -> list[gtsam.NonlinearFactor]:
-    """What earlier rows say as a factor, where they say anything."""
-    known = problem.known
-    return [] if known is None else [known.factor(problem.variables, problem.data.landmarks)]
-
-
-def _whitened(problem: Problem, noises: tuple[RowNoise, ...]) -> tuple[WhitenedBlock, ...]:
-    """The train rows whitened by their noise."""
-    state, sharing = problem.state, problem.options.pair_errors == "shared"
-    weights = None
-    if state.weights is not None:
-        weights = [w[s.train] for w, s in zip(state.weights, problem.data.blocks, strict=True)]
-    return whitened_rows(noises, sharing=sharing, joint_errors=state.joint_errors, weights=weights)
-
-
-def noises_at(
-    problem: Problem, parameters: Floats, *, at_readings: bool = False, fitted: bool = False
-) -> tuple[RowNoise, ...]:
+def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> tuple[RowNoise, ...]:
     """The rows of each series and their noise at a parameter vector.
 
     Args:
         problem: The problem.
         parameters: The parameter vector.
-        at_readings: Whether they are those of the readings also where true joint values are estimated.
         fitted: Whether they are the train rows alone; else train and test.
     """
-    places = _places(problem, parameters, at_readings)
-    series = [s.fitted if fitted else s for s in problem.data.blocks]
-    return tuple(row_noise(s, places[s.table], problem.state) for s in series)
-
-
-def _places(problem: Problem, parameters: Floats, at_readings: bool) -> list[TableState]:
-    data, errors = problem.data, problem.state.joint_errors
-    trigs = data.trigs(problem.robot)
-    if errors is not None and not at_readings:
-        moved = [t.measurements.readings + errors[place] for t, place in zip(data.tables, data.places, strict=True)]
-        trigs = tuple(problem.robot.trig(readings) for readings in moved)
-    at = at_parameters(problem, parameters, trigs)
-    estimated = problem.options.encoder == "estimated"
-    return [
-        TableState(table.measurements, place, trig, chain, at.coordinates, estimated)
-        for table, place, trig, chain in zip(data.tables, data.places, trigs, at.chains, strict=True)
+    data, at, trigs = problem.data, at_parameters(problem, parameters), problem.data.trigs(problem.robot)
+    width = problem.robot.n_joints + POSE_SLOTS * len(data.tables)
+    n_errors = width * data.n_configurations
+    places = [
+        TableState(table.measurements, k, data.places[k], trigs[k], at.chains[k], at.coordinates, width, n_errors)
+        for k, table in enumerate(data.tables)
     ]
+    return tuple(RowNoise(s.fitted if fitted else s, places[s.table], problem.state) for s in data.blocks)
 
 
-def at_parameters(problem: Problem, parameters: Floats, trigs: Sequence[Floats] | None = None) -> State:
-    """The arm and the measurements' unknowns at a parameter vector; test rows alone say where the others are.
-
-    Args:
-        problem: The problem.
-        parameters: The parameter vector.
-        trigs: Readings of each table for the kernels, or the joint values that are estimated in their place.
-    """
+def at_parameters(problem: Problem, parameters: Floats) -> State:
+    """The arm and the measurements' unknowns at a parameter vector; test rows alone say where the others are."""
     at = problem.variables.at(parameters)
     if np.all(at.columns >= 0):
         return at
-    trigs = trigs or problem.data.trigs(problem.robot)
-    return problem.variables.at(parameters, contact_points(problem.data, at.chains, trigs))
+    points = contact_points(problem.data, at.chains, problem.data.trigs(problem.robot))
+    return problem.variables.at(parameters, points)
 
 
 def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
@@ -468,7 +426,9 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
     """
     same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
     if (state is None or state is problem.state) and same:
-        return replace(problem, start=parameters)
+        started = replace(problem, start=parameters)
+        started.__dict__["_square_roots"] = problem._square_roots
+        return started
     return with_factors(problem, parameters, state)
 
 
@@ -493,8 +453,6 @@ def subsampled(problem: Problem, share: float) -> Problem | None:
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:
     """Of each series the length of each measurement's residual, whitened by all its noise, and its number of rows.
 
-    The residuals are those at the readings: at joint values estimated from these very rows they would be shorter.
-
     Args:
         problem: The problem.
         parameters: The parameter vector.
@@ -502,23 +460,20 @@ def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Fl
     Returns:
         Shapes (n,) each, train and test; both are 0 for a measurement that takes no part.
     """
-    return [noise.lengths() for noise in noises_at(problem, parameters, at_readings=True)]
+    return [noise.lengths() for noise in noises_at(problem, parameters)]
 
 
 def joint_errors(problem: Problem, parameters: Floats) -> Floats:
     """Posterior mean of the errors of the joint readings: true values minus readings, to first order.
 
     Returns:
-        Shape (n_configurations, n_joints), [rad] (prismatic: [m]); about the joint values that the problem has.
+        Shape (n_configurations, n_joints), [rad] (prismatic: [m]).
     """
-    sigma = problem.sigma_joint
-    joints = np.flatnonzero(sigma > 0.0)
+    rows, sigma = problem.rows, problem.sigma_joint
+    joints = rows.slots[rows.slots < len(sigma)]  # the first ones
     found = np.zeros((problem.data.n_configurations, len(sigma)))
-    at = problem.variables.at(parameters)
-    for block in problem.rows:
-        if block.states is not None:
-            z = block.posterior_mean(at)[:, block.joints : block.joints + len(joints)]
-            found[np.ix_(block.configurations, joints)] = -sigma[joints] * z
+    z = rows.posterior_mean(problem.variables.at(parameters))[:, : len(joints)]
+    found[np.ix_(rows.configurations, joints)] = -sigma[joints] * z
     return found
 
 
@@ -536,13 +491,11 @@ def linear_system(problem: Problem, parameters: Floats, *, with_loss: bool = Fal
     v = problem.variables
     r, J = prior_rows(v, parameters)
     rows, priors = square_root(problem, parameters, with_loss=with_loss), np.column_stack([J, r])
-    if not (np.isfinite(rows).all() and np.isfinite(priors).all()):
-        raise SolverError("a residual or derivative is not finite")
-
-    def gather() -> LinearRows:
-        return _linear_rows(problem, _with_loss(problem)[0] if with_loss else problem.rows, v.at(parameters))
-
-    return NormalSystem(rows, v.n_columns, v.prior_scales, priors, gather)
+    with np.errstate(over="ignore"):
+        if not np.isfinite(np.vdot(rows, rows) + np.vdot(priors, priors)):
+            raise SolverError("a residual is not finite: the measurements or the robot hold absurd numbers")
+    gather = lambda: problem.rows.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
+    return NormalSystem(rows, v.n_columns, v.prior_scales, priors, problem.rows.states, gather)
 
 
 def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
@@ -562,15 +515,9 @@ def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False
         others.append(problem.known.at_parameters(v, problem.data.landmarks, parameters))
     if problem.added:
         others.append(linearize_factors(problem.added, v, v.values(parameters)))
-    triangles = row_triangles(problem, parameters, with_loss=with_loss)
-    empty = np.zeros((0, v.n_columns + v.n_nuisance + 1))
-    return np.vstack([empty, *(np.column_stack([J, r]) for r, J in others), *triangles])
-
-
-def cost_at(problem: Problem, parameters: Floats) -> float:
-    """Half the sum of squares of all whitened rows and priors at a parameter vector."""
-    priors = prior_rows(problem.variables, parameters)[0]
-    return 0.5 * float(np.sum(square_root(problem, parameters)[:, -1] ** 2) + np.sum(priors**2))
+    variance = loss_variance(problem) if with_loss else 1.0
+    measured = problem.square_root(parameters) / np.sqrt(variance)
+    return np.vstack([*(np.column_stack([J, r]) for r, J in others), measured])
 
 
 def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
@@ -591,13 +538,6 @@ def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
     return out
 
 
-def row_triangles(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> list[Floats]:
-    """A square root of [J r] of each block, shape (n_columns + n_nuisance + 1,) * 2 each."""
-    at, (blocks, variance) = problem.variables.at(parameters), _with_loss(problem) if with_loss else (problem.rows, 1.0)
-    triangles = [block.triangle(at) for block in blocks]
-    return triangles if variance == 1.0 else [triangle / np.sqrt(variance) for triangle in triangles]
-
-
 def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     """Signal-to-noise ratios of data and priors at some parameters, and their unit-free directions as columns."""
     system = linear_system(problem, parameters)
@@ -609,72 +549,33 @@ def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     return named_rows(problem.variables, parameters, linear_system(problem, parameters).left.A)
 
 
-def felt(problem: Problem, parameters: Floats, errors: ErrorStates, wanted: Integers) -> Floats:
+def felt(problem: Problem, parameters: Floats, wanted: Integers) -> Floats:
     """M: the estimate is off by `-K M e` because of errors e of configurations, K its covariance.
 
     Args:
         problem: The problem.
         parameters: The parameter vector.
-        errors: The errors of all configurations.
-        wanted: Numbers of those that are asked for.
+        wanted: Numbers of the errors that are asked for (see `noise_models`).
 
     Returns:
         M by core and nuisance variables, these not eliminated, shape (n_columns + n_nuisance, len(wanted)).
     """
+    v = problem.variables
     if not len(wanted):
-        return np.zeros((problem.variables.n_columns + problem.variables.n_nuisance, 0))
-    row_sets, variance = _with_loss(problem)
-    return felt_errors(problem.noises, row_sets, problem.variables.at(parameters), errors, wanted) / variance
+        return np.zeros((v.n_columns + v.n_nuisance, 0))
+    J = problem.rows.private(v.at(parameters))[:, :-1]
+    L = all_errors(problem.noises, problem.rows)[:, wanted]
+    out: Floats = (L.T @ problem.rows.states.weigh(J)).T / loss_variance(problem)
+    return out
 
 
-def _linear_rows(problem: Problem, blocks: Sequence[WhitenedBlock], at: State) -> LinearRows:
-    """Whitened train rows one by one, those of each block and each of its parts after the other."""
-    rows, loadings, counts, used = [np.zeros((0, at.n_columns + at.n_nuisance + 1))], [], [np.zeros(0, np.int64)], []
-    shared = next((block for block in blocks if block.states is not None), None)
-    for block in blocks:
-        rows.append(block.private(at))
-        for part in block.parts:
-            series = problem.data.blocks[part.series]
-            counts.append(np.full(part.block.n, part.block.residual_dim))
-            used.append(series.used[series.train].ravel())
-        if shared is not None and shared.states is not None:
-            none = scipy.sparse.csr_array((len(rows[-1]), shared.states.loadings.shape[1]))
-            loadings.append(none if block.states is None else block.states.loadings)
-    wide, states, count = np.concatenate(rows), None, np.concatenate(counts)
-    if shared is not None and shared.states is not None:
-        L = scipy.sparse.csr_array(scipy.sparse.vstack(loadings))
-        states = shared.states if len(blocks) == 1 else SchurComplement(L, shared.states.width)
-    return LinearRows(
-        r=wide[:, -1],
-        A=wide[:, :-1],
-        measurement=np.repeat(np.arange(len(count)), count),
-        states=states,
-        used=np.concatenate([np.zeros(0, dtype=np.bool_), *used]),
-        configurations=np.zeros(0, dtype=np.int64) if shared is None else shared.configurations,
-        joints=0 if shared is None else shared.joints,
-    )
-
-
-def _with_loss(problem: Problem) -> tuple[tuple[WhitenedBlock, ...], float]:
-    """The rows, and the factor by which a robust loss makes the variance of the estimate larger.
-
-    Measurements of fewer rows lose less or more than others; they count relative to those that lose least.
-    """
-    state, loss = problem.state, problem.options.loss
-    if state.weights is None:
-        return problem.rows, 1.0
-    dims = [s.used.sum(axis=1) for s in problem.data.blocks]
-    largest = max(int(d.max(initial=0)) for d in dims)
-    of_dim = np.array([effect(loss, max(dim, 1)).variance for dim in range(largest + 1)])
-    of_train = np.concatenate([d[s.train] for d, s in zip(dims, problem.data.blocks, strict=True)])
-    present = np.unique(of_train[of_train > 0])
-    variance = float(of_dim[present].min(initial=np.inf)) if len(present) else 1.0
-    if len(present) <= 1:
-        return problem.rows, variance
-    share = np.minimum(variance / of_dim, 1.0)
-    weights = tuple(w * share[d] for w, d in zip(state.weights, dims, strict=True))
-    counted = replace(problem, state=replace(state, weights=weights))
-    return _whitened(counted, noises_at(counted, problem.start, fitted=True)), variance
+def loss_variance(problem: Problem) -> float:
+    """The factor by which a robust loss makes the variance of the estimate larger: the mean over the measurements."""
+    if problem.state.weights is None:
+        return 1.0
+    n_rows = np.concatenate([s.used[s.train].sum(axis=1) for s in problem.data.blocks])
+    counts = np.bincount(n_rows)
+    return float(sum(n * effect(problem.options.loss, dim).variance for dim, n in enumerate(counts) if n) / len(n_rows))
 
 
 def correlation(problem: Problem, parameters: Floats) -> Floats | None:
@@ -690,8 +591,9 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
     """
     if not problem.missing_correlation:
         return None
-    follow = linear_system(problem, parameters).left.follow
-    return correlation_of(problem.noises, problem.rows, problem.variables.at(parameters), follow)
+    n, wide = problem.variables.n_columns, problem.rows.private(problem.variables.at(parameters))
+    J = wide[:, :n] + wide[:, n:-1] @ linear_system(problem, parameters).left.follow
+    return correlation_of(problem.noises, problem.rows, J)
 
 
 def frames_only(problem: Problem) -> Problem | None:
@@ -704,10 +606,8 @@ def frames_only(problem: Problem) -> Problem | None:
     variables = variables_of(robot, problem.data, problem.options)
     options = replace(problem.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = problem.start[: variables.nuisance_span.stop]
-    state = replace(problem.state, joint_errors=None)
-    return with_factors(
-        problem, start, state, robot=robot, variables=variables, options=options, added=(), knowledge=None, whole=None
-    )
+    alone = replace(problem, added=(), knowledge=None, whole=None)
+    return with_factors(alone, start, robot=robot, variables=variables, options=options)
 
 
 def variables_of(robot: Robot, data: Dataset, options: Options) -> Variables:
@@ -736,6 +636,5 @@ def problem_at(
     robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
 ) -> Problem:
     """A problem with its rows whitened at a start."""
-    estimated = options.encoder == "estimated" and bool(np.any(data.sigma_joint > 0.0))
-    state = NoiseState(joint_errors=np.zeros_like(data.readings) if estimated else None)
-    return with_factors(Problem(robot, data, options, variables, start, state, (), **more), start)
+    bare = whitened_rows((), sharing=False, joints=False, weights=None)
+    return with_factors(Problem(robot, data, options, variables, start, NoiseState(), bare, **more), start)

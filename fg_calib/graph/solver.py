@@ -3,9 +3,8 @@
 Each iteration decomposes the normal system once (error states and landmarks eliminated, columns in units of what they
 may be off). That gives the Gauss-Newton step along the directions that data and priors determine, and the *decrement*:
 how far, in sigma, the optimum still is along them (the square root of the cost decrease that the step promises, times
-two). Where the cost does not fall by a fair share of what was promised, GTSAM takes a damped step on the reduced graph.
-Directions that nothing determines stay where they are: every step is a minimum-norm step. Near the optimum, where
-rounding of the cost exceeds what is left to gain, the decrement judges: it must fall.
+two). Where the cost does not fall by a fair share of what was promised, GTSAM takes a damped step along these
+directions. Directions that nothing determines stay where they are: every step is a minimum-norm step.
 
 Rows are whitened at the parameters that are estimated (joint noise, moments of pairs, robust weights). So near the
 optimum they are whitened anew after every step, and convergence is judged by the decrement of the rows whitened at the
@@ -14,7 +13,6 @@ estimate. The fixed point solves J^T C(x)^-1 r = 0: quasi-likelihood, consistent
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,38 +24,31 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.factors import measurement_factors
 from fg_calib.graph.noise_models import NoiseState, RowNoise
+from fg_calib.graph.normal_system import NormalSystem
 from fg_calib.graph.problem import (
     Problem,
-    cost_at,
     frames_only,
-    joint_errors,
     linear_system,
     mahalanobis_distances,
     noises_at,
-    reduced_graph,
     relinearized_at,
     subsampled,
     with_user_factors,
 )
 from fg_calib.graph.robust import Weighting, constants, cost
-from fg_calib.graph.variables import Variables
 from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, Options, SolverError, check_number, checked
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 
 FAIR_SHARE = 0.25
-"""Share of the promised decrease of the cost that an undamped step must bring."""
-
-SHORTER = 0.5
-"""Share of a step that the next one may be, where the cost does not judge."""
+"""Share of the promised decrease of the cost that a step must bring."""
 
 PATIENCE = 4
-"""Undamped steps in which the cost may rise before it has fallen."""
+"""How often rows are whitened anew where no step lowers the cost."""
 
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-15, 1e12
-"""Damping of damped steps, as a share of each column's own curvature: that of the first one, and its bounds."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING, DAMPING_FACTOR = 1e-3, 1e-15, 1e12, 10.0
+"""Damping of damped steps, as a share of the largest curvature: that of the first one, its bounds, and its factor."""
 
 NEAR_ENOUGH = 1e-3
 """What may be left to go when all iterations are spent, [sigma]."""
@@ -68,7 +59,7 @@ MAX_AT_ONCE, SAMPLE_SHARE = 200_000, 0.1
 SLOWEST = 0.9
 """Largest share of what is left to go that whitening anew is taken to leave each time, without end."""
 
-COARSE = 0.3
+COARSE = 1.0
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
 
@@ -96,7 +87,7 @@ class Iteration:
 
     Attributes:
         cost: Half the sum of squared whitened residuals after the step.
-        damping: Of a step by Levenberg-Marquardt, as a share of each column's own curvature; 0 for an undamped one.
+        damping: Of a step by Levenberg-Marquardt, as a share of the largest curvature; 0 for an undamped one.
         step: Length of the step, in changes of ordinary size (tolerances, else 1 mm and 1 mrad).
         decrement: How far from the optimum it started, [sigma].
     """
@@ -197,10 +188,7 @@ class Solution(FrozenArrays):
     @cached_property
     def values(self) -> gtsam.Values:
         """GTSAM's values at the estimate of all variables of `problem.graph`, error variables too."""
-        problem, variables = self.problem, self.problem.variables
-        values = variables.values(self.parameters)
-        values.insert(measurement_factors(problem.rows, variables, variables.at(self.parameters))[1])
-        return values
+        return replace(self.problem, start=self.parameters).initial
 
     @cached_property
     def objective(self) -> float:
@@ -217,8 +205,8 @@ class Solution(FrozenArrays):
 
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
-        """The rows of each series and their noise at the estimate, at the readings."""
-        return noises_at(self.problem, self.parameters, at_readings=True)
+        """The rows of each series and their noise at the estimate."""
+        return noises_at(self.problem, self.parameters)
 
 
 @checked
@@ -226,8 +214,8 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
     """Estimate the parameters.
 
     First measurement frame, base and tool alone with the arm at nominal, then everything; of very many measurements at
-    first some, drawn evenly, whose steps are not counted. Near the optimum rows are whitened anew after every step,
-    robust weights follow from the residuals there, and estimated joint errors from the posterior of the error states.
+    first some, drawn evenly, whose steps are not counted. Near the optimum rows are whitened anew after every step, and
+    robust weights follow from the residuals there.
 
     Args:
         problem: The problem, with what was added to its graph.
@@ -236,7 +224,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
 
     Raises:
         ProblemError: Factors of the problem's graph are missing, or an added variable has no start.
-        SolverError: GTSAM could not solve a step at all.
+        SolverError: A residual or derivative is not finite, or measurements share too many errors.
     """
     problem = with_user_factors(problem)
     options = options or options_of(problem.options)
@@ -245,11 +233,8 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
         before = _fit_frames(problem, options) if start is None else np.asarray(start, dtype=np.float64)
         if before is not problem.start:
             problem = relinearized_at(problem, before)
-        if not problem.variables.keys:
-            return _taken_as_it_is(problem, clock)
         run = _fit(_started_by_few(problem, options), options)
-        initial_cost = cost_at(problem, problem.start)
-        return _solution(run, before, initial_cost, clock)
+        return _solution(run, before, problem, clock)
 
 
 def unsolved(problem: Problem) -> Solution:
@@ -282,7 +267,7 @@ def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
         run = _fit(_started_by_few(few, options), options)
     except SolverError:
         return problem
-    return relinearized_at(problem, run.parameters) if run.converged else problem
+    return relinearized_at(problem, run.here.parameters) if run.converged else problem
 
 
 def _fit_frames(problem: Problem, options: SolverOptions) -> Floats:
@@ -291,39 +276,172 @@ def _fit_frames(problem: Problem, options: SolverOptions) -> Floats:
     if frames is None:
         return problem.start
     options = replace(options, decrement=max(options.decrement, COARSE))
-    found = _fit(_started_by_few(frames, options), options).parameters
+    found = _fit(_started_by_few(frames, options), options).here.parameters
     return np.concatenate([found, problem.start[len(found) :]])
 
 
-def _fit(problem: Problem, options: SolverOptions) -> _Descent:
+@dataclass(frozen=True)
+class _Point:
+    """A problem linearised at a parameter vector.
+
+    Attributes:
+        problem: The problem.
+        parameters: The parameter vector.
+    """
+
+    problem: Problem
+    parameters: Floats
+
+    @cached_property
+    def system(self) -> NormalSystem:
+        """The normal system."""
+        with _in_one_line():
+            return linear_system(self.problem, self.parameters)
+
+    @property
+    def decrement(self) -> float:
+        """How far the optimum still is, [sigma]."""
+        return self.system.decrement
+
+    @property
+    def rounding(self) -> float:
+        """What rounding of the residuals makes of the decrement, [sigma]."""
+        largest, angle = float(self.system.singular_values.max(initial=0.0)), self.problem.robot.scale_of("rad")
+        return 10.0 * float(np.finfo(float).eps) / angle * largest
+
+    @property
+    def at_rounding(self) -> bool:
+        """Whether rounding of the cost is above the decrease that the step promises."""
+        return 0.5 * self.decrement**2 <= 10.0 * self.rounding * float(np.sqrt(2.0 * self.system.cost))
+
+    def after(self, step: Floats) -> _Point:
+        """The point after a tangent step."""
+        return replace(self, parameters=self.problem.variables.moved(self.parameters, step))
+
+    def descend(self, damping: float) -> tuple[_Point, float, float] | None:
+        """Where the next step leads, undamped if that keeps what it promises; its damping, and the next one.
+
+        None if no step lowers the cost.
+
+        Args:
+            damping: Of the first damped step that is tried.
+        """
+        there = self.after(self.system.step)
+        try:
+            falls = self.system.cost - there.system.cost >= FAIR_SHARE * 0.5 * self.decrement**2
+            if falls or (self.at_rounding and there.decrement < self.decrement):
+                return there, 0.0, damping
+        except SolverError:
+            pass  # so far off that the rows have no derivative there
+        return None if self.at_rounding else self._descend_damped(damping)
+
+    def _descend_damped(self, damping: float) -> tuple[_Point, float, float] | None:
+        """By GTSAM's Levenberg-Marquardt, on a graph of one factor: rows and priors in the singular directions."""
+        system, key, start, graph = self.system, gtsam.symbol("S", 0), gtsam.Values(), gtsam.NonlinearFactorGraph()
+        n, weights = len(system.coordinates), system.weights
+
+        def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, H: list[Floats] | None) -> Floats:
+            y, r = values.atVector(key), np.zeros(n + 1)
+            if H is None:
+                try:
+                    r[0] = np.sqrt(2.0 * self._along(y).system.cost)
+                except SolverError:
+                    r[0] = np.sqrt(np.finfo(float).max) / 2.0
+            else:  # at the start alone
+                H[0], r[:n] = np.vstack([np.diag(weights), np.zeros((1, n))]), -system.coordinates
+                r[n] = np.sqrt(max(system.chi_square, 0.0))
+            return r
+
+        graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n + 1), [key], evaluate))
+        start.insert(key, np.zeros(n))
+        params = levenberg_marquardt_params(damping)
+        params.setDiagonalDamping(False)  # directions are in units of what they may be off
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
+        optimizer.iterate()
+        if not optimizer.error() < system.cost or optimizer.lambda_() >= MOST_DAMPING:
+            return None
+        following = max(optimizer.lambda_(), LEAST_DAMPING)
+        return self._along(optimizer.values().atVector(key)), DAMPING_FACTOR * following, following
+
+    def _along(self, y: Floats) -> _Point:
+        return self.after(self.system.full_root @ (self.system.weights * y))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Where a descent has arrived, its steps, whether it has converged, and why it stopped."""
+
+    here: _Point
+    history: tuple[Iteration, ...]
+    converged: bool
+    message: str
+
+
+def _fit(problem: Problem, options: SolverOptions) -> _Fit:
     """Least squares from the problem's start to the fixed point of whitening.
 
-    Rows stay as they are whitened until their optimum is near; then each step is one to rows whitened
-    where it leads. With a robust loss the first weights are those of the residuals at the start: gross errors would
-    lead least squares astray.
+    Rows stay as they are whitened until their optimum is near; then each step is one to rows whitened where it leads.
+    With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
+    astray.
     """
-    weighting = Weighting(problem.options.loss)
+    weighting, history, damping, tries = Weighting(problem.options.loss), list[Iteration](), FIRST_DAMPING, 0
+    start = problem.variables.parameters(problem.variables.values(problem.start))  # what is held is at nominal
     if problem.options.loss != "none":
-        problem = relinearized_at(problem, problem.start, _learn(problem, problem.start, weighting)[0])
-    run, tries = _Descent(problem, options), 0
-    while tries < PATIENCE:
-        arrived, was = run.descend(COARSE), run.here.decrement
-        if run.exhausted:
-            run.give_up()
+        problem = relinearized_at(problem, start, _learn(problem, start, weighting)[0])
+    here, converged, message = _Point(problem, start), False, ""
+    while not message and len(history) < options.max_iterations:
+        was, near, there = here, here.decrement <= COARSE, here
+        if not near and (found := here.descend(damping)) is not None:
+            here, used, damping = found
+            history.append(_iteration(was, here, used))
+            continue
+        stepped = near and here.decrement > max(options.decrement, here.rounding)
+        there = here.after(here.system.step) if stepped else here
+        state, final = _learn(here.problem, there.parameters, weighting)
+        here = _Point(relinearized_at(here.problem, there.parameters, state), there.parameters)
+        left = here.decrement
+        if stepped:  # each step leaves the same share of what was left, without end
+            history.append(_iteration(was, here, 0.0))
+            left /= 1.0 - min(left / was.decrement, SLOWEST)
+        tries = 0 if near else tries + 1
+        if final and left <= max(options.decrement, here.rounding):
+            converged, goal = True, max(options.decrement, here.rounding)
+            message = f"converged: less than {goal:.0e} sigma from the optimum"
+        elif not near and was.at_rounding:
+            converged = True
+            message = f"converged to rounding: no step lowers the cost, {here.decrement:.1e} sigma left"
+        elif tries == PATIENCE:
+            message = f"not converged: no step lowers the cost although {here.decrement:.1e} sigma are left to go"
+    if not message:
+        converged = here.decrement <= NEAR_ENOUGH
+        spent = f"{options.max_iterations} iterations, {here.decrement:.1e} sigma left to go"
+        message = f"{'converged' if converged else 'not converged'}: {spent}"
+    if converged and here.rounding > NEAR_ENOUGH:
+        hidden = f"rounding hides the optimum, by {here.rounding:.0e} sigma"
+        converged, message = False, f"not converged: {hidden}: noise, tolerances or lengths are out of all proportion"
+    return _Fit(here, tuple(history), converged, message if problem.variables.keys else "nothing to fit")
+
+
+def _iteration(before: _Point, after: _Point, damping: float) -> Iteration:
+    variables = before.problem.variables
+    taken = variables.step(before.parameters, after.parameters) / variables.all_scales
+    return Iteration(after.system.cost, damping, float(np.linalg.norm(taken)), before.decrement)
+
+
+def take_steps(problem: Problem, most: int) -> Floats:
+    """The parameter vector after some steps from the start, rows whitened as there: for a quick look.
+
+    Args:
+        problem: The problem.
+        most: Steps at most; fewer where one promises less than a thousandth of the cost.
+    """
+    here, damping = _Point(problem, problem.start), FIRST_DAMPING
+    for _ in range(most):
+        found = here.descend(damping) if here.decrement**2 > 2e-3 * here.system.cost else None
+        if found is None:
             break
-        step = run.here.system.step if arrived and was > run.least else None
-        parameters = run.parameters_after(step)
-        state, final = _learn(run.problem, parameters, weighting)
-        run.go_on_with(relinearized_at(run.problem, parameters, state), step)
-        left = run.here.decrement
-        if step is not None:  # each step leaves the same share of what was left, without end
-            left /= 1.0 - min(left / was, SLOWEST)
-        if final and left <= run.least:
-            run.descend(run.least)
-            break
-        tries = 0 if arrived else tries + 1
-    run.judge_rounding()
-    return run
+        here, _, damping = found
+    return here.parameters
 
 
 def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[NoiseState, bool]:
@@ -336,216 +454,23 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
         weights, final = weighting.update(e, residual_dim)
         ends = np.cumsum([s.n for s in problem.data.blocks])[:-1]
         state = replace(state, weights=tuple(np.split(weights, ends)))
-    if state.joint_errors is not None:
-        state = replace(state, joint_errors=joint_errors(problem, parameters))
     return state, final
 
 
-class _Point:
-    """A problem linearised at a parameter vector.
-
-    Attributes:
-        parameters: The parameter vector.
-        system: The normal system.
-        cost: Half the sum of squared whitened residuals.
-        decrement: How far the optimum still is, [sigma].
-        rounding: What rounding of the residuals makes of the decrement, [sigma].
-        at_rounding: Whether rounding of the cost is above the decrease that the step promises.
-    """
-
-    def __init__(self, problem: Problem, parameters: Floats) -> None:
-        self.parameters = parameters
-        with _in_one_line(problem.variables):
-            self.system = linear_system(problem, parameters)
-        self.cost, self.decrement = self.system.cost, self.system.decrement
-        largest, angle = float(self.system.singular_values.max(initial=0.0)), problem.robot.scale_of("rad")
-        self.rounding = 10.0 * float(np.finfo(float).eps) / angle * largest
-        self.at_rounding = 0.5 * self.decrement**2 <= 10.0 * self.rounding * np.sqrt(2.0 * self.cost)
-
-
-class _Descent:
-    """A descent from a problem's start, on one set of whitened rows after the other.
-
-    Attributes:
-        problem: The problem with the rows as they are whitened now.
-        here: Where the descent has arrived.
-        history: The steps taken.
-        converged: Whether the last descent arrived.
-        message: Why it stopped.
-    """
-
-    def __init__(self, problem: Problem, options: SolverOptions) -> None:
-        self.problem = problem
-        self.history: list[Iteration] = []
-        self.converged = False
-        self.message = ""
-        self._options = options
-        self._damping = FIRST_DAMPING
-        at, cost = problem.variables.at(problem.start), np.inf
-        with np.errstate(over="ignore", invalid="ignore"):
-            try:
-                start = problem.variables.values(problem.start)  # what is held is at nominal, wherever the start has it
-                self.here = _Point(problem, problem.variables.parameters(start))
-                cost = self.here.cost
-            except SolverError:
-                cost = sum(rows.squared_norm(at) for rows in problem.rows)
-                if np.isfinite(cost):
-                    raise
-        if not np.isfinite(cost):
-            raise SolverError(f"the cost at the start is {cost}: the measurements or the robot hold absurd numbers")
-
-    @property
-    def parameters(self) -> Floats:
-        """The parameter vector where the descent has arrived."""
-        return self.here.parameters
-
-    @property
-    def least(self) -> float:
-        """The decrement that counts as arrived, [sigma]: what the options say, or rounding."""
-        return max(self._options.decrement, self.here.rounding)
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether all iterations have been spent."""
-        return len(self.history) >= self._options.max_iterations
-
-    def parameters_after(self, step: Floats | None) -> Floats:
-        """The parameter vector after a step, or where the descent has arrived."""
-        return self.parameters if step is None else self.problem.variables.moved(self.parameters, step)
-
-    def go_on_with(self, problem: Problem, step: Floats | None) -> None:
-        """Take other rows, after a step or at the same place."""
-        there = _Point(problem, self.parameters_after(step))
-        self.problem = problem
-        if step is None:
-            self.here = there
-        else:
-            self._take(there, 0.0)
-
-    def descend(self, goal: float) -> bool:
-        """Step until the optimum of these rows is nearer than `goal`, [sigma]; whether it is."""
-        self.converged, stuck = self.here.decrement <= goal, False
-        while not (self.converged or stuck or self.exhausted):
-            path, damping = self._undamped(), 0.0
-            if not path:
-                path, damping = self._damped(), self._damping
-            stuck = not path
-            for there in path:
-                self._take(there, damping)
-            self.converged = self.here.at_rounding if stuck else self.here.decrement <= goal
-        if self.converged and not stuck:
-            self.message = f"converged: less than {goal:.0e} sigma from the optimum"
-        elif self.converged:
-            self.message = f"converged to rounding: no step lowers the cost, {self._left} left"
-        elif stuck:
-            self.message = f"not converged: no step lowers the cost although {self._left} are left to go"
-        else:
-            self.give_up()
-        return self.converged
-
-    def _take(self, there: _Point, damping: float) -> None:
-        variables = self.problem.variables
-        taken = variables.step(self.parameters, there.parameters)
-        length = float(np.linalg.norm(taken / variables.all_scales))
-        self.history.append(Iteration(there.cost, damping, length, self.here.decrement))
-        self.here = there
-
-    def judge_rounding(self) -> None:
-        """Not converged is also where rounding hides the optimum by more than may be left."""
-        if self.converged and self.here.rounding > NEAR_ENOUGH:
-            self.converged = False
-            hidden = f"rounding hides the optimum, by {self.here.rounding:.0e} sigma"
-            self.message = f"not converged: {hidden}: noise, tolerances or lengths are out of all proportion"
-
-    def give_up(self) -> None:
-        """Say that all iterations have been spent, and whether that matters."""
-        self.converged = self.here.decrement <= NEAR_ENOUGH
-        arrived = "converged" if self.converged else "not converged"
-        self.message = f"{arrived}: {self._options.max_iterations} iterations, {self._left} left to go"
-
-    @property
-    def _left(self) -> str:
-        return f"{self.here.decrement:.1e} sigma"
-
-    def _undamped(self) -> list[_Point]:
-        """Where Gauss-Newton steps lead; nothing if they do not keep what they promise.
-
-        A valley that is weakly determined may be curved: a step along it leaves it, and the next ones come back. So the
-        cost may rise as long as the steps that follow are ever shorter.
-        """
-        path: list[_Point] = []
-        here = there = self.here
-        for _ in range(PATIENCE):
-            last = there
-            try:
-                there = _Point(self.problem, self.problem.variables.moved(last.parameters, last.system.step))
-            except SolverError:
-                return []  # so far off that the rows have no derivative there
-            path.append(there)
-            if here.at_rounding:
-                return path if there.decrement < here.decrement else []
-            if here.cost - there.cost >= FAIR_SHARE * 0.5 * here.decrement**2:
-                return path
-            if here.decrement <= COARSE and there.decrement <= SHORTER * here.decrement:
-                return path  # so near, the whitening of these rows is not exact enough for the cost to judge
-            if len(path) > 1 and there.decrement >= SHORTER * last.decrement:
-                return []
-        return []
-
-    def _damped(self) -> list[_Point]:
-        """Where GTSAM's next damped step leads, undetermined directions held; nothing if none lowers the cost."""
-        here, graph, variables = self.here, reduced_graph(self.problem), self.problem.variables
-        start, params = variables.values(here.parameters), levenberg_marquardt_params(self._damping)
-        with _in_one_line(variables):
-            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
-            cost = optimizer.error()
-            optimizer.iterate()
-        if not optimizer.error() < cost or optimizer.lambda_() >= MOST_DAMPING:
-            return []
-        self._damping = max(optimizer.lambda_(), LEAST_DAMPING)
-        there = variables.parameters(optimizer.values())
-        held = variables.moved(here.parameters, here.system.without_null_space(variables.step(here.parameters, there)))
-        with _in_one_line(variables):
-            lower = graph.error(variables.values(held)) < cost
-        return [_Point(self.problem, held if lower else there)]
-
-
-def _solution(run: _Descent, before: Floats, initial_cost: float, clock: float) -> Solution:
-    cost, problem, variables = run.here.cost, run.problem, run.problem.variables
-    parameters = variables.parameters(variables.values(run.parameters))  # angles of poses in their usual range
-    if problem.state.weights is not None:
-        unweighted = relinearized_at(problem, parameters, replace(problem.state, weights=None))
-        cost = cost_at(unweighted, parameters)
+def _solution(run: _Fit, before: Floats, started: Problem, clock: float) -> Solution:
+    problem, weighted_cost = run.here.problem, run.here.system.cost
+    parameters = problem.variables.parameters(problem.variables.values(run.here.parameters))  # angles in usual range
+    weighted, cost = problem.state.weights is not None, weighted_cost
+    if weighted:
+        cost = relinearized_at(problem, parameters, replace(problem.state, weights=None)).linearize().cost
     return Solution(
         problem=problem,
         parameters=parameters,
         before=before,
         converged=run.converged,
         message=run.message,
-        history=tuple(run.history),
-        initial_cost=initial_cost,
-        cost=cost,
-        weighted_cost=run.here.cost,
-        seconds=time.perf_counter() - clock,
-    )
-
-
-def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
-    """The "solution" of an evaluation that has nothing to fit; robust weights are those of the rows as they are."""
-    weighted, final, weighting = problem, problem.options.loss == "none", Weighting(problem.options.loss)
-    while not final:
-        state, final = _learn(problem, problem.start, weighting)
-        weighted = relinearized_at(problem, problem.start, state)
-    at = problem.variables.at(problem.start)
-    cost, weighted_cost = (0.5 * sum(rows.squared_norm(at) for rows in p.rows) for p in (problem, weighted))
-    return Solution(
-        problem=weighted,
-        parameters=problem.start,
-        before=problem.start,
-        converged=True,
-        message="nothing to fit",
-        history=(),
-        initial_cost=cost,
+        history=run.history,
+        initial_cost=started.linearize().cost,
         cost=cost,
         weighted_cost=weighted_cost,
         seconds=time.perf_counter() - clock,
@@ -553,26 +478,17 @@ def _taken_as_it_is(problem: Problem, clock: float) -> Solution:
 
 
 @contextmanager
-def _in_one_line(variables: Variables) -> Iterator[None]:
-    """What GTSAM, LAPACK or an added factor raises in the block becomes a `SolverError`."""
+def _in_one_line() -> Iterator[None]:
+    """What LAPACK or an added factor raises in the block becomes a `SolverError`."""
     try:
         yield
     except CalibrationError:
         raise
     except Exception as error:
-        raise SolverError(_in_words(str(error) or type(error).__name__, variables)) from error
+        raise SolverError(" ".join((str(error) or type(error).__name__).split())) from error
 
 
-def _in_words(message: str, variables: Variables) -> str:
-    """GTSAM's message in one line, with the key it names as our variable and its parameters."""
-    found = re.search(r"Symbol:\s*(\w)(\d+)", message)
-    if "ndetermin" in message and found:
-        key = gtsam.symbol(found.group(1), int(found.group(2)))
-        return f"the linear system has no unique solution near {variables.describe(key)}"
-    return " ".join(message.split())
-
-
-def levenberg_marquardt_params(damping: float = FIRST_DAMPING) -> gtsam.LevenbergMarquardtParams:
+def levenberg_marquardt_params(damping: float = 1e-3) -> gtsam.LevenbergMarquardtParams:
     """Options for GTSAM's own optimiser that work on these graphs: QR, and damping in each column's own unit.
 
     With its defaults GTSAM returns the start without a word where weak priors hold directions.
@@ -584,7 +500,7 @@ def levenberg_marquardt_params(damping: float = FIRST_DAMPING) -> gtsam.Levenber
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
     parameters.setDiagonalDamping(True)
     parameters.setlambdaInitial(damping)
-    parameters.setlambdaFactor(10.0)
+    parameters.setlambdaFactor(DAMPING_FACTOR)
     parameters.setlambdaUpperBound(MOST_DAMPING)
     parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
     parameters.setAbsoluteErrorTol(0.0)

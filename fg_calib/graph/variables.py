@@ -49,8 +49,7 @@ class Variable:
         key: GTSAM's key.
         symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
         kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
-            as a touched point, or a user's: of any of GTSAM's types, its parameters are tangent coordinates at
-            its start.
+            as a touched point, or a vector or pose that a user added.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
@@ -60,7 +59,7 @@ class Variable:
 
     key: int
     symbol: str
-    kind: Literal["vector", "tool", "base", "frame", "unknown", "own"]
+    kind: Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
@@ -84,7 +83,7 @@ class Variable:
     @property
     def is_pose(self) -> bool:
         """Whether it is a Pose3; else it is a vector."""
-        return self.kind in ("tool", "base", "frame")
+        return self.kind in ("tool", "base", "frame", "own pose")
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,6 @@ class Variables(Brief):
         nuisance: The nuisance variables; their columns follow those of the core.
         coordinates: Of the measurements' unknown coordinates, where each stands in the parameter vector; -1 for those
             that are not estimated.
-        own: Start of added variables.
     """
 
     robot: Robot
@@ -116,7 +114,6 @@ class Variables(Brief):
     nuisance: tuple[Variable, ...] = ()
     coordinates: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     others: Floats = field(default_factory=lambda: np.zeros(0))
-    own: gtsam.Values = field(default_factory=gtsam.Values, compare=False)
 
     @property
     def n_columns(self) -> int:
@@ -210,15 +207,10 @@ class Variables(Brief):
 
     def values(self, parameters: Floats) -> gtsam.Values:
         """GTSAM's values at a parameter vector."""
-        values, off = gtsam.Values(), gtsam.VectorValues()
+        values = gtsam.Values()
         for v in self.items + self.nuisance:
             chosen = parameters[v.places]
-            if v.kind == "own":
-                off.insert(v.key, chosen)
-            else:
-                values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
-        if off.size():
-            values.insert(self.own.retract(off))
+            values.insert(v.key, pose_of(chosen) if v.is_pose else chosen)
         return values
 
     def parameters(self, values: gtsam.Values, only: Sequence[Variable] | None = None) -> Floats:
@@ -226,9 +218,7 @@ class Variables(Brief):
         parameters = self.nominal()
         for v in self.items + self.nuisance if only is None else only:
             of_v = v.places
-            if v.kind == "own":
-                parameters[of_v] = local_coordinates(self.own, values, v.key)
-            elif v.is_pose:
+            if v.is_pose:
                 near = None if v.kind == "frame" else parameters[of_v]
                 parameters[of_v] = frame_of(values.atPose3(v.key), near)
             else:
@@ -244,10 +234,6 @@ class Variables(Brief):
                 continue  # a step of the core alone moves no landmark
             if v.is_pose:
                 after[of_v] = frame_of(pose_of(parameters[of_v]).retract(part), parameters[of_v])
-            elif v.kind == "own":
-                start = only_key(self.own, v.key)
-                value = _retracted(_retracted(start, v.key, parameters[of_v]), v.key, part)
-                after[of_v] = local_coordinates(start, value, v.key)
             else:
                 after[of_v] += part
         return after
@@ -258,9 +244,6 @@ class Variables(Brief):
         for v in self.items + self.nuisance:
             if v.is_pose:
                 out[v.columns] = gtsam.Pose3.Logmap(pose_of(start[v.places]).between(pose_of(end[v.places])))
-            elif v.kind == "own":
-                from_v, to_v = (_retracted(only_key(self.own, v.key), v.key, p[v.places]) for p in (start, end))
-                out[v.columns] = local_coordinates(from_v, to_v, v.key)
             else:
                 out[v.columns] = end[v.places] - start[v.places]
         return out
@@ -304,20 +287,26 @@ class Variables(Brief):
         chains = tuple(chain.at(parameters) for chain in self.chains)
         return State(chains, values, columns, self.n_columns, self.n_nuisance)
 
-    def without_own(self) -> Variables:
-        """The variables without added ones."""
-        return replace(self, nuisance=tuple(v for v in self.nuisance if v.kind != "own"), own=gtsam.Values())
+    def without_added(self) -> Variables:
+        """The variables without a user's."""
+        return replace(self, nuisance=tuple(v for v in self.nuisance if not v.kind.startswith("own")))
 
-    def with_own(self, start: gtsam.Values) -> Variables:
-        """The variables with added ones, of any type, by their start."""
-        variables = self
-        for key in list(start.keys()):
-            n, place, symbol = only_key(start, key).dim(), variables.nuisance_span.stop, str(gtsam.Symbol(key)).strip()
-            column = variables.n_columns + variables.n_nuisance
-            parameters, columns = tuple(range(place, place + n)), slice(column, column + n)
-            added = Variable(key, symbol, "own", parameters, columns, scales=(1.0,) * n)
-            variables = replace(variables, nuisance=(*variables.nuisance, added))
-        return replace(variables, own=start)
+    def with_added(self, key: int, symbol: str, initial: gtsam.Values) -> Variables:
+        """The variables with one that a user added, a pose or a vector; a vector of nothing where it is neither."""
+        n = 6
+        kind: Literal["own", "own pose"] = "own pose"
+        try:
+            initial.atPose3(key)
+        except RuntimeError:
+            kind = "own"
+            try:
+                n = len(initial.atVector(key))
+            except RuntimeError:
+                n = 0
+        first, column = self.nuisance_span.stop, self.n_columns + self.n_nuisance
+        places, columns = tuple(range(first, first + n)), slice(column, column + n)
+        added = Variable(key, symbol, kind, places, columns, scales=(1.0,) * n)
+        return replace(self, nuisance=(*self.nuisance, added))
 
     def columns_of(self, other: Variables, parameters: Floats) -> Floats:
         """Each column of other variables of the same arm in these, shape (n_columns, other.n_columns).
@@ -425,28 +414,6 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
         )
         chains.append(replace(chain, source=moved, n_columns=len(names)))
     return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
-
-
-def only_key(values: gtsam.Values, key: int) -> gtsam.Values:
-    """The value of one key alone."""
-    one = gtsam.Values(values)
-    for other in list(values.keys()):
-        if other != key:
-            one.erase(other)
-    return one
-
-
-def _retracted(values: gtsam.Values, key: int, step: Floats) -> gtsam.Values:
-    """The value of the only key after a tangent step."""
-    delta = gtsam.VectorValues()
-    delta.insert(key, step)
-    return values.retract(delta)
-
-
-def local_coordinates(start: gtsam.Values, end: gtsam.Values, key: int) -> Floats:
-    """The tangent step from a variable's value to another, whatever its type."""
-    step: Floats = only_key(start, key).localCoordinates(only_key(end, key)).at(key)
-    return step
 
 
 def pose_of(frame: Floats) -> gtsam.Pose3:

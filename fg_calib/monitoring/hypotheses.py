@@ -36,7 +36,7 @@ from scipy import special
 
 from fg_calib.graph import Variables, build_variables
 from fg_calib.inputs import POSE_MODELS, CalibrationError, Floats, FrozenArrays, Integers
-from fg_calib.monitoring.new_data import Linear, Rows, ends_of_rows, linearise_new_data, place_new_data, whitened
+from fg_calib.monitoring.new_data import Linear, Rows, ends_of_rows, linearise_new_data, place_new_data
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, forward, names_of, random_readings
 from fg_calib.statistics import FACTOR
@@ -241,7 +241,7 @@ def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
     for k in np.unique(ends[ends >= 0]).tolist():
         mine = np.flatnonzero((ends == k).any(axis=1))
         if 3 * len(mine) <= len(ends):
-            columns = whitened(problem, unit[:, mine])
+            columns = problem.rows.states.whiten(unit[:, mine])
             columns, none = columns[:, columns.any(axis=0)], np.zeros((rows.of_arm.shape[1], 0))
             found.append(ChangeHypothesis((problem.data.names[k],), "row", ("",) * columns.shape[1], columns, none))
     return found

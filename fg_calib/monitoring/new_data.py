@@ -217,7 +217,7 @@ def linearise_new_data(at: Placed) -> Linear:
     """
     calibrated, problem, v = at.calibrated, at.problem, at.problem.variables
     wide = v.n_columns + v.n_nuisance
-    every = whitened(problem, np.vstack([block.private(v.at(problem.start)) for block in problem.rows]))
+    every = problem.rows.states.whiten(problem.rows.private(v.at(problem.start)))
     J, r = every[:, :wide], every[:, wide]
     stated, J_stated = unknown_prior_rows(v, problem.start)
     places = [coordinates_of(v, problem.data.landmarks, name) for name in at.pinned]
@@ -247,20 +247,10 @@ def linearise_new_data(at: Placed) -> Linear:
     )
 
 
-def whitened(problem: Problem, rows: Floats) -> Floats:
-    """Rows that are whitened by their private noise, shape (n, k), whitened by all they share, shape (m, k)."""
-    found, first = [], 0
-    for block in problem.rows:
-        mine = rows[first : first + sum(part.n_rows for part in block.parts)]
-        found.append(mine if block.states is None else block.states.whiten(mine))
-        first += len(mine)
-    return np.vstack(found)
-
-
 def ends_of_rows(problem: Problem) -> Integers:
     """The configurations of each row that is whitened by its private noise, -1 for no second one, shape (n, 2)."""
     found = []
-    for part in (part for block in problem.rows for part in block.parts):
+    for part in problem.rows.parts:
         ends = np.pad(problem.data.places[part.table][part.block.ends], ((0, 0), (0, 2)), constant_values=-1)
         found.append(np.repeat(ends[:, :2], part.block.residual_dim, axis=0))
     return np.concatenate(found)

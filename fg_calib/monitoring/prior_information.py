@@ -28,8 +28,7 @@ from fg_calib.graph import (
     coordinates_of,
     eliminate,
     prior_rows,
-    row_triangles,
-    unknown_prior_rows,
+    square_root,
 )
 from fg_calib.inputs import Floats, Options
 from fg_calib.measurements import LANDMARKS, Measurements, Table
@@ -172,9 +171,8 @@ def _place(problem: Problem, name: Name) -> NDArray[np.int64] | None:
 def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss: bool) -> tuple[Floats, Floats]:
     """All rows but the arm's tolerances, by the problem's columns, then by those of what was known and is not seen."""
     v, extra = problem.variables, SIZE * len(unseen)
-    r, J = unknown_prior_rows(v, parameters)
-    blocks = [np.column_stack([J, r]), *row_triangles(problem, parameters, with_loss=with_loss)]
-    wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]]) for B in blocks]
+    B = square_root(replace(problem, knowledge=None), parameters, with_loss=with_loss)
+    wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]])]
     known = problem.knowledge
     if known is not None:
         s, D = known.step_to(v, problem.data.landmarks, parameters)

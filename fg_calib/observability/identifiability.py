@@ -148,7 +148,7 @@ def observe_configurations(
     if not any(p.estimated for p in robot.parameters):
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing)
-    if not problem.rows:
+    if not problem.rows.parts:
         if measurements.test.all():
             raise ProblemError(measurements.source, "test rows alone", "train rows: test rows are never fitted")
         raise ProblemError(measurements.source, "no row takes part", "configurations that differ")

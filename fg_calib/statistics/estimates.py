@@ -12,7 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.graph import Problem, Solution, Variables, at_parameters, corrections_of, linear_system, pose_of
+from fg_calib.graph import (
+    Problem,
+    Solution,
+    Variables,
+    at_parameters,
+    corrections_of,
+    joint_errors,
+    linear_system,
+    pose_of,
+)
 from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
@@ -264,12 +273,12 @@ def _n_rows(problem: Problem) -> Integers:
 
 def _joint_errors(solution: Solution) -> JointErrors | None:
     problem, data = solution.problem, solution.problem.data
-    if problem.state.joint_errors is None:
+    if not problem.joints_estimated:
         return None
     joints = np.flatnonzero(data.sigma_joint > 0.0)
     sigma = problem.sigma_joint[joints]
-    rows, share = _share_of_variance(solution, len(joints))
-    error = problem.state.joint_errors[np.ix_(rows, joints)]
+    rows, share = _share_of_variance(solution, joints)
+    error = joint_errors(problem, solution.parameters)[np.ix_(rows, joints)]
     with np.errstate(invalid="ignore", divide="ignore"):
         studentised = np.where(share > LEAST_SHARE, error / (sigma * np.sqrt(share)), np.nan)
     size = np.nan_to_num(np.abs(studentised))
@@ -286,12 +295,11 @@ def _joint_errors(solution: Solution) -> JointErrors | None:
     )
 
 
-def _share_of_variance(solution: Solution, n_joints: int) -> tuple[Integers, Floats]:
+def _share_of_variance(solution: Solution, joints: Integers) -> tuple[Integers, Floats]:
     """Configurations of the fitted rows, and by which share of its prior variance each estimated error varies."""
-    system = linear_system(solution.problem, solution.parameters)
-    rows = system.rows
-    if rows.states is None:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, n_joints))
-    order = np.argsort(rows.configurations)
-    share = 1.0 - system.z_variance.reshape(len(order), rows.states.width)
-    return rows.configurations[order], share[order, rows.joints : rows.joints + n_joints]
+    rows = solution.problem.rows
+    variance = linear_system(solution.problem, solution.parameters).z_variance
+    share = np.zeros((len(rows.configurations), solution.problem.robot.n_joints))
+    of_joints = rows.slots < share.shape[1]
+    share[:, rows.slots[of_joints]] = 1.0 - variance.reshape(len(share), -1)[:, of_joints]
+    return rows.configurations, share[:, joints]

@@ -385,7 +385,10 @@ class RowStatistics:
     def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
         problem = solution.problem
         self.solution, self.spread, self.table = solution, spread, table
-        self.robust, self._shared = problem.state.weights is not None, any(noise.sources for noise in solution.noises)
+        self.robust, self._shared = (
+            problem.state.weights is not None,
+            any(noise.loading.shape[2] for noise in solution.noises),
+        )
         self.weight: Floats = np.ones(table.n) if self.robust else np.broadcast_to(1.0, table.n)
         for number, weights in enumerate(problem.state.weights or ()):
             mine = table.rows_of(number)
@@ -423,9 +426,8 @@ class RowStatistics:
                 first, last = last, last + int(np.sum(measured[chunk]))
                 rows = slice(first, last)
                 if model.is_plain(number) and not asked[rows].any():
-                    moments = noise.moments_at(chunk)
-                    squares = squares_along(noise.rows_at(chunk, moments), model.chain(number), root)
-                    of_rows = (squares + np.maximum(moments.variance, 0.0))[measured[chunk]]
+                    squares = squares_along(noise.rows_at(chunk), model.chain(number), root)
+                    of_rows = (squares + noise.variance[chunk])[measured[chunk]]
                     self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
                     continue
                 found = model.errors(number, np.arange(chunk.start, chunk.stop))
@@ -529,9 +531,8 @@ class RowStatistics:
         """Variance of each row by the noise of the joint readings, shape (n,)."""
         variance = np.zeros(self.table.n)
         for number, noise in enumerate(self.solution.noises):
-            for source in (source for source in noise.sources if source.name == "joints"):
-                of_rows = np.einsum("nii->ni", source.variance)
-                variance[self.table.rows_of(number)] += of_rows[noise.series.measured]
+            of_joints = noise.loading[:, :, : noise.n_of_joints]
+            variance[self.table.rows_of(number)] = np.sum(of_joints**2, axis=2)[noise.series.measured]
         return variance
 
     def _predict(self, test: Integers, squares: Floats, kept: Integers, of_kept: RowErrors) -> JudgedRows:

@@ -14,7 +14,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 
-from fg_calib.graph import PRIVATE_SHARE, ErrorStates, Problem, RowNoise, at_parameters, felt, linear_system, says_where
+from fg_calib.graph import PRIVATE_SHARE, Problem, RowNoise, at_parameters, felt, linear_system, reach, says_where
 from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
@@ -152,14 +152,14 @@ class RowModel:
 
     def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
         self._at = at_parameters(problem, parameters)
-        self._noises, self._states, self._n = noises, ErrorStates(noises), problem.variables.n_columns
+        self._noises, self._n = noises, problem.variables.n_columns
         left = linear_system(problem, parameters).left
         of_landmarks, width = np.hstack([left.follow, left.inverse]), self._n + left.rank
         estimated, n = self._at.columns >= 0, len(self._at.columns)
         self._follow = np.zeros((n, width))
         self._follow[estimated] = of_landmarks[self._at.columns[estimated] - self._n]
-        self._common = self._states.predicted(noises)
-        core, landmarks = np.split(felt(problem, parameters, self._states, self._common), [self._n])
+        self._common = np.flatnonzero((reach(noises) > 0) & (reach(noises, test=True) > 0))
+        core, landmarks = np.split(felt(problem, parameters, self._common), [self._n])
         self._felt = np.eye(width, self._n) @ core + of_landmarks.T @ landmarks
         blocks, unknowns = problem.data.blocks, problem.data.landmarks
         self._means = [says_where(problem.data, s) & ~estimated[s.nuisances].any(axis=1) for s in blocks]
@@ -170,7 +170,7 @@ class RowModel:
             located[s.nuisances[touches].ravel()] = True
         self._nowhere: list[Booleans] = [np.any(~located[s.nuisances], axis=1) for s in blocks]
         counts = [s.n * s.kind.residual_dim * touches.any() for s, touches in zip(blocks, self._means, strict=True)]
-        self._first = self._states.n_errors + np.cumsum([0, *counts])
+        self._first = max((noise.place.n_errors for noise in noises), default=0) + np.cumsum([0, *counts])
         self._averaged = Sparse((n, int(self._first[-1])))
         for number in (number for number, touches in enumerate(self._means) if touches.any()):
             rows = np.flatnonzero(self._means[number])
@@ -183,7 +183,7 @@ class RowModel:
     def is_plain(self, number: int) -> bool:
         """Whether rows of a block follow from the core and private noise alone."""
         noise = self._noises[number]
-        return not (noise.sources or noise.series.nuisances.shape[1])
+        return not (noise.loading.shape[2] or noise.series.nuisances.shape[1])
 
     def chain(self, number: int) -> Chain:
         """The chain of a block at the estimate."""
@@ -218,8 +218,8 @@ class RowModel:
         row = np.broadcast_to(np.arange(n * h).reshape(n, h, 1), in_landmarks.shape).ravel()
         place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_landmarks.shape).ravel()
         N = Sparse((in_landmarks.ravel(), (row, place)), shape=(n * h, len(self._follow)))
-        private = np.maximum(noise.moments_at(rows).variance, 0.0).ravel()
-        L = self._states.loading(noise, rows)
+        private = noise.variance[rows].ravel()
+        L = noise.errors_at(rows)
         L = Sparse((L.data, L.indices, L.indptr), shape=(n * h, width))
         mean = np.flatnonzero(np.repeat(self._means[number][rows], h))
         if len(mean):

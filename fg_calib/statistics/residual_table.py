@@ -293,7 +293,7 @@ class ResidualTable(FrozenArrays):
 def residual_table(solution: Solution) -> ResidualTable:
     """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem, data = solution.problem, solution.problem.data
-    before = noises_at(problem, solution.before, at_readings=True)
+    before = noises_at(problem, solution.before)
     kinds: dict[RowKind, int] = {}
     reasons, labels = {"": 0}, {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
@@ -305,7 +305,7 @@ def residual_table(solution: Solution) -> ResidualTable:
             excluded[mask] = reasons.setdefault(reason, len(reasons))
         m, k = np.nonzero(s.measured)  # measurement and component of each row
         a, b = _ends(data.places[s.table][s.ends], data.landmarks.owners[s.nuisances], data.n_configurations)
-        after, excess, sigma = new.figures()
+        after, excess, sigma = new.residual(), new.excess, new.sigma
         columns.append(
             {
                 "kind_code": codes[k],

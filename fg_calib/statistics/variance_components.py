@@ -18,7 +18,7 @@ What the residuals cannot distinguish keeps its specified noise: an origin that 
 unless what was specified is then `UNLIKELY` sigma from the estimate. So noise that is specified but absent goes to
 nothing, and noise too small to be determined stays.
 
-Where rows are weighted by more than their noise (`WhitenedBlock.spare`: C = sum V_i + S), t_i is tr(P V_i) -
+Where rows are weighted by more than their noise (`WhitenedRows.spare`: C = sum V_i + S), t_i is tr(P V_i) -
 tr(P V_i P S). A row with robust weight w counts as w rows. Noise of formed pairs beyond the first order counts as that
 of the poses. Where measurements that share errors are asked to count as independent, they do here too.
 
@@ -39,7 +39,6 @@ import scipy.sparse
 
 from fg_calib.graph import (
     JOINT_NOISE,
-    ErrorStates,
     NoiseName,
     Problem,
     RowNoise,
@@ -52,7 +51,7 @@ from fg_calib.graph import (
     solve,
     whitener_of,
 )
-from fg_calib.inputs import Floats, Integers, checked
+from fg_calib.inputs import Booleans, Floats, Integers, checked
 from fg_calib.parallel import single_threaded
 
 Sparse = scipy.sparse.csr_array
@@ -107,11 +106,7 @@ class NoiseComponents:
 
 def has_joint_noise(problem: Problem) -> bool:
     """Whether the noise of joint readings reaches any fitted row."""
-    return any(
-        source.name == "joints" and bool(np.any(source.loading[noise.series.train]))
-        for noise in problem.noises
-        for source in noise.sources
-    )
+    return any(bool(np.any(noise.loading[noise.series.train][:, :, : noise.n_of_joints])) for noise in problem.noises)
 
 
 def noise_components(solution: Solution) -> NoiseComponents:
@@ -128,9 +123,8 @@ def noise_components(solution: Solution) -> NoiseComponents:
     u = system.weighted_residual / np.sqrt(_robust_weights(problem))
     squares = np.array([np.sum((E.T @ u) ** 2) for E in roots])
     expected = np.array([system.trace(E) for E in roots])
-    spare = [Sparse((rows.n_rows, 0)) if rows.spare is None else rows.spare for rows in problem.rows]
-    if any(S.shape[1] for S in spare):
-        S = Sparse(scipy.sparse.block_diag(spare))
+    S = problem.rows.spare
+    if S.nnz:
         probes, n = S.toarray(), 1
         if S.shape[1] > MAX_EXACT:
             probes, n = S @ np.random.default_rng(0).choice([-1.0, 1.0], size=(S.shape[1], N_PROBES)), N_PROBES
@@ -149,7 +143,7 @@ def _families(noise: RowNoise) -> list[str]:
 def _robust_weights(problem: Problem) -> Floats:
     """Robust weight of each row of the linear system, shape (n_rows,)."""
     given, out = problem.state.weights, [np.zeros(0)]
-    for part in (part for rows in problem.rows for part in rows.parts):
+    for part in problem.rows.parts:
         train = problem.noises[part.series].series.train
         weights = np.ones(len(train)) if given is None else np.maximum(given[part.series][train], 1e-12)
         out.append(np.repeat(weights, part.block.residual_dim))
@@ -158,31 +152,23 @@ def _robust_weights(problem: Problem) -> Floats:
 
 def _root(problem: Problem, name: NoiseName) -> Sparse:
     """E with E E^T the part of the rows' covariance that noise of one origin makes, shape (n_rows, k)."""
-    estimated = problem.state.joint_errors is not None
-    shares = ErrorStates(problem.noises, problem.options.pair_errors == "shared", estimated)
-    parts = [part for rows in problem.rows for part in rows.parts]
-    found = [_root_of_part(problem.noises[part.series], part, name, shares) for part in parts]
+    rows = problem.rows
+    found = [_root_of_part(problem.noises[part.series], part, name, rows.shared) for part in rows.parts]
     private = scipy.sparse.block_diag([own for own, _ in found])
     return Sparse(scipy.sparse.hstack([private, scipy.sparse.vstack([common for _, common in found])]))
 
 
-def _root_of_part(noise: RowNoise, part: WhitenedSeries, name: NoiseName, shares: ErrorStates) -> tuple[Sparse, Sparse]:
+def _root_of_part(noise: RowNoise, part: WhitenedSeries, name: NoiseName, shared: Booleans) -> tuple[Sparse, Sparse]:
     """How whitened rows follow from noise of one origin: what is private to each measurement, and what is shared."""
     train, W = noise.series.train, whitener_of(noise, part)
-    n, h = W.shape[:2]
-    blocks = [np.zeros((n, h, 0))]
-    if name == JOINT_NOISE:
-        sources = [source for source in noise.sources if source.name == "joints"]
-    else:
-        mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
-        sources = [source for source in noise.sources if source.name != "joints" and mine.any()]
-        sources = [source._replace(loading=source.loading * mine[:, None, None]) for source in sources]
-        blocks.append(W @ _square_roots(noise.own_at(train))[:, :, mine])
-    masks = {source.name: shares.mask(source)[train] for source in sources}
-    for source in sources:
-        alone = np.where(masks[source.name][:, None, :, None], 0.0, source.loading[train]).reshape(n, h, -1)
-        blocks += [W @ alone] if alone.any() else []
-    return block_diagonal(np.concatenate(blocks, axis=2)), shares.loading(noise, train, W, masks, sources)
+    of_joints = np.arange(noise.loading.shape[2]) < noise.n_of_joints
+    mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
+    origin = of_joints[None] if name == JOINT_NOISE else mine[:, None] & ~of_joints
+    is_state = shared[noise.columns[train]][:, None]
+    alone = W @ np.where(origin & ~is_state, noise.loading[train], 0.0)
+    own = W @ _square_roots(noise.private_at(train))[:, :, mine]
+    private = block_diagonal(np.concatenate([own, alone] if alone.any() else [own], axis=2))
+    return private, noise.errors_at(train, W, origin & is_state)
 
 
 def _square_roots(covariance: Floats) -> Floats:

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import InputError, Measurements, Pairing, Table, assess, solve
-from fg_calib.graph import noise_models, solver
+from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import whitening_of
-from fg_calib.graph.problem import linear_system, noises_at, relinearized_at, subsampled
+from fg_calib.graph.problem import linear_system, relinearized_at, subsampled
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
@@ -97,19 +97,6 @@ def test_small_covariances_are_whitened_by_the_rows_in_use(d):
     assert np.abs(W @ (C * both) @ np.swapaxes(W, 1, 2) - np.eye(d) * both).max() < 1e-12
     with pytest.raises(InputError, match="lost in rounding"):
         whitening_of(-C, np.ones_like(used))
-
-
-def test_noise_of_many_rows_is_computed_on_demand_and_is_the_same(problem, monkeypatch):
-    (of_few,) = noises_at(problem, problem.start)
-    monkeypatch.setattr(noise_models, "SPAN", 64)
-    (of_many,) = noises_at(problem, problem.start)
-    rows = np.random.default_rng(0).permutation(of_few.series.n)[:500]
-    kept, anew = of_few.moments_at(slice(None)), of_many.moments_at(slice(None))
-    assert np.sum(kept.slope < 0.999) > 5  # some lengths are near 0
-    for name in ("excess", "slope", "variance"):
-        assert getattr(anew, name) == pytest.approx(getattr(kept, name), rel=1e-9, abs=1e-15)
-        assert np.array_equal(getattr(of_many.moments_at(rows), name), getattr(anew, name)[rows])
-    assert of_many.sigma == pytest.approx(of_few.sigma, rel=1e-9)
 
 
 @pytest.mark.parametrize("n_sigma", [0.2, 3.0])

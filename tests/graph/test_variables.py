@@ -205,7 +205,7 @@ def test_a_factors_wrong_shape_or_number_is_an_error_and_not_the_end_of_the_inte
     for word, linearise in cases.items():
         with pytest.raises(SolverError, match=word):
             CheckedFactor(variables.items, 3, linearise).linearize(values)
-    with pytest.raises(SolverError, match="residual of shape"):
+    with pytest.raises(SolverError, match="shapes"):
         CheckedFactor(variables.items, 3, cases["shapes"]).error(values)
 
 

@@ -106,7 +106,7 @@ def test_leverages_are_those_of_the_hat_matrix():
     solution = solve(build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=4), model="pose"))
     uncertainty = assess(solution)
     table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
-    (rows,) = solution.problem.rows
+    rows = solution.problem.rows
     J = rows.linearise(solution.problem.variables.at(solution.parameters))[1]
     H = J @ np.linalg.pinv(J, rcond=1e-9)
     assert goodness.leverage[table.used] == pytest.approx(np.diag(H), rel=1e-6)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from fg_calib.graph.noise_models import PRIVATE_SHARE
+from fg_calib.graph import PRIVATE_SHARE
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, square_root
 
 N = 60

@@ -131,7 +131,7 @@ def dense_model(solution):
 
 def spare_of(problem):
     """Covariance that rows are weighted by on top of their noise: of distances alone."""
-    rows = problem.rows[0]
+    rows = problem.rows
     W = whitener_of(problem.noises[0], rows.parts[0])[:, 0, 0]
     return np.diag(np.asarray(rows.spare.power(2).sum(axis=1)).ravel() / W**2)
 
