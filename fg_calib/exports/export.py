@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,8 +25,16 @@ from fg_calib.exports.dh import (
     in_table,
     with_frames_of,
 )
-from fg_calib.exports.ros import UrBase, dumped, hash_of, tesseract_text, ur_base_of, ur_kinematics, ur_text
-from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, calibrated_urdf, new_urdf
+from fg_calib.exports.urdf import (
+    BASE_LINK,
+    TOOL_LINK,
+    UrBase,
+    calibrated_urdf,
+    dumped,
+    new_urdf,
+    tesseract_text,
+    ur_kinematics,
+)
 from fg_calib.inputs import Floats, InputError, as_floats, check, check_flag, checked, printable, shown
 from fg_calib.io import Units, encoding_of, replacing, require_absent, robot_text
 from fg_calib.robot import CONVENTIONS, Robot, frame_values
@@ -90,17 +99,9 @@ class Export:
 
         with errors as in `PoseErrors`; SI.
         """
-        return {
-            "schema": "fg-calib/export/1",
-            "version": __version__,
-            "to": self.to,
-            "robot": self.robot,
-            "text": self.text,
-            "notes": list(self.notes),
-            "findings": list(self.findings),
-            "not_accepted": list(self.not_accepted),
-            **self.details,
-        }
+        document = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "details"}
+        lists = {name: list(value) for name, value in document.items() if isinstance(value, tuple)}
+        return {"schema": "fg-calib/export/1", "version": __version__, **document, **lists, **self.details}
 
     def __str__(self) -> str:
         return self.text
@@ -253,31 +254,31 @@ def _urdf(arm: _Arm, calibration_elements: bool) -> Export:
         return Export("urdf", robot.name, calibrated_urdf(robot, nominal), notes)
     if calibration_elements:
         raise InputError("calibration_elements", "an arm that is no URDF", "an arm that was read from a URDF")
-    notes = (f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",)
-    if any(np.isinf([joint.lower, joint.upper]).any() for joint in robot.joints if joint.prismatic):
-        notes += ("slides without limits have 1000 m, as URDF knows none without",)
-    if any(np.isfinite([joint.lower, joint.upper]).sum() == 1 for joint in robot.joints if not joint.prismatic):
-        notes += ("joints that turn and have one limit alone are continuous here, without it",)
-    if any(np.isfinite([joint.lower, joint.upper]).all() for joint in robot.joints):
-        notes += ("effort and velocity in <limit> are 0, as nobody has stated them",)
+    notes = (
+        f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",
+        "URDF knows no slide without limits, which has 1000 m here, and no turn with one limit, which has none",
+        "effort and velocity in <limit> are 0: they are not known",
+    )
     return Export("urdf", robot.name, new_urdf(robot, [printable(c) for c in (*arm.comments, *notes)]), notes)
 
 
 def _ur(arm: _Arm, base: UrBase | None, word: str | None) -> Export:
-    base = ur_base_of(arm.robot) if base is None else check("ur_base", base, UrBase)
+    urdf = arm.robot.urdf
+    drawn_base: UrBase = "base_link" if urdf is not None and urdf.base_link.endswith("base_link") else "base"
+    base = drawn_base if base is None else check("ur_base", base, UrBase)
     if word is not None and (not isinstance(word, str) or not word.isprintable() or " " in word or not word):
         raise InputError("ur_hash", f"found {shown(word)}", "a word such as calib_12788084448423163542")
     kinematics, tool = ur_kinematics(arm.robot, base)
-    word = word or hash_of(kinematics)
+    own = f"fg_calib_{sha256(repr(kinematics).encode()).hexdigest()[:16]}"  # which no controller has
     notes = [f"kinematics_parameters_file of ur_description; its frame {base} is the base of {arm.robot.name}"]
     values = frame_values("tool", tool)
     if max(map(abs, values.values())) > EXACT:
         words = ", ".join(f"{k} {_MM_DEG.from_si(v, 'm' if k in 'xyz' else 'rad'):.9g}" for k, v in values.items())
         notes.append(f"the tool is not in it: from tool0 it is at {words} (mm, deg; Rz(yaw) Ry(pitch) Rx(roll))")
-    if word.startswith("fg_calib_"):
+    if word is None:
         notes.append("the driver will say that the controller's hash is another: its own kinematics are")
-    text = _commented((*arm.comments, *notes), ur_text(kinematics, word))
-    details = {"base": base, "hash": word, "tool0_T_tool": tool.tolist()}
+    text = _commented((*arm.comments, *notes), dumped({"kinematics": {**kinematics, "hash": word or own}}))
+    details = {"base": base, "hash": word or own, "tool0_T_tool": tool.tolist()}
     return Export("ur", arm.robot.name, text, tuple(notes), details=details)
 
 

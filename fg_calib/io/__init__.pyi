@@ -40,9 +40,10 @@ from .saved import (
     write_calibration,
 )
 from .tables import Targets, joint_columns, read_joint_table, read_measurements, read_targets
-from .units import ANGLES, LENGTHS, Units, UnitsOfFile, quantity
 from .urdf import ROUNDING, encoding_of, read_urdf, urdf_text, write_urdf
 from .yaml import (
+    ANGLES,
+    LENGTHS,
     Bound,
     Count,
     FilePath,
@@ -50,7 +51,10 @@ from .yaml import (
     Number,
     Positive,
     Schema,
+    Units,
+    UnitsOfFile,
     first_misfit,
+    quantity,
     read_yaml,
     refuse_unknown_keys,
     shown,

@@ -74,15 +74,6 @@ def decoded(content: bytes, name: str) -> str:
     raise InputError(f"{name}:{line}", found, "UTF-8 text", "is it UTF-16, Latin-1 or Windows text? save it as UTF-8")
 
 
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file.
-
-    Raises:
-        InputError: There is no such file, or it may not be read.
-    """
-    return hashlib.sha256(read_bytes(path)).hexdigest()
-
-
 def exists(path: Path) -> bool:
     """Whether there is a file or folder; False for a name that no file can have."""
     with suppress(OSError, ValueError):
@@ -148,12 +139,13 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".fg-calib-", dir=folder, ignore_cleanup_errors=True) as made:
-            _write_to(Path(made), write, folder)
+            try:
+                write(Path(made))
+            except InputError as error:
+                place = error.place.replace(made, str(folder))
+                raise InputError(place, error.found, error.expected, error.hint) from error
             names = sorted((file.name for file in Path(made).iterdir()), key=lambda name: name == last)
             require_own(folder, own)
-            for name in names:
-                if (folder / name).is_dir():
-                    raise InputError(str(folder / name), "is a folder", "a place for a file")
             for name in set(own).difference(names):
                 (folder / name).unlink(missing_ok=True)
             for name in names:
@@ -165,15 +157,6 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
         for parent in missing:  # where nothing was written, they are empty
             with suppress(OSError, ValueError):
                 parent.rmdir()
-
-
-def _write_to(temporary: Path, write: Callable[[Path], None], folder: Path) -> None:
-    """Write files to a temporary folder; errors name the folder where they were to appear."""
-    try:
-        write(temporary)
-    except InputError as error:
-        place = error.place.replace(str(temporary), str(folder))
-        raise InputError(place, error.found, error.expected, error.hint) from error
 
 
 def require_writable(folder: Path) -> None:

@@ -146,20 +146,18 @@ class Table:
             InputError: It cannot be read, it has no rows, or `columns` does not fit.
         """
         require_polars(name)
-        given, of_csv = _as_frame_or_csv(table, name)
-        name = name if of_csv is None and not isinstance(table, os.PathLike | str) else Path(table).name
-        header = of_csv.header if of_csv is not None else given.columns
-        header = [column.strip() for column in header]
-        check_different(name if of_csv is None else f"{name}:1", header)
-        meant = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
-        if of_csv is not None:
+        with _one_line(name, "no table"):
+            given = _open(table, name)
+            header = [column.strip() for column in given.columns]
+            name = given.name if isinstance(given, _Csv) else name if _is_frame(table) else Path(table).name
+            check_different(name, header)
+            names = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
             numbers = {*(known or ()), *joints} - _OF_WORDS
-            with _one_line(name, "no table"):
-                given = of_csv.read([column in numbers for column in meant])
-        given.columns = meant
-        if not given.height:
+            frame = given.read([column in numbers for column in names]) if isinstance(given, _Csv) else given
+        frame.columns = names
+        if not frame.height:
             raise InputError(name, "no rows", "at least one")
-        return cls(name, tuple(meant), given, of_csv, dict(columns or {}))
+        return cls(name, tuple(names), frame, given if isinstance(given, _Csv) else None, dict(columns or {}))
 
     @property
     def separator(self) -> str:
@@ -273,29 +271,29 @@ class Table:
 
 @dataclass(frozen=True)
 class _Csv:
-    """A text of cells with a separator between, which its header tells.
-
-    Raises:
-        InputError: It is empty, or a quote is not closed.
-    """
+    """A text of cells with a separator between, which its header tells."""
 
     name: str
     text: str
-    separator: str = field(init=False)
-    header: Sequence[str] = field(init=False)
+    separator: str
+    columns: Sequence[str]
 
-    def __post_init__(self) -> None:
-        if '"' in self.text and self.text.count('"') % 2:
-            line = next(i for i, one in enumerate(self.text.splitlines(), start=1) if one.count('"') % 2)
-            raise InputError(f"{self.name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
-        first = re.search(r"[^\r\n]*[^\s,;][^\r\n]*", self.text)
+    @classmethod
+    def of(cls, name: str, text: str) -> _Csv:
+        """The CSV of a text.
+
+        Raises:
+            InputError: It is empty, or a quote is not closed.
+        """
+        if '"' in text and text.count('"') % 2:
+            line = next(i for i, one in enumerate(text.splitlines(), start=1) if one.count('"') % 2)
+            raise InputError(f"{name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
+        first = re.search(r"[^\r\n]*[^\s,;][^\r\n]*", text)
         if first is None:
-            raise InputError(f"{self.name}:1", "an empty file", "a header and rows")
+            raise InputError(f"{name}:1", "an empty file", "a header and rows")
         separator = max(",;\t", key=re.sub(r'"[^"]*"', "", first[0]).count)
-        header = next(csv.reader([first[0]], delimiter=separator))
-        header[0] = header[0].removeprefix("#")  # as numpy writes it
-        object.__setattr__(self, "separator", separator)
-        object.__setattr__(self, "header", header)
+        names = next(csv.reader([first[0].removeprefix("#")], delimiter=separator))  # as numpy writes it
+        return cls(name, text, separator, names)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
         """The line where each row begins, and its cells; the header first, rows of empty cells left out."""
@@ -321,18 +319,13 @@ class _Csv:
         """
         import polars as pl
 
-        n, text = len(are_numbers), self.text
+        n, text, separator = len(are_numbers), self.text, self.separator
         n_lines = text.count("\n") + (not text.endswith("\n"))
-        if (
-            '"' not in text
-            and text.count("\r") == text.count("\r\n")
-            and text.count(self.separator) == (n - 1) * n_lines
-        ):
+        is_plain = '"' not in text and text.count("\r") == text.count("\r\n")
+        if is_plain and text.count(separator) == (n - 1) * n_lines:
             schema = {str(i): pl.Float64 if is_number else pl.String for i, is_number in enumerate(are_numbers)}
             with suppress(pl.exceptions.PolarsError):
-                frame = pl.read_csv(
-                    text.encode(), separator=self.separator, schema=schema, has_header=False, skip_rows=1
-                )
+                frame = pl.read_csv(text.encode(), separator=separator, schema=schema, has_header=False, skip_rows=1)
                 if frame.height == n_lines - 1 and not frame.select(pl.all_horizontal(pl.all().is_null()).any()).item():
                     return frame
         rows = list(self.rows())[1:]
@@ -343,26 +336,29 @@ class _Csv:
         return pl.DataFrame([cells for _, cells in rows], {str(i): pl.String for i in range(n)}, orient="row")
 
 
-def _as_frame_or_csv(table: Path | str | Any, name: str) -> tuple[Any, _Csv | None]:
-    """The columns of a Parquet file or a frame, or else the text of a CSV.
+def _is_frame(table: Path | str | Any) -> bool:
+    return not isinstance(table, os.PathLike | str)
+
+
+def _open(table: Path | str | Any, name: str) -> pl.DataFrame | _Csv:
+    """The columns of a Parquet file or a frame, or else a CSV.
 
     Raises:
         InputError: It is missing, or is no table.
     """
     import polars as pl
 
-    if not isinstance(table, os.PathLike | str):
-        with _one_line(name, "no table"):
-            return _as_polars(table, name), None
+    if _is_frame(table):
+        return _as_polars(table, name)
     path = Path(table)
     content, ending = read_bytes(path), path.suffix.lower()
     if ending == ".csv":
-        return None, _Csv(path.name, decoded(content, path.name))
+        return _Csv.of(path.name, decoded(content, path.name))
     if ending not in (".parquet", ".pq"):
         hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
         raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
     with _one_line(path.name, "not a Parquet file"):
-        return pl.read_parquet(BytesIO(content)), None
+        return pl.read_parquet(BytesIO(content))
 
 
 def _understood(
@@ -435,15 +431,13 @@ def _one_line(name: str, what: str) -> Iterator[None]:
     Raises:
         InputError: It makes nothing of a table.
     """
+    import polars as pl
+
     try:
         yield
     except (InputError, MemoryError):
         raise
-    except BaseException as error:  # of a frame's objects polars may raise anything
-        if type(error).__name__ == "PanicException":
-            raise InputError(name, f"{what}: polars cannot read it", hint="write it anew") from None
-        if not isinstance(error, Exception):
-            raise
+    except (Exception, pl.exceptions.PanicException) as error:  # of a frame's objects polars may raise anything
         first = str(error).strip().partition("\n")[0]
         raise InputError(name, f"{what}: {first or type(error).__name__}") from None
 

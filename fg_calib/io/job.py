@@ -30,7 +30,6 @@ from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.columns import Column
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
 from fg_calib.io.tables import read_measurements, read_points
-from fg_calib.io.units import Units, UnitsOfFile, quantity
 from fg_calib.io.yaml import (
     Count,
     FilePath,
@@ -39,6 +38,9 @@ from fg_calib.io.yaml import (
     Positive,
     Schema,
     Seed,
+    Units,
+    UnitsOfFile,
+    quantity,
     read_yaml,
     refuse_unknown_keys,
     shown,

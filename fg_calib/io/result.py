@@ -17,17 +17,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import scipy
-from pydantic import (
-    AliasPath,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    WrapSerializer,
-)
+from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
 
-from fg_calib import __version__
+from fg_calib import __version__, statistics
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import SetupCheck
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale, Variables
@@ -38,18 +30,6 @@ from fg_calib.measurements import Table
 from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
 from fg_calib.prediction import ExpectedError
-from fg_calib.statistics import (
-    Acceptance,
-    CrossValidation,
-    FrameEstimate,
-    JointErrors,
-    KindFit,
-    LandmarkEstimate,
-    ParameterEstimate,
-    PredictedFit,
-    PriorFit,
-    ResidualTable,
-)
 
 SCHEMA = "fg-calib/result/2"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
@@ -266,28 +246,28 @@ class Result(Section):
     chi2_p_value: float | None = of("assessed.fit.chi_square.p_value", None)
     chi2_expected: Figure = of("assessed.fit.chi_square.expected", np.nan)
     chi2_bounds: tuple[Figure, Figure] = of("assessed.fit.chi_square.bounds", (np.nan, np.nan))
-    goodness: dict[str, KindFit] = {}
+    goodness: dict[str, statistics.KindFit] = {}
     suspect_level: Figure = of("assessed.fit.goodness.level", np.nan)
     suspect_configurations: tuple[SuspectConfiguration, ...] = ()
     evaluated_only: bool = of("problem.evaluated", False)
-    test: PredictedFit | None = of("assessed.fit.goodness.test", None)
-    acceptance: Acceptance | None = of("assessed.acceptance", None)
-    folds: CrossValidation | None = of("assessed.cross_validation", None)
-    priors: PriorFit | None = of("assessed.fit.priors", None)
+    test: statistics.PredictedFit | None = of("assessed.fit.goodness.test", None)
+    acceptance: statistics.Acceptance | None = of("assessed.acceptance", None)
+    folds: statistics.CrossValidation | None = of("assessed.cross_validation", None)
+    priors: statistics.PriorFit | None = of("assessed.fit.priors", None)
     expected_error: ExpectedError | None = of("assessed.expected_error", None)
     sigma_joint: Floats = of("problem.sigma_joint", np.zeros(0))
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
     tolerance_scales: tuple[ToleranceScale, ...] | None = of("solution.estimated_tolerances.scales", None)
     residual_rms: dict[str, dict[str, Rms | None]]
-    parameters: tuple[ParameterEstimate, ...] = of("assessed.estimates.parameters")
+    parameters: tuple[statistics.ParameterEstimate, ...] = of("assessed.estimates.parameters")
     covariance: Covariance = of("assessed")
     posterior: Posterior = of("assessed.whole")
     links: tuple[str, str] | None = None
-    frame_estimate: FrameEstimate | None = of("assessed.estimates.frame")
-    frames: dict[str, FrameEstimate] = {}
-    joint_values: JointErrors | None = of("assessed.estimates.joint_errors", None)
-    groups: tuple[LandmarkEstimate, ...] = of("assessed.estimates.landmarks", ())
+    frame_estimate: statistics.FrameEstimate | None = of("assessed.estimates.frame")
+    frames: dict[str, statistics.FrameEstimate] = {}
+    joint_values: statistics.JointErrors | None = of("assessed.estimates.joint_errors", None)
+    groups: tuple[statistics.LandmarkEstimate, ...] = of("assessed.estimates.landmarks", ())
     observability: Observability = of("assessed.identifiability")
     options: Options = of("problem.options")
     versions: dict[str, str] = {}
@@ -359,7 +339,7 @@ class Result(Section):
         return self.frame_estimate is not None or self.pairing is not None
 
     @property
-    def estimated(self) -> tuple[ParameterEstimate, ...]:
+    def estimated(self) -> tuple[statistics.ParameterEstimate, ...]:
         """The parameters that are not fixed."""
         return tuple(p for p in self.parameters if p.identifiability != "fixed")
 
@@ -398,7 +378,7 @@ class Result(Section):
         return document
 
 
-def key_of(fit: KindFit, fits: tuple[KindFit, ...]) -> str:
+def key_of(fit: statistics.KindFit, fits: tuple[statistics.KindFit, ...]) -> str:
     """A kind of noise, with the number of its table where several tables have that kind."""
     several = sum(other.kind == fit.kind for other in fits) > 1
     return f"{fit.kind}, table {fit.table + 1}" if several else fit.kind
@@ -426,7 +406,7 @@ def _pairing(problem: Problem) -> str | None:
     return "measured" if tables[0].measurements.pairs is not None else str(tables[0].pairing)
 
 
-def _noise_factors(solution: Solution, fits: tuple[KindFit, ...]) -> dict[str, Any]:
+def _noise_factors(solution: Solution, fits: tuple[statistics.KindFit, ...]) -> dict[str, Any]:
     """Factors of the estimated noise by key, and the keys of those that could not be estimated."""
     estimated = solution.estimated_noise
     if estimated is None:
@@ -439,7 +419,7 @@ def _noise_factors(solution: Solution, fits: tuple[KindFit, ...]) -> dict[str, A
     return {"noise_factors": factors, "noise_kept": tuple(kept)}
 
 
-def _residual_rms(table: ResidualTable) -> dict[str, dict[str, Rms | None]]:
+def _residual_rms(table: statistics.ResidualTable) -> dict[str, dict[str, Rms | None]]:
     """RMS by split and kind, by table too where several tables have a kind."""
     rms: dict[str, dict[str, Any]] = table.rms()
     kinds = list(dict.fromkeys(("position", "orientation", "distance", "angle", *table.families)))

@@ -25,7 +25,6 @@ from pydantic import Field
 
 from fg_calib.inputs import InputError, checked
 from fg_calib.io.atomic import write_text
-from fg_calib.io.units import Units, UnitsOfFile
 from fg_calib.io.urdf import read_urdf
 from fg_calib.io.yaml import (
     Bound,
@@ -33,6 +32,8 @@ from fg_calib.io.yaml import (
     Number,
     Positive,
     Schema,
+    Units,
+    UnitsOfFile,
     meaning,
     read_yaml,
     shown,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +20,7 @@ import numpy as np
 from fg_calib.assessment import Assessment
 from fg_calib.graph import Solution
 from fg_calib.inputs import InputError
-from fg_calib.io.atomic import digest_of, exists, fill_folder, read_bytes, require_own, write_text
+from fg_calib.io.atomic import exists, fill_folder, read_bytes, require_own, write_text
 from fg_calib.io.result import Result
 from fg_calib.io.robot_file import read_robot, write_robot
 from fg_calib.io.urdf import write_urdf
@@ -128,11 +129,11 @@ def joint_frame(found: JointErrors, solution: Solution) -> pl.DataFrame:
     suspect = np.zeros((n, k), dtype=np.bool_)
     for place in found.suspects:
         suspect[place] = True
-    units = [solution.problem.robot.joints[j].unit for j in found.joints]
+    joint, units = np.tile(np.arange(k), n), [solution.problem.robot.joints[j].unit for j in found.joints]
     columns = {
         "id": _coded(solution.problem.end_names, np.repeat(found.configurations + 1, k)),
-        "joint": _coded(found.names, np.tile(np.arange(k), n)),
-        "unit": _coded(units, np.tile(np.arange(k), n)),
+        "joint": _coded(found.names, joint),
+        "unit": _coded(units, joint),
         "reading": found.reading.ravel(),
         "estimate": (found.reading + found.error).ravel(),
         "error": found.error.ravel(),
@@ -165,7 +166,7 @@ def write_calibration(
         _write_robot(into, robot)
         for name, table in tables.items():
             table.write_parquet(into / name) if name.endswith(".parquet") else table.write_csv(into / name)
-        digests = {name: digest_of(into / name) for name in tables}
+        digests = {name: sha256(read_bytes(into / name)).hexdigest() for name in tables}
         document = result.model_copy(update={"files": digests}).document()
         texts = {**pages, "result.json": json.dumps(document, indent=1, allow_nan=False) + "\n"}
         for name, text in texts.items():
@@ -219,10 +220,10 @@ def read_table(folder: Path, name: str, result: Result) -> pl.DataFrame | None:
     file = next((folder / f"{name}.{e}" for e in ("csv", "parquet") if exists(folder / f"{name}.{e}")), None)
     if file is None:
         return None
-    if digest_of(file) != result.files.get(file.name):
+    content = read_bytes(file)
+    if sha256(content).hexdigest() != result.files.get(file.name):
         raise InputError(str(file), "changed, or of another calibration", "the files of one calibration")
     words = dict.fromkeys(("id", "kind", "a", "b", "split", "excluded", "unit", "flag", "table", "of"), pl.String)
-    content = read_bytes(file)
     return pl.read_parquet(content) if file.suffix == ".parquet" else pl.read_csv(content, schema_overrides=words)
 
 

@@ -27,7 +27,7 @@ from fg_calib.inputs import (
     once,
 )
 from fg_calib.io.columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of
-from fg_calib.io.units import Units
+from fg_calib.io.yaml import Units
 from fg_calib.measurements import (
     GENERIC_COLUMNS,
     INSTRUMENTS,

@@ -200,22 +200,17 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
 def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> None:
     """Give a joint's element attributes with these numbers; 0 is what a missing one means."""
     element = joint.find(tag)
-    words, changed = {}, []
     for name, numbers in wanted.items():
-        given = None if element is None else element.get(name)
-        read = [0.0] * len(numbers) if given is None else _figures(given)
-        pairs = zip(read or [math.nan] * len(numbers), numbers, strict=True)
-        kept = [was if abs(was - number) <= ROUNDING else float(number) for was, number in pairs]
-        words[name] = " ".join(map(repr, kept))
-        if kept != read:
-            changed.append(name)
-    if element is None and changed:
-        element = joint.makeelement(tag, dict(words))
-        element.tail = joint.text
-        joint.insert(0, element)
-    for name in changed:
-        if element is not None:
-            element.set(name, words[name])
+        given = (
+            [0.0] * len(numbers) if element is None or name not in element.attrib else _figures(element.get(name, ""))
+        )
+        if len(given) == len(numbers) and max(abs(a - b) for a, b in zip(given, numbers, strict=True)) <= ROUNDING:
+            continue
+        if element is None:
+            element = joint.makeelement(tag)
+            element.tail = joint.text
+            joint.insert(0, element)
+        element.set(name, " ".join(repr(float(number)) for number in numbers))
 
 
 def _parse(data: bytes, place: str) -> tuple[str, Element]:

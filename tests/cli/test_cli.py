@@ -19,8 +19,7 @@ from typer.testing import CliRunner
 
 from fg_calib import __version__, cli, read_robot
 from fg_calib.cli import entry
-from fg_calib.io import read_measurements
-from fg_calib.io.units import Units
+from fg_calib.io import Units, read_measurements
 
 JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"
 OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv", "configurations.csv"}

@@ -11,8 +11,8 @@ from oracle import dh_joint, frame, tool_pose
 from tolerances import rounding
 
 from fg_calib.inputs import InputError
+from fg_calib.io import Units
 from fg_calib.io.robot_file import read_robot, write_robot
-from fg_calib.io.units import Units
 from fg_calib.robot.model import CONVENTIONS, Axis, Element, Joint, Robot, RobotBuilder
 
 GOOD = """\
@@ -167,20 +167,3 @@ estimate: [tool.z]
 tolerance: {base.yaw: 3.0, a: 1.0, alpha: 0.5, d2: 2.0, tool: 5.0}
 """
     )
-
-
-ROW = "  - {a: 0, alpha: 0, d: 0, theta: 0}\n"
-HEAD = "convention: dh\njoints:\n"
-
-
-def test_links_are_for_urdfs(tmp_path):
-    (tmp_path / "robot.yaml").write_text(GOOD)
-    with pytest.raises(InputError) as caught:
-        read_robot(tmp_path / "robot.yaml", tip_link="flange")
-    assert str(caught.value) == (
-        "robot.yaml: a robot without links, expected a URDF; base_link and tip_link name links of one"
-    )
-
-
-def test_a_byte_order_mark_is_tolerated(tmp_path):
-    assert read(tmp_path, b"\xef\xbb\xbf" + GOOD.encode()) == read(tmp_path, GOOD)
