@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib.assessment import Assessment, assess, solve_job
-from fg_calib.graph import SIZE, Knowledge, Solution, build_variables, frame_of, tables_of
+from fg_calib.graph import SIZE, Knowledge, Solution, Variables, build_variables, frame_of, tables_of
 from fg_calib.inputs import (
     Floats,
     InputError,
@@ -702,11 +702,22 @@ def _posterior(robot: Robot, result: Result, place: str) -> TangentCovariance:
     unknown = [int(symbol[2:-1]) for symbol in result.frames]
     variables = build_variables(robot, [t in unknown for t in range(max(unknown, default=0) + 1)], False)
     saved, n = result.posterior, variables.n_columns
-    if saved.variables != {v.symbol: tuple(variables.names[v.columns]) for v in variables.items}:
-        raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
     values = np.concatenate([[p.estimate for p in result.parameters], *poses])
+    if saved is None and tuple(variables.names) == result.covariance.names:
+        return _posterior_of_names(variables, values, result.covariance.matrix)
+    if saved is None or saved.variables != {v.symbol: tuple(variables.names[v.columns]) for v in variables.items}:
+        raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
     matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
     return TangentCovariance(variables, values, *(matrix.reshape(len(matrix), n) for matrix in matrices))
+
+
+def _posterior_of_names(variables: Variables, values: Floats, covariance: Floats) -> TangentCovariance:
+    """The covariance of the parameters in the tangent space; what has no variance counts as undetermined."""
+    E, unknown = variables.tangent_derivative(values), np.isnan(np.diag(covariance))
+    loose = (E @ np.eye(len(covariance))[:, unknown]).T / variables.scales
+    loose /= np.linalg.norm(loose, axis=1, keepdims=True)
+    tangent = E @ np.where(unknown[:, None] | unknown, 0.0, covariance) @ E.T
+    return TangentCovariance(variables, values, tangent, loose, loose)
 
 
 def _knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:

@@ -129,7 +129,7 @@ _OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
 
 class _JobKeys(_TableKeys):
     robot: Any
-    measurements: FilePath | Annotated[list[dict[str, Any]], Field(min_length=1)]
+    measurements: Any
     accept: Any = None
     truth: FilePath | None = None
     targets: Mapping[str, _Point] = Field(default_factory=dict)
@@ -272,6 +272,8 @@ def _tables(given: Mapping[str, Any], file: Any, robot: Robot, path: Path) -> li
         path: The job's file.
     """
     entries, places = file.measurements, [path.name]
+    if not entries or not isinstance(entries, str | list):
+        raise InputError(f"{path.name}: measurements", f"found {shown(entries)}", "a path, or a list of tables")
     if isinstance(entries, str):
         entries = [{"table": entries}]
     elif file.pairs is not None:
@@ -279,7 +281,8 @@ def _tables(given: Mapping[str, Any], file: Any, robot: Robot, path: Path) -> li
     else:
         places = [f"{path.name}: measurement {i}" for i in range(1, len(entries) + 1)]
     defaults = {key: given[key] for key in _TableKeys.model_fields if key in given}
-    read = [validate(_Entry, defaults | dict(one), place) for one, place in zip(entries, places, strict=True)]
+    whole = [defaults | one if isinstance(one, dict) else one for one in entries]
+    read = [validate(_Entry, one, place) for one, place in zip(whole, places, strict=True)]
     points: list[str] = []  # of all tables, as pairs may name those of another
     if len(read) > 1 and any(entry.pairs is not None for entry in read):
         for entry in read:

@@ -31,7 +31,7 @@ from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
 from fg_calib.prediction import ExpectedError
 
-SCHEMA = "fg-calib/result/2"
+SCHEMA, FORMER_SCHEMA = "fg-calib/result/2", "fg-calib/result/1"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
 
 KINDS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
@@ -262,7 +262,7 @@ class Result(Section):
     residual_rms: dict[str, dict[str, Rms | None]]
     parameters: tuple[statistics.ParameterEstimate, ...] = of("assessed.estimates.parameters")
     covariance: Covariance = of("assessed")
-    posterior: Posterior = of("assessed.whole")
+    posterior: Posterior | None = of("assessed.whole")
     links: tuple[str, str] | None = None
     frame_estimate: statistics.FrameEstimate | None = of("assessed.estimates.frame")
     frames: dict[str, statistics.FrameEstimate] = {}
@@ -476,6 +476,8 @@ def read_result(path: Path | str) -> Result:
         raise InputError(str(file), f"not JSON: {str(error).partition(';')[0]}", hint="was it cut off?") from None
     if not isinstance(document, dict) or not str(document.get("schema")).startswith("fg-calib/result/"):
         raise InputError(str(file), "no result of a calibration", f"a result.json of schema {SCHEMA}")
+    if document["schema"] == FORMER_SCHEMA:
+        document = _upgraded(document)
     if document["schema"] != SCHEMA:
         raise InputError(str(file), f"schema {document['schema']}", SCHEMA, "calibrate its job again")
     try:
@@ -489,14 +491,27 @@ def read_result(path: Path | str) -> Result:
     return result
 
 
+def _upgraded(document: dict[str, Any]) -> dict[str, Any]:
+    """A document of version 1: the posterior is the parameters' covariance, what version 2 added is unknown."""
+    solver, found = document.get("solver"), document.get("observability")
+    more = {key: document.get(key) for key in ("robot", "n_configurations")}
+    return {
+        "trustworthy": isinstance(solver, dict) and solver.get("converged"),
+        "options": {},
+        "posterior": None,
+        **document,
+        "schema": SCHEMA,
+        "observability": more | found if isinstance(found, dict) else found,
+    }
+
+
 def _stated_twice(result: Result) -> Iterator[tuple[str, Any, Any]]:
     """What a result says in two places: the key, what it says there, and what the rest says."""
     names, known = result.covariance.names, {p.name for p in result.parameters}
-    n_tangent = sum(map(len, result.posterior.variables.values()))
-    for key, M, n in (
-        ("covariance", result.covariance.matrix, len(names)),
-        ("posterior: covariance", result.posterior.covariance, n_tangent),
-    ):
+    matrices = [("covariance", result.covariance.matrix, len(names))]
+    if (posterior := result.posterior) is not None:
+        matrices.append(("posterior: covariance", posterior.covariance, sum(map(len, posterior.variables.values()))))
+    for key, M, n in matrices:
         yield f"{key}: shape", M.shape if M.size else (0, 0), (n, n)
         variances = np.diag(M) if n else np.zeros(0)
         rounding = 1e-9 * np.nanmin(np.abs(variances), initial=1.0)

@@ -201,10 +201,9 @@ def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> Non
     """Give a joint's element attributes with these numbers; 0 is what a missing one means."""
     element = joint.find(tag)
     for name, numbers in wanted.items():
-        given = (
-            [0.0] * len(numbers) if element is None or name not in element.attrib else _figures(element.get(name, ""))
-        )
-        if len(given) == len(numbers) and max(abs(a - b) for a, b in zip(given, numbers, strict=True)) <= ROUNDING:
+        given = None if element is None else element.get(name)
+        read = [0.0] * len(numbers) if given is None else _figures(given)
+        if len(read) == len(numbers) and max(abs(a - b) for a, b in zip(read, numbers, strict=True)) <= ROUNDING:
             continue
         if element is None:
             element = joint.makeelement(tag)

@@ -112,13 +112,3 @@ def test_what_is_no_file_is_one_line(tmp_path, make, message):
         read_bytes(make(tmp_path))
     assert message in str(error.value)
     assert len(str(error.value)) < 300
-
-
-@pytest.mark.parametrize("name", ["residuals.csv", "result.json"])
-def test_results_replace_results_and_nothing_else(example, fg_calib, name):
-    (example / name).write_text("q1,mine\n")
-    before = {file.name: file.read_bytes() for file in example.iterdir()}
-    ended = fg_calib("calibrate", example / "calibration.yaml", "--out", example)
-    expected = f"error: {example / name}: is there already, not written by this command, expected another folder\n"
-    assert ended == (1, "", expected)
-    assert {file.name: file.read_bytes() for file in example.iterdir()} == before

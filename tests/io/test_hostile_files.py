@@ -1,13 +1,10 @@
 """Files as an enemy would write them: one line for each, and what was asked for is read, not what a name looks like."""
 
-import hashlib
-import shutil
-
 import numpy as np
 import polars as pl
 import pytest
 
-from fg_calib import InputError, Robot, read_job
+from fg_calib import InputError, Robot
 from fg_calib.inputs import ORDINARY
 from fg_calib.io import read_measurements
 
@@ -69,19 +66,6 @@ def test_cells_of_several_types_are_all_read(tmp_path):
     found = read_measurements(columns | {"q3": [0.5, 0.75]}, ARM)
     assert found.readings.tolist() == [[1.0, 0.25, 0.5], [0.5, 1.0, 0.75]]
     assert found.ids.tolist() == ["1", "b"]
-
-
-def test_a_name_is_no_pattern(example):
-    """A folder `run[1]` is not `run1`, and what is hashed is what was read."""
-    odd, plain = example.with_name("run[1]"), example.with_name("run1")
-    shutil.copytree(example, plain)
-    example.rename(odd)
-    text = (plain / "poses.csv").read_text()
-    (plain / "poses.csv").write_text(text.replace("p0,", "q0,", 1))
-    job = read_job(odd / "calibration.yaml")
-    assert job.measurements.ids[0] == "p0"
-    assert job.inputs["poses.csv"] == hashlib.sha256((odd / "poses.csv").read_bytes()).hexdigest()
-    assert sorted(job.inputs) == ["calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"]
 
 
 def test_columns_that_look_as_if_they_were_used_are_told_of(tmp_path, caplog):

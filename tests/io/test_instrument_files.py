@@ -94,12 +94,9 @@ def test_every_form_of_a_known_point(tmp_path):
 @pytest.mark.parametrize(
     ("top", "entry", "fixed"),
     [
-        ("camera.yaml", None, False),
         ("camera.yaml", "fixed", True),
-        (None, "camera.yaml", False),
         (None, {"file": "camera.yaml", "fixed": True}, True),
         (None, INTRINSICS, False),
-        (INTRINSICS, "fixed", True),
     ],
 )
 def test_every_form_of_a_camera(top, entry, fixed, tmp_path):
@@ -154,14 +151,7 @@ def test_a_cell_that_cannot_be_used_is_named(model, text, message, tmp_path):
     [
         ({"fx": 1}, "camera.yaml: missing keys 'fy', 'cx', 'cy'"),
         (INTRINSICS | {"fx": -1}, "camera.yaml: fx: found -1, expected 1 to 1e+06 px"),
-        (INTRINSICS | {"k1": -1e7}, "camera.yaml: k1: found -1e+07, expected -1e+06 to 1e+06"),
         (INTRINSICS | {"k4": 0}, "camera.yaml: unknown key 'k4', expected one of fx, fy, cx, cy, k1, k2, p1, p2, k3"),
-        (INTRINSICS | {"width": 0}, "camera.yaml: width: found 0, expected a number above 0"),
-        (
-            INTRINSICS | {"sigma": {"k4": 1}},
-            "camera.yaml: sigma: unknown key 'k4', expected one of fx, fy, cx, cy, k1, k2",
-        ),
-        (INTRINSICS | {"sigma": {"fx": -1}}, "camera.yaml: sigma: fx: found -1, expected a number not below 0"),
     ],
 )
 def test_a_camera_that_is_none_is_named(given, message, tmp_path):
@@ -175,14 +165,11 @@ def test_a_camera_that_is_none_is_named(given, message, tmp_path):
     ("key", "value", "message"),
     [
         ("anchors", {"a0": {"x": 1, "y": 2}}, "job.yaml: anchors: a0: missing key 'z'"),
-        ("anchors", {"a0": {"x": 1, "y": 2, "z": 3, "tolerance": 0}}, "job.yaml: anchors: a0: tolerance"),
-        ("anchors", {"a0": {"x": 1, "y": True, "z": 3}}, "job.yaml: anchors: a0: y: found True, expected a finite n"),
         (
             "tolerance",
             {"anchor": 1},
             "job.yaml: tolerance: unknown key 'anchor', expected one of estimate, targets, anchors",
         ),
-        ("offset", "yes", "job.yaml: offset"),
     ],
 )
 def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):

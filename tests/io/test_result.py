@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulated import measure, small_arm, true_robot, write_job
+from simulated import measure, small_arm, true_robot
 
-from fg_calib import Calibration, InputError, Pairing, calibrate, calibrate_job
-from fg_calib.io import read_result, read_urdf
+from fg_calib import Calibration, InputError, Pairing, calibrate
+from fg_calib.io import read_result
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -110,7 +110,6 @@ def move(parameter):
         (lambda f: (f / "result.json").write_text("{"), "result.json: not JSON: .*; was it cut off?"),
         (lambda f: (f / "result.json").write_text("[]"), "result.json: no result of a calibration, expected"),
         (lambda f: (f / "result.json").unlink(), "no result.json in this folder"),
-        (lambda f: changed(f, lambda d: d.update(schema="fg-calib/result/1")), "schema fg-calib/result/1, expected"),
         (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
         (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
@@ -144,19 +143,28 @@ def test_there_must_be_something_to_read(tmp_path):
         read_result(tmp_path / "nowhere")
 
 
-def test_a_urdf_with_several_tips_is_loaded_by_its_links(tmp_path):
-    joint = '<joint name="{0}" type="{3}"><parent link="{1}"/><child link="{2}"/><origin xyz="0.3 0.1 0.2"/></joint>'
-    joints = [("j1", "base", "a", "continuous"), ("j2", "a", "tip", "continuous"), ("j3", "a", "camera", "fixed")]
-    links = "".join(f'<link name="{name}"/>' for name in ("base", "a", "tip", "camera"))
-    urdf = f'<robot name="arm">{links}{"".join(joint.format(*j) for j in joints)}</robot>'
-    (tmp_path / "arm.urdf").write_text(urdf)
-    robot = read_urdf(tmp_path / "arm.urdf", tip_link="tip", tolerance={"x": 1e-3, "yaw": 1e-3})
-    rng = np.random.default_rng(2)
-    m = measure(true_robot(robot, rng), 30, rng)
-    path = write_job(tmp_path, small_arm(), m, model="pose")
-    path.write_text(path.read_text().replace("robot: robot.yaml", "robot: {urdf: arm.urdf, tip_link: tip}"))
-    calibrate_job(path).save(tmp_path / "result")
-    assert not (tmp_path / "result" / "robot_calibrated.yaml").exists()
-    found = Calibration.load(tmp_path / "result")
-    assert found.robot.urdf.tip_link == "tip"
-    assert found.robot.nominal == pytest.approx([p.estimate for p in found.parameters.values()], abs=1e-15)
+def test_version_1_is_readable_with_no_more_than_it_promised(folder):
+    before = Calibration.load(folder)
+    now = {"trustworthy", "posterior", "options", "frames", "goodness", "carried", "history", "files", "expected_error"}
+    (folder / "residuals.csv").unlink()
+    (folder / "configurations.csv").unlink()
+
+    def to_version_1(document):
+        for key in document.keys() - PROMISED:
+            del document[key]
+        for key in ("robot", "n_configurations", "lost", "fixed", "missing", "with_fixed_known", "kept"):
+            document["observability"].pop(key, None)
+        document |= {"schema": "fg-calib/result/1", "of a later day": 1}
+
+    assert not now & PROMISED
+    changed(folder, to_version_1)
+    found = Calibration.load(folder)
+    assert found.parameters == before.parameters
+    assert "position" in str(found)
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 4))
+    new, old = before.predict(q), found.predict(q)
+    # Nothing is undetermined here: equal to rounding of sums of 16 terms.
+    assert old.covariance == pytest.approx(new.covariance, rel=1e-9, abs=1e-12 * np.abs(new.covariance).max())
+    for refused in (found.check, found.update):
+        with pytest.raises(InputError, match=r"new\.csv: the calibration does not say how its tables were read"):
+            refused(folder / "new.csv")

@@ -70,14 +70,6 @@ def test_the_chain_is_base_then_joints_then_tool(tmp_path):
     assert tool_pose(robot, q) == pytest.approx(expected, abs=rounding(1.0))  # rounding of a few products
 
 
-def test_beta_may_be_left_out_and_units_default_to_si(tmp_path):
-    robot = read(tmp_path, "convention: dh-hayati\njoints: [{a: 1, alpha: 2, d: 3, theta: 4}]\n", "arm.yaml")
-    assert robot.name == "arm"
-    assert robot.joints == (Joint("q1"),)
-    values = {p.name: p.nominal for p in robot.parameters if p.owner == 1}
-    assert values == {"theta1": 4.0, "d1": 3.0, "a1": 1.0, "alpha1": 2.0, "beta1": 0.0}
-
-
 numbers = st.floats(-12.0, 12.0)  # angles of more than two turns are taken for degrees
 positive = st.floats(1e-9, 1e3)
 words = st.from_regex(r"[a-z][a-z0-9_.\- ]{0,8}", fullmatch=True) | st.sampled_from(["on", "1e-3", "null", "ünï", "7"])
@@ -109,14 +101,6 @@ def robots(draw):
 
 
 @pytest.mark.slow
-@given(robot=robots())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_a_robot_written_in_si_reads_back_the_same(tmp_path, robot):
-    write_robot(tmp_path / "robot.yaml", robot)
-    assert read_robot(tmp_path / "robot.yaml") == robot
-
-
-@pytest.mark.slow
 @given(
     robot=robots(), length=st.sampled_from(["m", "cm", "mm", "um", "in"]), angle=st.sampled_from(["rad", "deg", "mrad"])
 )
@@ -124,6 +108,8 @@ def test_a_robot_written_in_si_reads_back_the_same(tmp_path, robot):
 def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, robot, length, angle):
     write_robot(tmp_path / "robot.yaml", robot, units=Units(length=length, angle=angle))
     back = read_robot(tmp_path / "robot.yaml")
+    if (length, angle) == ("m", "rad"):
+        assert back == robot
     # one division and one multiplication: an ulp of each
     assert back.nominal == pytest.approx(robot.nominal, rel=4.5e-16, abs=1e-300)
     assert back.limits == pytest.approx(robot.limits, rel=4.5e-16, abs=1e-300)

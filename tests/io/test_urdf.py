@@ -61,11 +61,6 @@ def yourdfpy_pose(path, base, tip, q):
     return model.get_transform(tip, base)
 
 
-def test_the_tip_defaults_to_the_only_leaf_below_the_base(tree):
-    robot = read_urdf(tree, base_link="right_1")
-    assert (robot.urdf.base_link, robot.urdf.tip_link) == ("right_1", "right_tip")
-
-
 def test_joints_stand_in_chain_order_with_their_own_parameters_and_limits(tree):
     robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
     assert robot.joints == (
@@ -197,19 +192,7 @@ def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
     )
 
 
-JUNK = [
-    '<transmission name="t"><joint name="r1"><mechanicalReduction>100</mechanicalReduction></joint></transmission>',
-    '<gazebo reference="r1"><link name="inside"/><joint name="r1" type="screw"/></gazebo>',
-]
 """What yourdfpy reads, refuses or skips, and what says nothing of the chain."""
-
-
-@pytest.mark.parametrize("junk", JUNK, ids=range(len(JUNK)))
-def test_only_links_and_joints_of_the_robot_itself_are_read(tree, tmp_path, junk):
-    path = tmp_path / "junk.urdf"
-    path.write_text(TREE.replace('  <joint name="r1"', f'{junk}\n  <joint name="r1"'))
-    robot, plain = (read_urdf(p, base_link="left_1", tip_link="right_tip") for p in (path, tree))
-    assert (robot.joints, robot.parameters, robot.elements) == (plain.joints, plain.parameters, plain.elements)
 
 
 def random_urdf(rng):
