@@ -69,7 +69,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
         CALIBRATE,
         "poses.csv:4: q2: found 'abc', expected a finite number",
     ),
-    "an unknown key": (replaced(JOB, "^pairing", "pairng"), CALIBRATE, "unknown key 'pairng', expected one of robot,"),
+    "an unknown key": (replaced(JOB, "^pairing", "pairng"), CALIBRATE, "unknown key 'pairng', expected one of pairs,"),
     "degrees read as radians": (
         replaced(JOB, "angle: deg", "angle: rad"),
         CALIBRATE,
