@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
@@ -67,6 +67,10 @@ class SchurComplement:
 
     loadings: Sparse
     width: int = 1
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but factors, which functions hold."""
+        return {"loadings": self.loadings, "width": self.width}
 
     @property
     def n_states(self) -> int:
