@@ -171,7 +171,7 @@ def said_by_all_rows(job, plan):
     return Posterior(every, square_root(every, every.start)[:, :-1]).error(plan.task).position
 
 
-@pytest.mark.parametrize("n", [1, 5])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 5])
 def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
     """Distances between sockets that the plan asks for count, and no others."""
     job = job_of(Instrument(model="distance", name="it", sockets=5), RandomReadings(12))

@@ -82,10 +82,9 @@ def test_relations_say_what_moves_together():
 
 
 def test_indices_follow_their_formulas():
-    s = np.array([8.0, 4.0, 2.0])
-    assert observability_indices(s, 4) == pytest.approx(
-        {"O1": 4.0 / 2, "O2": 0.25, "O3": 2.0, "O4": 0.5, "O5": 1 / 0.875}
-    )
+    s = np.array([9.0, 8.0, 3.0])
+    expected = {"O1": 6.0 / 2, "O2": 1 / 3, "O3": 3.0, "O4": 1.0, "O5": 1 / (1 / 9 + 1 / 8 + 1 / 3)}
+    assert observability_indices(s, 4) == pytest.approx(expected)
     assert observability_indices(np.array([]), 4)["O3"] == 0.0
 
 
