@@ -142,7 +142,7 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
     table = Table.read(path, "table")
     headers = [_HEADER.match(column) for column in table.columns]
     bare = [match["name"].lower() if match else c.lower() for match, c in zip(headers, table.columns, strict=True)]
-    stated = [(match["bracket"] or match["suffix"]).lower() if match else "" for match in headers]
+    written = [(match["bracket"] or match["suffix"]).lower() if match else "" for match in headers]
     joints = _find_joints(bare, robot)
     is_pairs = not joints and {"a", "b"} <= set(bare)
     if not joints and not is_pairs:
@@ -162,12 +162,12 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
     units, guessed = dict[str, str](), list[str]()
     for kind, (possible, *_) in _UNITS.items():
         of_kind = {name: k for name, k in every.items() if kinds.get(name) == kind}
-        there = {_SPELLINGS.get(stated[k], stated[k]) for k in of_kind.values() if stated[k]}
+        there = {_SPELLINGS.get(written[k], written[k]) for k in of_kind.values() if written[k]}
         if len(there) > 1 or not there <= possible.keys():
             raise InputError(table.name, f"{kind}s in {', '.join(sorted(there))}", f"one of {', '.join(possible)}")
         if of_kind:
             units[kind] = there.pop() if there else _guess_unit(table, kind, of_kind)
-            guessed += [kind] if not any(stated[k] for k in of_kind.values()) else []
+            guessed += [kind] if not any(written[k] for k in of_kind.values()) else []
     present = tuple(name for name in every if name not in joints)
     return _Recognised(
         path=path,

@@ -723,7 +723,7 @@ class Scenario(Brief):
         frame: world_T_base, in whose world the poses are measured: `base` is the base itself, `unknown` an arbitrary
             one, drawn.
         validation: Where it is measured to test the calibration; None without test rows.
-        stated_noise: Values that the calibration is given instead of the true ones; None where these are given.
+        specified_noise: Values that the calibration is given instead of the true ones; None where these are given.
         job: Other keys of the calibration job, such as model and pairing.
         length_unit: Unit of length of the job's files.
         angle_unit: Unit of angles of the job's files.
@@ -738,7 +738,7 @@ class Scenario(Brief):
     noise: InNoise
     frame: Frame = "unknown"
     validation: InConfigurations | None = None
-    stated_noise: Noise | None = None
+    specified_noise: Noise | None = None
     job: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({"model": "distance-rotation"}))
     length_unit: LengthUnit = "m"
     angle_unit: AngleUnit = "rad"
@@ -794,10 +794,10 @@ def read_scenario(path: Path | str) -> Scenario:
     file = validate(_ScenarioInFile, read_yaml(path), source)
     robot = robot_of(file.robot, f"{source}: robot", path.parent, file.units)
     context = FileContext(file.units, path.parent, robot)
-    job, stated = _read_job(file, source, context)
+    job, specified = _read_job(file, source, context)
     given = {
         **{key: getattr(file, key) for key in ("errors", "configurations", "noise", "frame", "validation")},
-        **{"robot": robot, "job": job, "stated_noise": stated, "source": source},
+        **{"robot": robot, "job": job, "specified_noise": specified, "source": source},
         **{"length_unit": file.units.length, "angle_unit": file.units.angle, "name": file.name or Path(source).stem},
         "instruments": _complete(file.instruments or (), source, path.parent),
     }

@@ -153,7 +153,7 @@ class Measuring:
         self.place = f"{self.scenario.source}: instruments: {self.name}"
         self.places = self.generator("places")
         self.noises = override_noise(self.scenario.noise, self.instrument.noise)
-        self.sigmas = override_noise(self.noises, self.scenario.stated_noise)
+        self.sigmas = override_noise(self.noises, self.scenario.specified_noise)
 
     def measure(self) -> tuple[Table, Truth]:
         """Measure: a table, and where landmarks truly are.
@@ -210,7 +210,7 @@ class Measuring:
             readings=visits.readings,
             ids=visits.ids,
             test=visits.test,
-            sigma_joint=joint_sigma(self.scenario.stated_noise or self.scenario.noise, self.scenario.robot),
+            sigma_joint=joint_sigma(self.scenario.specified_noise or self.scenario.noise, self.scenario.robot),
             source=f"{self.name}.csv",
             named=True,
             **nothing | measured,

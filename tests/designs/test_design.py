@@ -100,7 +100,7 @@ def test_what_no_candidate_determines_is_reported():
 def job_of(instrument, configurations, stated=NOISE, **changes):
     """A job of what the nominal arm shows at some configurations."""
     given = {"configurations": configurations, "errors": Errors("values", {}), "noise": SILENT}
-    of = scenario(instrument, stated_noise=stated, **given | changes)
+    of = scenario(instrument, specified_noise=stated, **given | changes)
     tables = simulate(of).tables
     return Job(None, of.robot, tables, Options(tables[0].model))
 

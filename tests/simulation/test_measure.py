@@ -21,7 +21,7 @@ from fg_calib.simulation import Instrument, Placement, RandomReadings, Spot, wri
 def exact(which):
     """What an instrument measures without noise, the truth, and the true tool frames, 4x4."""
     n = {"pixels": 400, "camera in the room": 60, "faces": 12}.get(which, 40)
-    of = scenario(INSTRUMENTS[which], n=n, noise=EXACT, stated_noise=SIGMA, validation=RandomReadings(7))
+    of = scenario(INSTRUMENTS[which], n=n, noise=EXACT, specified_noise=SIGMA, validation=RandomReadings(7))
     s = simulate(of)
     m = s.tables[0].measurements
     return m, s.truth, np.stack([tool_pose(s.true_robot, q) for q in m.readings])
@@ -216,7 +216,7 @@ def same(a, b, *names):
 def test_the_same_configuration_has_the_same_joint_errors_in_all_tables():
     """Instruments without noise of their own, of an arm whose encoders have some."""
     one, wire = Instrument(model="position", name="one", frame="base"), Instrument(model="anchor", name="wire")
-    of = scenario(one, replace(one, name="two"), wire, noise=replace(EXACT, joint=1e-3), stated_noise=SIGMA)
+    of = scenario(one, replace(one, name="two"), wire, noise=replace(EXACT, joint=1e-3), specified_noise=SIGMA)
     s = simulate(of)
     first, second, wire = (table.measurements for table in s.tables)
     assert first.ids.tolist() == second.ids.tolist() == wire.ids.tolist()

@@ -100,7 +100,6 @@ def test_the_shipped_scenario_is_the_papers(tmp_path, monkeypatch):
     ("errors", "expected"),
     [
         ("{uniform: {a: 10, alpha: 2, a2: 5}}", Errors("uniform", {"a1": 0.01, "a2": 0.005, "alpha1": 2, "alpha2": 2})),
-        ("{uniform: {}}", Errors("uniform", {})),
         ("{normal: {d: 10, tool.yaw: 3, tool.x: 4}}",
          Errors("normal", {"d1": 0.01, "d2": 0.01, "tool.x": 0.004, "tool.yaw": 3})),
         ("{values: {a2: -3, theta1: -1}}", Errors("values", {"a2": -0.003, "theta1": -1})),
@@ -137,9 +136,9 @@ def test_a_job_may_state_another_noise_than_the_true_one(folder):
     assert s.job == {"model": "pose", "gauge": "keep", "prefer": ["d2"]}
     assert (s.noise.position, s.noise.joint) == (1e-6, (0.0, 0.0))
     assert s.noise.orientation == pytest.approx(math.radians(0.002))
-    assert s.stated_noise.position is None
-    assert s.stated_noise.orientation == pytest.approx(math.radians(0.5))
-    assert s.stated_noise.joint == pytest.approx((math.radians(1), 2e-3))
+    assert s.specified_noise.position is None
+    assert s.specified_noise.orientation == pytest.approx(math.radians(0.5))
+    assert s.specified_noise.joint == pytest.approx((math.radians(1), 2e-3))
 
 
 def test_a_tracker_has_every_value_in_the_units_of_the_file(folder):
@@ -221,24 +220,18 @@ MISTAKES = [
     ("robot: robot.yaml\n", "missing keys 'configurations', 'noise'"),
     (replaced("{uniform: {a: 0.01}}", "{uniform: {a: 1}, values: {a: 1}}"),
      "errors: found uniform and values, expected one of uniform, normal, values"),
-    (replaced("a: 0.01", "a: -1"), "errors: uniform: a: found -1, expected a number not below 0"),
     (replaced("uniform: {a: 0.01}", "values: {b2: 1}"),
      "errors: values: unknown parameter or kind 'b2', expected one of a, alpha, base, d, theta, tool, base.x, base.y, "
      "base.z, base.yaw, base.pitch, base.roll, ..."),
     (replaced("{random: {count: 3}}", "{}"),
      "configurations: found none, expected one of board, tracker, random, table"),
-    (replaced("count: 3", "n: 3"),
-     "configurations: random: unknown key 'n', expected one of keep_out, apart, count"),
     (with_board("distance: [2, 1]"),
      "configurations: board: distance: found [2.0, 1.0], expected the smaller one first"),
     (with_board("cone: 2"), "configurations: board: cone: found 2 rad, expected at most a quarter turn"),
-    (replaced("{random: {count: 3}}", "{tracker: {station: {x: 3}, acceptance: 4}}"),
-     "configurations: tracker: acceptance: found 4 rad, expected at most half a turn"),
     (replaced("0.002}", "0.002, joint: [1]}"), "noise: joint: 1 values, expected one for all or 2, one a joint"),
     (SHORT + "frame: room\n", "frame: found 'room', expected one of base, unknown"),
     (SHORT + "job: {frame: known}\n", f"job: found key 'frame', {FOLLOWS}"),
     (SHORT + "job: {noise: {position: -1}}\n", "job: noise: position: found -1, expected a number not below 0"),
-    (REST + "instruments: []\n", "instruments: found [], expected at least 1 in the list"),
     (with_instrument("{anchors: 3}"), f"{IN}missing key 'model'"),
     (with_instrument("{model: anchor, anchor: 3}"), f"{IN}unknown key 'anchor', expected one of model, name, "
      "noise, configurations, targets, stations, frame, pairing, pairs, sockets, anchors, offset, planes, contact, "
@@ -246,13 +239,10 @@ MISTAKES = [
     (with_instrument("{model: anchor, targets: 3}"),
      f"{IN}targets: with model anchor, expected model pose or position"),
     (with_instrument("{model: anchor, anchors: {a: {x: 1, y: 2}}}"), f"{IN}anchors: a: missing key 'z'"),
-    (with_instrument("{model: anchor, anchors: 0}"), f"{IN}anchors: found 0, expected a number above 0"),
     (with_instrument("{model: anchor, offset: 3, contact: true}"),
      f"{IN}offset: with contact, expected none: there is no length"),
     (with_instrument("{model: position, stations: 2, frame: base}"), f"{IN}stations: 2 with frame base, expected 1"),
     (with_instrument("{model: pixels}"), f"{IN}camera: found none with model pixels, expected it with model pixels"),
-    (with_instrument("{model: distance, pairs: star, name: 'a b'}"),
-     f"{IN}name: found 'a b', expected a name of the pattern ^[A-Za-z0-9][A-Za-z0-9_-]{{0,63}}$"),
     (with_instrument("{model: anchor, name: a}\n  - {model: plane, name: A}"),
      "instrument 2: name: A is there already, expected another one"),
     (REST + "instruments: [{model: anchor}]\njob: {model: anchor}\n", f"job: found key 'model', {FOLLOWS}"),
@@ -266,16 +256,14 @@ def test_a_mistake_is_named_in_one_line(folder, text, message):
     assert str(caught.value) == f"scenario.yaml: {message}"
 
 
-@pytest.mark.slow
-def test_the_command_says_what_each_table_has_and_writes_the_truth(fg_calib, folder):
+def test_the_truth_is_written_in_the_units_of_the_scenario(folder):
     tracker = "{model: position, name: tracker, targets: {ball: {x: 50, y: 0, z: 100}}}"
     wire = "{model: anchor, name: wire, anchors: {bolt: {x: 800, y: 0, z: 0, tolerance: 0}}, offset: 120}"
-    read_instruments(folder, tracker, wire, rest=REST + "validation: {random: {count: 4}}\n")
-    ended = fg_calib("simulate", folder / "scenario.yaml", "--out", folder / "job", "--seed", 2)
-    counts = "20 rows to calibrate, 4 to test"
-    assert (ended.code, ended.out.splitlines()[1:]) == (
-        0, [f"tracker.csv: model position, {counts}", f"wire.csv: model anchor, {counts}"]
-    )  # fmt: skip
+    simulation = simulate(read_instruments(folder, tracker, wire, rest=REST + "validation: {random: {count: 4}}\n"), 2)
+    counts = {"n_train": 20, "n_test": 4}
+    tables = [{"table": "tracker.csv", "model": "position"} | counts, {"table": "wire.csv", "model": "anchor"} | counts]
+    assert simulation.summary()["tables"] == tables
+    write_simulation(folder / "job", simulation)
     truth = yaml.safe_load((folder / "job" / "truth.yaml").read_text())
     assert truth["units"] == {"length": "mm", "angle": "deg"}
     assert (truth["anchors"], truth["offsets"]) == ({"bolt": {"x": 800.0, "y": 0.0, "z": 0.0}}, {"wire": 120.0})

@@ -74,7 +74,7 @@ def measured(simulation):
 def test_encoder_noise_moves_the_arm_and_the_table_holds_the_reading(shipped):
     """With encoder noise alone the measured pose is exactly where the noise took the arm, not where the table says."""
     noise = Noise(0.0, 0.0, tuple(0.01 * (i + 1) for i in range(7)))
-    noisy = replace(shipped, noise=noise, stated_noise=Noise(1e-3, 1e-4))
+    noisy = replace(shipped, noise=noise, specified_noise=Noise(1e-3, 1e-4))
     s, still = simulate(noisy, 2), simulate(noisy, 2, exact=True)
     assert s.measurements.readings.tolist() == still.measurements.readings.tolist() == still.true_readings.tolist()
     _, position, turn = measured(s)
