@@ -5,19 +5,23 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import chi2, multivariate_normal, norm
 from simulated import TOOL, measure, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import FIRST_TOLERANCE, build_problem
+from fg_calib.graph.problem import linear_system
 from fg_calib.graph.solver import solve
+from fg_calib.graph.variables import prior_rows
 from fg_calib.inputs import InputError, Options
 from fg_calib.statistics.priors import (
     COMMON_SIGMA,
     GROUP_SIGMA,
     Corrections,
     ScalePosterior,
+    _beyond,
+    _corrections,
     estimate_tolerances,
     fit_scales,
 )
@@ -224,3 +228,25 @@ def test_a_correction_varies_by_what_the_data_take_off_its_prior_variance():
         assert sigma == pytest.approx(np.sqrt(1.0 - (p.sigma / p.prior_sigma) ** 2), rel=1e-6, abs=1e-6)
     assert priors.chi2 == pytest.approx(np.sum(priors.z**2))
     assert priors.expected == pytest.approx(np.sum(priors.sigma**2))
+    P = prior_rows(problem.variables, found.spread.parameters)[1]
+    A = np.eye(16) - P @ found.spread.tangent @ P.T
+    nu = np.trace(A) ** 2 / np.sum(A * A)
+    assert priors.p_value == pytest.approx(chi2.sf(nu * priors.chi2 / priors.expected, nu))
+
+
+def test_a_correction_beyond_its_prior_is_named_and_what_follows_it_is_not():
+    """The second is 9 sigma off because the first is 10: without that prior it is met."""
+    A = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 0.25]])
+    found = list(_beyond(("a", "b", "c"), np.array([10.0, 9.0, 2.5]), A, 3))
+    assert [(one.name, one.z, one.is_place) for one in found] == [("a", 10.0, False), ("c", 2.5, False)]
+    assert found[1].sigma == 0.5
+    assert not list(_beyond(("a", "b", "c"), np.array([2.5, 2.5, 1.0]), A, 3))
+
+
+def test_what_has_no_prior_follows_the_corrections():
+    """The information on the corrections is that of the rows, the measurement frame moved along."""
+    problem, _ = drawn_problem(frame="unknown")
+    solution, n = solve(problem), len(prior_rows(problem.variables, problem.start)[0])
+    corrections, follow = _corrections(solution, problem.variables, np.ones(n), np.zeros(n, dtype=np.int64))
+    rows = linear_system(solution.problem, solution.parameters).left.A @ follow
+    np.testing.assert_allclose(rows.T @ rows, corrections.information, rtol=1e-6, atol=1e-6 * np.max(rows**2))
