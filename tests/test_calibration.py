@@ -1,14 +1,13 @@
 """The front door: one call does the steps, and what it found prints, predicts, and is saved and loaded."""
 
 import copy
-import json
 import pickle
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import TOOL, measure, small_arm, true_robot, write_job
+from simulated import TOOL, measure, small_arm, true_robot
 
 from fg_calib import (
     Calibration,
@@ -19,8 +18,6 @@ from fg_calib import (
     assess,
     build_problem,
     calibrate,
-    calibrate_job,
-    read_job,
     solve,
 )
 from fg_calib.diagnostics.multistart import multistart
@@ -168,28 +165,6 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
 
 
 @pytest.mark.slow
-def test_the_command_writes_and_prints_the_same(fg_calib, tmp_path):
-    robot, m, settings = given("priors")
-    path = write_job(tmp_path, robot, m, **settings)
-    ended = fg_calib("calibrate", path, "--out", tmp_path / "by command", "--json")
-    result = calibrate_job(path)
-    result.save(tmp_path / "in python")
-
-    def without_time(document):
-        document["solver"].pop("seconds")
-        document.pop("date")
-        return document
-
-    assert ended.code == 0
-    assert without_time(json.loads(ended.out)) == without_time(result.result.document())
-    names = sorted(f.name for f in (tmp_path / "in python").iterdir())
-    assert names == sorted(f.name for f in (tmp_path / "by command").iterdir())
-    for name in set(names) - {"result.json"}:
-        assert (tmp_path / "in python" / name).read_text() == (tmp_path / "by command" / name).read_text()
-    assert calibrate_job(read_job(path)).result.inputs.keys() == {"calibration.yaml", "robot.yaml", "poses.csv"}
-
-
-@pytest.mark.slow
 def test_noise_is_estimated_from_nothing_stated():
     robot, m, _ = given("priors", n=40)
     stated = calibrate(robot, m, model="pose", estimate_noise=True)
@@ -240,16 +215,6 @@ def test_what_a_calibration_is_made_of_is_read_only(found):
         for key, array in vars(part).items():
             if isinstance(array, np.ndarray) and key not in part._left_open:
                 assert not array.flags.writeable, (name, key)
-
-
-@pytest.mark.slow
-def test_a_notebook_gets_a_table(found):
-    robot, m, settings = given("priors")
-    text = calibrate(replace(robot, name="<b>arm</b>"), m, **settings)._repr_html_()
-    assert "<b>arm</b>" not in text
-    assert "&lt;b&gt;arm&lt;/b&gt;: distance-rotation" in text
-    assert text.count("<tr>") == 1 + sum(p.estimated or p.owner == 5 for p in robot.parameters)
-    assert "<td>a2</td>" in text
 
 
 def test_a_calibration_goes_to_other_processes(found):

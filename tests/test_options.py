@@ -76,13 +76,6 @@ def test_a_word_in_capitals_is_refused_with_the_word_that_was_meant(function, ke
         )
 
 
-@pytest.mark.parametrize(("function", "key"), CALLS, ids=[f"{f.__name__} {key}" for f, key in CALLS])
-@pytest.mark.parametrize("value", [None, ["star"]], ids=repr)
-def test_what_is_no_word_is_refused_too(function, key, value):
-    with pytest.raises(InputError, match=f"^{key}: found "):
-        function(**{key: value})
-
-
 NAN, INF = float("nan"), float("inf")
 MISTAKES = {
     "a strategy": (lambda: Pairing("Chain"), "pairing: found 'Chain', expected one of star, chain, all, random; "

@@ -195,18 +195,6 @@ def test_json_puts_the_result_and_nothing_else_on_stdout(fg_calib, example):
     assert printed == written
 
 
-@pytest.mark.slow
-def test_an_existing_folder_keeps_its_other_files(fg_calib, example):
-    out = example / "result"
-    out.mkdir()
-    (out / "notes.txt").write_text("mine")
-    (out / "result.json").write_text('{\n "schema": "fg-calib/result/1",\n}')
-    assert fg_calib("calibrate", example / JOB, "--out", out).code == 0
-    assert {f.name for f in out.iterdir()} == OUTPUTS | {"notes.txt"}
-    assert (out / "notes.txt").read_text() == "mine"
-    assert json.loads((out / "result.json").read_text())["schema"] == "fg-calib/result/2"
-
-
 def test_a_failure_leaves_an_existing_folder_as_it_was(fg_calib, example):
     out = example / "result"
     out.mkdir()

@@ -103,22 +103,6 @@ def test_a_notebook_a_saved_result_and_reprs_are_clean(found, tmp_path):
     assert [text for text in shown if not clean(text)] == []
 
 
-@pytest.mark.parametrize("more", [(), ("--configurations", "poses.csv", "--angle", "deg")])
-def test_observe_is_clean(fg_calib, job, monkeypatch, more):
-    monkeypatch.chdir(job.parent)
-    ended = fg_calib("observe", job.parent / "robot.yaml", *more)
-    assert (ended.code, ended.err) == (0, "")
-    assert r"arm\x1b[31m" in ended.out
-    assert clean(ended.out)
-
-
-def test_simulate_is_clean(fg_calib, folder, tmp_path):
-    ended = fg_calib("simulate", folder / "scenario.yaml", "--out", tmp_path / "a\x1b[31m\nb")
-    assert ended.code == 0
-    assert clean(ended.out + ended.err)
-    assert (ended.out.count("\n"), ended.err.count("\n")) == (1, 2)
-
-
 def test_errors_and_warnings_are_clean(fg_calib, folder, tmp_path):
     message = str(InputError(f"a{STEERING}\nb", "found \x1b", "\x07"))
     assert message == rf"a{SHOWN} b: found \x1b, expected \x07"
