@@ -313,7 +313,8 @@ class WhitenedRows(Brief):
         R = np.zeros((0, at.n_columns + at.n_nuisance + 1))
         for chunk in chunks:
             for start in range(0, len(chunk), 4 * SPAN):
-                R = np.linalg.qr(np.vstack([R, chunk[start : start + 4 * SPAN]]), mode="r")  # type: ignore[assignment]
+                R = np.vstack([R, chunk[start : start + 4 * SPAN]])
+                R = R if len(R) <= R.shape[1] else np.linalg.qr(R, mode="r")  # type: ignore[assignment]
         return R
 
     def posterior_mean(self, at: State) -> Floats:
@@ -342,18 +343,22 @@ def whitened_rows(
         for i, noise in enumerate(noises)
         if len(noise.series.train)
     ]
-    L = _stacked([L for _, L, _ in found])
+    parts = tuple(part for part, _, _ in found)
+    L = spare = Sparse((sum(part.n_rows for part in parts), 0))
+    if shared.any():
+        L = _stacked([L for _, L, _ in found])
+        spare = Sparse(scipy.sparse.block_diag([E for _, _, E in found]))
     configuration, slot = np.divmod(L.indices, width)
     configurations, at = _ranks(configuration)
     slots, k = _ranks(slot)
     L = Sparse((L.data, at * len(slots) + k, L.indptr), shape=(L.shape[0], len(configurations) * len(slots)))
     return WhitenedRows(
-        parts=tuple(part for part, _, _ in found),
+        parts=parts,
         states=SchurComplement(L, max(len(slots), 1)),
         configurations=configurations,
         slots=slots,
         shared=shared,
-        spare=Sparse(scipy.sparse.block_diag([Sparse((0, 0)), *(E for _, _, E in found)])),
+        spare=spare,
         counted_as_private=bool(np.any((reached > 1) & ~shared)),
     )
 

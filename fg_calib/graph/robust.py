@@ -62,32 +62,25 @@ def weight(loss: Loss, e: Floats, c: Floats | float) -> Floats:
         e: Length of the whitened residual, any shape.
         c: The loss's constant, of a shape that goes with `e`.
     """
-    match loss:
-        case "none":
-            return np.ones_like(e)
-        case "huber":
-            return np.minimum(1.0, c / np.maximum(e, 1e-300))
-        case "cauchy":
-            return c**2 / (c**2 + e**2)
-        case "geman-mcclure":
-            return (c**2 / (c**2 + e**2)) ** 2
-        case "gnc":
-            return (e <= c).astype(np.float64)
+    return _LOSSES[loss][0](e, c)
 
 
 def cost(loss: Loss, e: Floats, c: Floats | float) -> Floats:
     """What a loss has measurements cost: its derivative in `e` is `e` times their `weight`, whose arguments it has."""
-    match loss:
-        case "none":
-            return 0.5 * e**2
-        case "huber":
-            return np.where(e <= c, 0.5 * e**2, c * (e - 0.5 * c))
-        case "cauchy":
-            return 0.5 * c**2 * np.log1p((e / c) ** 2)
-        case "geman-mcclure":
-            return 0.5 * c**2 * e**2 / (c**2 + e**2)
-        case "gnc":
-            return 0.5 * np.minimum(e, c) ** 2
+    return _LOSSES[loss][1](e, c)
+
+
+_LOSSES: dict[Loss, tuple[Callable[..., Floats], Callable[..., Floats]]] = {
+    "none": (lambda e, _: np.ones_like(e), lambda e, _: 0.5 * e**2),
+    "huber": (
+        lambda e, c: np.minimum(1.0, c / np.maximum(e, 1e-300)),
+        lambda e, c: np.where(e <= c, 0.5 * e**2, c * (e - 0.5 * c)),
+    ),
+    "cauchy": (lambda e, c: c**2 / (c**2 + e**2), lambda e, c: 0.5 * c**2 * np.log1p((e / c) ** 2)),
+    "geman-mcclure": (lambda e, c: (c**2 / (c**2 + e**2)) ** 2, lambda e, c: 0.5 * c**2 * e**2 / (c**2 + e**2)),
+    "gnc": (lambda e, c: (e <= c).astype(np.float64), lambda e, c: 0.5 * np.minimum(e, c) ** 2),
+}
+"""Weight and cost of each loss."""
 
 
 @cache

@@ -155,13 +155,13 @@ class Solution(FrozenArrays):
     problem: Problem
     parameters: Floats
     before: Floats
-    converged: bool
-    message: str
-    history: tuple[Iteration, ...]
-    initial_cost: float
-    cost: float
-    weighted_cost: float
-    seconds: float
+    converged: bool = False
+    message: str = "not solved"
+    history: tuple[Iteration, ...] = ()
+    initial_cost: float = np.nan
+    cost: float = np.nan
+    weighted_cost: float = np.nan
+    seconds: float = 0.0
     estimated_noise: tuple[tuple[int, str], ...] | None = None
     estimated_tolerances: ToleranceScales | None = None
     others: tuple[Floats, ...] = ()
@@ -239,16 +239,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
 
 def unsolved(problem: Problem) -> Solution:
     """A problem at its start as if that were its solution: what could be known there."""
-    return Solution(
-        *(problem, problem.start, problem.start),
-        converged=False,
-        message="not solved",
-        history=(),
-        initial_cost=np.nan,
-        cost=np.nan,
-        weighted_cost=np.nan,
-        seconds=0.0,
-    )
+    return Solution(problem, problem.start, problem.start)
 
 
 def options_of(options: Options) -> SolverOptions:

@@ -159,15 +159,10 @@ class Variables(Brief):
     @cached_property
     def scales(self) -> Floats:
         """A change of ordinary size in each column (see `Robot.scale_of`), shape (n_columns,)."""
-        angle, length = self.robot.scale_of("rad"), self.robot.scale_of("m")
-        scales = np.repeat([angle, length], 3)
-        parts = [
-            scales
-            if v.is_pose
-            else np.array([length if self.robot.parameters[i].unit == "m" else angle for i in v.parameters])
-            for v in self.items
-        ]
-        return np.concatenate([np.zeros(0), *parts])
+        of_pose, units = 3 * ["rad"] + 3 * ["m"], list[str]()
+        for v in self.items:
+            units += of_pose if v.is_pose else [self.robot.parameters[i].unit for i in v.parameters]
+        return np.array([self.robot.scale_of(unit) for unit in units], dtype=np.float64)
 
     @cached_property
     def prior_scales(self) -> Floats:
@@ -351,14 +346,6 @@ class Variables(Brief):
                 E[v.columns, v.columns] = _tangent_derivative(parameters[v.places])
         return E
 
-    def describe(self, key: int) -> str:
-        """A key in words: `K(3) (a3, alpha3, d3)`."""
-        for v in self.items + self.nuisance:
-            if v.key == key:
-                kind = "point" if v.symbol.startswith("L(") else v.kind
-                return f"{v.symbol} ({', '.join(self.names[v.columns]) or kind})"
-        return str(gtsam.Symbol(key))
-
 
 def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -> Variables:
     """The variables of a robot's estimated parameters, and of the measurement frames that are unknown.
@@ -460,14 +447,9 @@ _ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
 
 def _frame_derivative(frame: Floats) -> Floats:
     """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
-    pitch, roll = frame[4], frame[5]
-    secant = 1.0 / np.cos(pitch) if abs(np.cos(pitch)) > QUARTER_TURN else np.nan
-    D = np.zeros((6, 6))
-    D[:3, 3:] = pose_of(frame).rotation().matrix()
-    # Body rates of Rz(yaw) Ry(pitch) Rx(roll), solved for the angles' rates.
-    D[3, :3] = [0.0, np.sin(roll) * secant, np.cos(roll) * secant]
-    D[4, :3] = [0.0, np.cos(roll), -np.sin(roll)]
-    D[5, :3] = [1.0, np.sin(roll) * np.sin(pitch) * secant, np.cos(roll) * np.sin(pitch) * secant]
+    D = np.linalg.pinv(_tangent_derivative(frame)).astype(np.float64)
+    if abs(np.cos(frame[4])) <= QUARTER_TURN:
+        D[[3, 5]] = np.nan
     return D
 
 

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import polars as pl
 import pytest
@@ -89,7 +88,6 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is():
         assert not p.sigma or abs(again.parameters[i] - p.estimate) < 1e-3 * p.sigma
     for name in RIGID:
         assert abs(again.parameters[robot.index(name)] - robot.nominal[robot.index(name)]) < 1e-9
-    assert problem.variables.describe(gtsam.symbol("L", 2)) == "L(2) (point)"
 
 
 def test_points_of_test_rows_are_predicted_and_train_rows_alone_are_fitted():
