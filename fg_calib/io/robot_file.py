@@ -26,19 +26,7 @@ from pydantic import Field
 from fg_calib.inputs import InputError, checked
 from fg_calib.io.atomic import write_text
 from fg_calib.io.urdf import read_urdf
-from fg_calib.io.yaml import (
-    Bound,
-    FilePath,
-    Number,
-    Positive,
-    Schema,
-    Units,
-    UnitsOfFile,
-    meaning,
-    read_yaml,
-    shown,
-    validate,
-)
+from fg_calib.io.yaml import Bound, FilePath, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, shown, validate
 from fg_calib.robot import (
     AXIS_OF_KIND,
     CONVENTIONS,
@@ -55,14 +43,14 @@ from fg_calib.robot import (
 
 
 class FrameValues(Schema):
-    """A frame as six values, those missing 0."""
+    """A frame as six values, those missing 0: x, y, z and Rz(yaw) Ry(pitch) Rx(roll)."""
 
-    x: Number = meaning("Place along x", 0.0)
-    y: Number = meaning("Place along y", 0.0)
-    z: Number = meaning("Place along z", 0.0)
-    roll: Number = meaning("Turn about x, the first of Rz(yaw) Ry(pitch) Rx(roll) to act", 0.0)
-    pitch: Number = meaning("Turn about y", 0.0)
-    yaw: Number = meaning("Turn about z", 0.0)
+    x: Number = 0.0
+    y: Number = 0.0
+    z: Number = 0.0
+    roll: Number = 0.0
+    pitch: Number = 0.0
+    yaw: Number = 0.0
 
     def si(self, units: Units, place: str) -> dict[str, float]:
         """The six values by kind, [m] and [rad].
@@ -86,20 +74,25 @@ def _si(kind: str, value: float, units: Units, place: str) -> float:
 
 
 class _Robot(Schema):
-    """The keys that both forms of a robot file have."""
+    """The keys that both forms of a robot file have.
 
-    name: str | None = meaning("The robot's name", None)
-    units: UnitsOfFile = meaning("Of the figures in this file", Units())
-    base: FrameValues = meaning("Base frame to frame 0, or to the first link of a URDF", FrameValues())
-    tool: FrameValues = meaning("Last frame to tool frame", FrameValues())
-    fixed: tuple[str, ...] = meaning("Parameters of the joints that are known exactly, never estimated", ())
-    estimate: tuple[str, ...] = meaning(
-        "Parameters of base and tool that are estimated, which others are not: tool.x", ()
-    )
-    tolerance: dict[str, Positive] = meaning(
-        "1 sigma of true minus nominal, by kind (a, theta, tool, ...) or by name: used as priors",
-        {},
-    )
+    Attributes:
+        name: The robot's name.
+        units: Of the values in this file.
+        base: Base frame to frame 0, or to the first link of a URDF.
+        tool: Last frame to tool frame.
+        fixed: Parameters of the joints that are known exactly, never estimated.
+        estimate: Parameters of base and tool that are estimated, which others are not: tool.x.
+        tolerance: 1 sigma of true minus nominal, by kind (a, theta, tool, ...) or by name: used as priors.
+    """
+
+    name: str | None = None
+    units: UnitsOfFile = Units()
+    base: FrameValues = FrameValues()
+    tool: FrameValues = FrameValues()
+    fixed: tuple[str, ...] = ()
+    estimate: tuple[str, ...] = ()
+    tolerance: dict[str, Positive] = Field(default_factory=dict)
 
     def choices(self, place: str) -> dict[str, Any]:
         """What `RobotBuilder.build` wants to know, [m] and [rad].
@@ -115,25 +108,25 @@ class _Robot(Schema):
 
 
 class _Row(Schema):
-    type: Literal["revolute", "prismatic"] = meaning("Whether it turns or slides", "revolute")
-    name: str | None = meaning("The joint's name, which its column may have; q1 to qn if left out", None)
-    a: Number | None = meaning("Shift along x", None)
-    alpha: Number | None = meaning("Turn about x", None)
-    d: Number | None = meaning("Shift along z; the reading of a slide is added", None)
-    theta: Number | None = meaning("Turn about z; the reading of a turning joint is added", None)
-    beta: Number = meaning("Turn about y, of the conventions with -hayati", 0.0)
-    limits: tuple[Bound, Bound] = meaning("Lower and upper of its readings", (-math.inf, math.inf))
+    type: Literal["revolute", "prismatic"] = "revolute"
+    name: str | None = None
+    a: Number | None = None
+    alpha: Number | None = None
+    d: Number | None = None
+    theta: Number | None = None
+    beta: Number = 0.0
+    limits: tuple[Bound, Bound] = (-math.inf, math.inf)
 
 
 class _DhRobot(_Robot):
-    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati"] = meaning("Order of one joint's transforms")
-    joints: Annotated[list[_Row], Field(min_length=1)] = meaning("A row a joint, in chain order")
+    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati"]
+    joints: Annotated[list[_Row], Field(min_length=1)]
 
 
 class _UrdfRobot(_Robot):
-    urdf: FilePath = meaning("A URDF, in place of convention and joints; the path is relative to this file")
-    base_link: str | None = meaning("Link where the chain starts; the root if left out", None)
-    tip_link: str | None = meaning("Link where the chain ends; the only leaf if left out", None)
+    urdf: FilePath
+    base_link: str | None = None
+    tip_link: str | None = None
 
 
 @checked

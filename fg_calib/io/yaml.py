@@ -103,11 +103,6 @@ class Schema(BaseModel):
         return refuse_unknown_keys(*cls.model_fields)(value)
 
 
-def meaning(words: str, default: Any = ...) -> Any:
-    """A key of a schema with what it means; its default is ... where it is required."""
-    return Field(default, description=words)
-
-
 AnySchema = TypeVar("AnySchema", bound=Schema)
 
 

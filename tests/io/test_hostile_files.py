@@ -66,13 +66,3 @@ def test_cells_of_several_types_are_all_read(tmp_path):
     found = read_measurements(columns | {"q3": [0.5, 0.75]}, ARM)
     assert found.readings.tolist() == [[1.0, 0.25, 0.5], [0.5, 1.0, 0.75]]
     assert found.ids.tolist() == ["1", "b"]
-
-
-def test_columns_that_look_as_if_they_were_used_are_told_of(tmp_path, caplog):
-    names = ["sigma_joint", "sigma_yaw", "sigma_pos", "sigma_position [mm]", "X", "note"]
-    (tmp_path / "poses.csv").write_text(",".join(["q1,q2,q3,x,y,z", *names]) + "\n0,0,0,1,2,3" + ",1" * 6 + "\n")
-    read_measurements(tmp_path / "poses.csv", ARM)
-    sigmas = ["distance", "orientation", "pixel", "point", "position", "rx", "ry", "rz", "u", "v", "x", "y", "z"]
-    said = f"sigmas are {', '.join(f'sigma_{name}' for name in sigmas)}"
-    expected = [f"poses.csv: column {name!r} is not used; {said}" for name in names[:4]]
-    assert caplog.messages == [*expected, "poses.csv: column 'X' is not used; x is"]

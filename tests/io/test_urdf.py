@@ -61,22 +61,6 @@ def yourdfpy_pose(path, base, tip, q):
     return model.get_transform(tip, base)
 
 
-def test_joints_stand_in_chain_order_with_their_own_parameters_and_limits(tree):
-    robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
-    assert robot.joints == (
-        Joint("l3", prismatic=True, lower=0.0, upper=0.7),
-        Joint("l1", lower=-1.5, upper=2.0),
-        Joint("r1"),
-        Joint("r2"),
-    )
-    assert [p.name for p in robot.parameters if p.owner == 1] == [
-        f"l3.{k}" for k in ("x", "y", "z", "yaw", "pitch", "roll")
-    ]
-    assert robot.parameters[robot.index("l3.pitch")].nominal == 1.5708  # as written, beyond a quarter turn
-    assert robot.parameters[robot.index("l1.yaw")].nominal == 0.6
-    assert {p.owner for p in robot.parameters if p.estimated} == {1, 2, 3, 4}
-
-
 def test_changed_parameters_of_a_reversed_chain_are_those_of_the_file(tree, tmp_path):
     robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
     rng = np.random.default_rng(2)
