@@ -26,7 +26,19 @@ from pydantic import Field
 from fg_calib.inputs import InputError, checked
 from fg_calib.io.atomic import write_text
 from fg_calib.io.urdf import read_urdf
-from fg_calib.io.yaml import Bound, FilePath, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, shown, validate
+from fg_calib.io.yaml import (
+    Bound,
+    FilePath,
+    Loader,
+    Number,
+    Positive,
+    Schema,
+    Units,
+    UnitsOfFile,
+    read_yaml,
+    shown,
+    validate,
+)
 from fg_calib.robot import (
     AXIS_OF_KIND,
     CONVENTIONS,
@@ -324,6 +336,8 @@ class _Flow(dict[str, Any]):
 
 class _Dumper(yaml.SafeDumper):
     """The safe dumper, with rows, frames and names on one line."""
+
+    yaml_implicit_resolvers = Loader.yaml_implicit_resolvers  # quotes what reads as a number
 
 
 _Dumper.add_representer(

@@ -227,7 +227,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         line = text[: half.start()].count("\n") + 1
         raise InputError(f"{path.name}:{line}", f"half a character, {half[0]}", "the character itself")
     try:
-        mapping = yaml.load(text, _Loader)
+        mapping = yaml.load(text, Loader)
     except RecursionError:
         raise InputError(path.name, "nested too deeply", "a mapping, key: value") from None
     except yaml.MarkedYAMLError as error:
@@ -245,7 +245,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return mapping
 
 
-class _Loader(yaml.SafeLoader):
+class Loader(yaml.SafeLoader):
     """The safe loader with different keys that are words, and numbers of base 10.
 
     YAML 1.1 reads 045 as 37 and 1:30 as 90; dates and merge keys have no meaning in our files.
@@ -285,7 +285,7 @@ for _tag, _pattern, _first in (
         "-+.0123456789",
     ),
 ):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_pattern})$"), list(_first))
+    Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^({_pattern})$"), list(_first))
 
 
 # --- units ------------------------------------------------------------------------------------------------------------
