@@ -208,7 +208,7 @@ class Instrument:
 
         nuisances = self._nuisances(m, kinds, add).astype(np.int64)
         for kind, chosen in kinds:
-            rows = np.flatnonzero(chosen & np.isfinite(data).all(axis=1))
+            rows = np.flatnonzero(chosen & ~np.isnan(data).any(axis=1))
             if len(rows):
                 arrays = data[rows, : kind.width], self.sigma(m, rows), nuisances[rows, : kind.n_nuisances]
                 found.append(MeasurementBlock.of_rows(kind, table, number, rows, *arrays, **self.more(table, rows)))
