@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.sparse
 from oracle import random_robot, tool_pose
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
-from fg_calib.graph.error_states import SchurComplement, State, WhitenedBlock, WhitenedSeries
 from fg_calib.measurements import residuals, stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.kinds.pose import Orientation
@@ -70,26 +68,3 @@ def test_the_sum_over_spans_does_not_depend_on_threads(monkeypatch):
     many = residuals.gram(block, chain)
     monkeypatch.setattr("fg_calib.robot.kinematics.processors", lambda: 1)
     assert np.array_equal(residuals.gram(block, chain), many)
-
-
-@pytest.mark.parametrize(("n", "n_shared"), [(6, 3), (6, 30)], ids=["few shared errors", "many"])
-def test_rows_that_share_errors_are_whitened_together_and_their_parts_can_be_divided(n, n_shared):
-    block, chain = random_pairs(n, rng := np.random.default_rng(0))
-    chain = replace(chain, joint_columns=False)
-    loading = scipy.sparse.csr_array(rng.normal(size=(n * block.residual_dim, n_shared)))
-    correlated = WhitenedBlock(
-        (WhitenedSeries(block, 0, 0, np.zeros((n, 0), dtype=np.int64)),), SchurComplement(loading)
-    )
-    some = residuals.residual(residuals.rows_of(correlated.parts[0].block, slice(0, 2)), chain)
-    assert np.array_equal(some, residuals.residual(block, chain)[:2])
-    at = State((chain,), np.zeros(0), np.zeros(0, dtype=np.int64), chain.n_columns, 0)
-    r, J = correlated.linearise(at)
-    assert (r.shape, J.shape) == ((correlated.n_rows,), (correlated.n_rows, chain.n_columns))
-    plain = residuals.linearise(block, chain)
-    rows = np.column_stack([plain[1].reshape(-1, chain.n_columns), plain[0].ravel()])
-    expected = rows.T @ np.linalg.solve(np.eye(len(rows)) + (loading @ loading.T).toarray(), rows)
-    of_rounding = rounding(rows.T @ rows, 10.0)
-    whitened, R = np.column_stack([J, r]), correlated.triangle(at)
-    for gram in (whitened.T @ whitened, R.T @ R):
-        assert gram == pytest.approx(expected, abs=of_rounding)
-    assert correlated.squared_norm(at) == pytest.approx(expected[-1, -1], abs=of_rounding)
