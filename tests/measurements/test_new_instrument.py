@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fg_calib.measurements.kind import Floats, Frames, Kind, Rows
-from fg_calib.measurements.kinds.instrument import Column, ColumnInstrument
+from fg_calib.inputs import Floats
+from fg_calib.measurements import Frames, Kind, Rows
+from fg_calib.measurements.kinds.instrument import Column, Instrument
 
 
 class Inclination(Kind):
@@ -37,7 +38,7 @@ class Inclination(Kind):
         return Rows(np.arctan2(sine, z[:, 2])[:, None] - data[:, :1], D)
 
 
-class Inclinometer(ColumnInstrument):
+class Inclinometer(Instrument):
     """Inclinations of the tool's z axis."""
 
     model, words, kind = "inclination", "measured inclinations", Inclination()
