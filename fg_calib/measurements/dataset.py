@@ -16,6 +16,7 @@ from fg_calib.inputs import (
     InputError,
     Integers,
     Pairing,
+    brief,
     check_names,
     check_number,
     checked,
@@ -293,6 +294,11 @@ class Measurements(FrozenArrays):
             labels=labels,
             **checked_columns(given, n),
         )
+
+    def __repr__(self) -> str:
+        """What was measured, without its sigmas."""
+        names = [f.name for f in fields(self) if not f.name.startswith(("sigma", "ids", "test", "named", "part"))]
+        return brief(self, (name for name in names if getattr(self, name) is not None))
 
     @property
     def n_configurations(self) -> int:
