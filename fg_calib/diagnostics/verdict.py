@@ -20,6 +20,7 @@ from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.graph import JOINT_NOISE, Problem, Solution
 from fg_calib.measurements import missing_values
 from fg_calib.observability import MissingMotion
+from fg_calib.robot import pose
 from fg_calib.statistics import (
     CONFIDENCE,
     FACTOR,
@@ -51,8 +52,8 @@ PRIOR_P_VALUE = 1e-4
 AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
 """Part of the information that may rest on lengths and angles of ambiguous sign: with a warning, and no more at all."""
 
-LARGE_NOISE = 0.2
-"""Estimated noise over the arm's reach, or over a radian, beyond which it is no noise."""
+LARGE_NOISE, MOST_READINGS = 0.2, 1000
+"""Estimated noise over the tool's motion, beyond which it is no noise; and configurations of which that is taken."""
 
 MAX_OUTLIER_SHARE = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
@@ -344,11 +345,16 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
-    """Check whether estimated noise is small compared with what the arm can do."""
-    sizes, estimated = {"m": case.problem.robot.reach, "rad": 1.0}, case.solution.estimated_noise or ()
+    """Check whether estimated noise is small compared with how the tool would move if each joint moved by itself."""
+    estimated = case.solution.estimated_noise
+    if not estimated:
+        return
+    readings = case.problem.data.readings[:MOST_READINGS]
+    at = pose(case.problem.robot, readings).jacobian[:, :, -readings.shape[1] :] * readings.std(axis=0)
+    turn, shift = (float(np.sqrt(np.mean(np.sum(part**2, axis=2)))) for part in (at[:, :3], at[:, 3:]))
     for fit in case.fit.goodness.kinds:
-        ratio = fit.factor * fit.stated_sigma_rms / sizes.get(fit.unit, np.inf)
-        text = f"the noise estimated of {fit.kind} is {ratio:.2g} times {'the reach' if fit.unit == 'm' else '1 rad'}"
+        ratio = fit.factor * fit.stated_sigma_rms / {"m": shift, "rad": turn}.get(fit.unit, np.inf)
+        text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as what the joints move"
         text += ": the arm explains next to nothing; check the table and the job"
         yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)
 

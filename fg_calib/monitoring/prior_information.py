@@ -6,6 +6,7 @@ file's format make no difference: integers multiplied and added modulo 2^64, of 
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -231,7 +232,7 @@ def _of_rows(m: Measurements) -> Words:
 def _hash(*values: NDArray[Any]) -> Words:
     """One hash a row of values, in units of the resolution, or of hashes."""
     total: Words = np.zeros(len(values[0]), dtype=np.uint64)
-    for column in (column for v in values for column in np.reshape(v, (len(total), -1)).T):
+    for column in (column for v in values for column in np.reshape(v, (len(total), math.prod(v.shape[1:]))).T):
         whole = np.round(np.nan_to_num(column.astype(np.float64), nan=_NOT_MEASURED) / _RESOLUTION)
         words = column if column.dtype == np.uint64 else whole.astype(np.int64).view(np.uint64)
         total = (total ^ words) * _FACTOR

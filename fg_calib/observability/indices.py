@@ -75,6 +75,19 @@ class RelativeGroup:
 
 
 @dataclass(frozen=True)
+class Correlated:
+    """Two parameters that are strongly correlated.
+
+    Attributes:
+        parameters: Their names.
+        correlation: Between -1 and 1.
+    """
+
+    parameters: tuple[str, str]
+    correlation: Figure
+
+
+@dataclass(frozen=True)
 class WeakDirection:
     """A direction that the data determine, but badly.
 
@@ -119,7 +132,7 @@ class Observability(FrozenArrays):
     condition_number: Figure
     sigma: dict[str, Figure]
     correlation: Floats
-    correlations: tuple[tuple[str, str, Figure], ...]
+    correlations: tuple[Correlated, ...]
     weak: tuple[WeakDirection, ...]
 
     def named(self, wanted: IdentifiabilityClass) -> list[str]:
@@ -211,7 +224,7 @@ def observability_indices(singular_values: Floats, n_measurements: int) -> dict[
 
 def _spread(
     J: Floats, names: Sequence[str], scales: Floats
-) -> tuple[dict[str, float], Floats, tuple[tuple[str, str, float], ...], tuple[WeakDirection, ...]]:
+) -> tuple[dict[str, float], Floats, tuple[Correlated, ...], tuple[WeakDirection, ...]]:
     """Sigmas, correlations, strong correlations and weak directions of columns that are determined together."""
     if not names:
         return {}, np.zeros((0, 0)), (), ()
@@ -232,7 +245,7 @@ def _spread(
     return (
         dict(zip(names, (spread * scales).tolist(), strict=True)),
         correlation,
-        tuple((names[i], names[j], float(correlation[i, j])) for i, j in strongest),
+        tuple(Correlated((names[i], names[j]), float(correlation[i, j])) for i, j in strongest),
         tuple(weak),
     )
 

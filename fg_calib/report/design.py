@@ -194,7 +194,10 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     measured = design.tables if design.pool.scenario is not None else ()
     filled = {
-        name: to_fill_in(dict(columns) | _rounded(t.measurements.readings, robot, units), touched=_is_touched(t))
+        name: to_fill_in(
+            dict(columns) | (_rounded(t.measurements.readings, robot, units) if "q1" in columns else {}),
+            touched=_is_touched(t),
+        )
         for t in measured
         for name, columns in table_columns(t, robot, units).items()
     }

@@ -87,7 +87,7 @@ def _classes(found: Identifiability) -> Iterator[Content | Section]:
         combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
         rows = [(name, sigma, tables.unit_of(name), combined.get(name, "")) for name, sigma in o.sigma.items()]
         sigmas = table_of(("", "sigma|q", "|unit", "stands for"), rows)
-        correlated = table_of(("", "|+.3f"), [(f"{a}, {b}:", rho) for a, b, rho in o.correlations])
+        correlated = table_of(("", "|+.3f"), [(f"{', '.join(c.parameters)}:", c.correlation) for c in o.correlations])
         yield from section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))
         yield from section(f"Weak directions ({tables.WEAK})", tables.weak_directions(o))
         yield from section("Sigma of the kept parameters, the others at nominal", sigmas)

@@ -53,7 +53,6 @@ from functools import cached_property
 
 import numpy as np
 from scipy import special
-from scipy.optimize import minimize
 
 from fg_calib.graph import (
     RANK_TOLERANCE,
@@ -243,6 +242,8 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
         return -at.value, -at.gradient
 
     n = len(corrections.member)
+    from scipy.optimize import minimize  # here, for it takes as long to import as a small calibration
+
     modes = (minimize(cost, np.full(n, start), jac=True, method="BFGS", options={"gtol": GTOL}).x for start in STARTS)
     mode = max((ScalePosterior(corrections, theta) for theta in modes), key=lambda at: at.value)
     theta, variance, added = mode.theta, np.zeros(n), mode.covariance
