@@ -13,7 +13,7 @@ So with the base frame at `base`,
     O1 = base . Z1,   O_i = X_(i-1) Z_i,   tool0_T_tool = X6 . tool
 
 where Z = Rz(theta) Tz(d) and X = Tx(a) Rx(alpha) Ry(beta) are the rows of the arm in Hayati's convention (`tables`),
-which holds every arm. Those of a UR as drawn give the frames of ur_description's own default_kinematics.yaml, so that
+which holds every arm. Those of a nominal UR give the frames of ur_description's own default_kinematics.yaml, so that
 meshes stand where they belong. What is behind joint 6 has no place in the file.
 
 References:

@@ -202,7 +202,7 @@ class Options:
         if self.estimate_tolerance is not None:
             set_checked(self, estimate_tolerance=SharedScale)
             if self.gauge != "prior":
-                found = f"to be estimated beside gauge: {self.gauge}"
+                found = f"to be estimated with gauge: {self.gauge}"
                 raise InputError("tolerance", found, "gauge: prior, the scale of which it is")
         if self.max_iterations is not None:
             check_number("max_iterations", self.max_iterations, above=True, whole=True)
@@ -227,7 +227,7 @@ class Options:
             check_flag("prior", prior)
             gauge = choices.setdefault("gauge", "prior" if prior else "none")
             if prior != (gauge == "prior"):
-                raise InputError("prior", f"found {prior} beside gauge: {gauge}", "gauge alone")
+                raise InputError("prior", f"found {prior} with gauge: {gauge}", "gauge alone")
         choices["pairing"] = as_pairing(choices.get("pairing"))
         if not isinstance(choices.get("prefer", ()), str):
             choices["prefer"] = listed("prefer", choices.get("prefer", ()))

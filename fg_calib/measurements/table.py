@@ -197,7 +197,7 @@ class CustomMeasurements(Brief):
     def block(self, table: Table, number: int, landmarks: Landmarks) -> MeasurementBlock:
         """A block of them.
 
-        Their unknowns are in the frame that the table's measurements are in: elsewhere one of the same name is another.
+        Their unknowns are in the frame of the table's measurements: one of the same name in another frame is another.
 
         Raises:
             InputError: They are at configurations that the table has not.

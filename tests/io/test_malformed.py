@@ -92,7 +92,7 @@ JOB = "robot: robot.yaml\nmeasurements: poses.csv\nmodel: pose\n"
 T = "robot: robot.yaml\nmeasurements:\n"
 JOBS = [
     (JOB + "columns: {q1: {name: x, scale: 0}}\n", 'job.yaml: columns: x: scale: found 0.0, expected a finite number other than 0'),
-    (JOB + "prior: false\ngauge: prior\n", "job.yaml: prior: found False beside gauge: prior, expected gauge alone"),
+    (JOB + "prior: false\ngauge: prior\n", "job.yaml: prior: found False with gauge: prior, expected gauge alone"),
     (JOB.replace("robot.yaml","\"a\\0b\""), '{folder}/a\\x00b: cannot be read: ...'),
     (JOB+"pairs: poses.csv\n", "poses.csv: no a, expected a and b, the two configurations of a pair"),
     (JOB+"truth: other.yaml\n", 'other.yaml: another robot, expected the parameters of robot, with their true values'),

@@ -211,7 +211,7 @@ def test_an_arm_that_is_only_evaluated_keeps_its_tolerances():
 
 @pytest.mark.parametrize("choices", [{"gauge": "keep"}, {"gauge": "none"}, {"prior": False}])
 def test_without_priors_there_is_nothing_to_estimate(choices):
-    with pytest.raises(InputError, match=r"^tolerance: to be estimated beside gauge: \w+, expected gauge: prior"):
+    with pytest.raises(InputError, match=r"^tolerance: to be estimated with gauge: \w+, expected gauge: prior"):
         Options.of(estimate_tolerance="kind", **choices)
 
 
