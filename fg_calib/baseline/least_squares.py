@@ -125,8 +125,8 @@ def fit_least_squares(
     check_names("names", wanted, names_of(robot.parameters))
     if not wanted:
         raise InputError("names", "nothing to estimate", "at least one parameter")
-    system = _System(robot, data, [i for i, p in enumerate(robot.parameters) if p.name in wanted], start)
-    fit, weights = system.solve(weighted)
+    system = _System(robot, data, [i for i, p in enumerate(robot.parameters) if p.name in wanted], start, weighted)
+    fit, weights = system.solve()
     m, (r, J), parameters = len(wanted), system.evaluate(fit.x, weights), system.parameters(fit.x)
     return LeastSquares(
         robot=robot.with_values(parameters[: len(robot.parameters)]),
@@ -204,8 +204,7 @@ def claimed_covariance(r: Floats, J: Floats, weighted: bool) -> Floats:
     if not weighted:
         covariance = covariance * (float(r @ r) / (len(r) - rank) if len(r) > rank else np.nan)
     undetermined = np.linalg.norm(Vt[rank:], axis=0) > MAX_SHARE
-    covariance[undetermined, :] = np.nan
-    covariance[:, undetermined] = np.nan
+    covariance[undetermined] = covariance[:, undetermined] = np.nan
     return covariance
 
 
@@ -227,10 +226,6 @@ class _Rows:
     use: Booleans
     covariance: Floats
 
-    def at(self, coordinates: Floats) -> Block:
-        """The measurements with values of their landmarks."""
-        return replace(self.block, nuisances=coordinates[self.landmarks])
-
     def differentiable(self, chain: Chain) -> _Rows:
         """The rows without distances and angles of pairs that have no derivative at the start."""
         parts = self.block.kind.parts
@@ -238,8 +233,7 @@ class _Rows:
             return self
         predicted = residuals.residual(self.block, chain) + self.block.data
         most = np.array([np.pi if part.quantity == "angle" else np.inf for part in parts])
-        good = (predicted >= NOT_DIFFERENTIABLE) & (predicted <= most - NOT_DIFFERENTIABLE)
-        return replace(self, use=self.use & good)
+        return replace(self, use=self.use & (np.minimum(predicted, most - predicted) >= NOT_DIFFERENTIABLE))
 
     def whitening(self, chain: Chain, coordinates: Floats, sigma_joint: Floats) -> Floats:
         """W with W S W^T = 1 of each measurement, lower triangular, shape (n, residual_dim, residual_dim).
@@ -248,7 +242,8 @@ class _Rows:
         """
         S, ends = self.covariance, self.block.kind.ends
         if ends and np.any(sigma_joint > 0.0):
-            J = residuals.linearise(self.at(coordinates), chain.without_columns().with_joint_columns())[1]
+            block = replace(self.block, nuisances=coordinates[self.landmarks])
+            J = residuals.linearise(block, chain.without_columns().with_joint_columns())[1]
             J = J[:, :, : ends * len(sigma_joint)] * np.tile(sigma_joint, ends)
             S = S + J @ np.swapaxes(J, 1, 2)
         S = np.where(self.use[:, :, None] & self.use[:, None, :], S, np.eye(self.block.residual_dim))
@@ -264,28 +259,26 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
         train, h = s.train, s.kind.residual_dim
         if not len(train):
             continue
-        trig, unit = data.trigs(robot)[s.table], unit_whitening(len(train), h)
-        unset = np.zeros(s.nuisances[train].shape)
-        block = Block(s.kind, trig, s.ends[train], s.data[train], unit, unset, s.source)
-        sigma: Floats = s.sigma
+        unit, unset, sigma = unit_whitening(len(train), h), np.zeros(s.nuisances[train].shape), s.sigma
+        block = Block(s.kind, data.trigs(robot)[s.table], s.ends[train], s.data[train], unit, unset, s.source)
         if s.formed:  # each pair as if it were alone
             pairs = usable_pairs(data.tables[s.table], ("distance" in s.kind.names, "angle" in s.kind.names))
             of_pairs = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
             sigma = np.nan_to_num(
                 np.stack([of_pairs[part.quantity][s.number] for part in s.kind.parts], axis=1), nan=1.0
             )
-        covariance = sigma[train][:, :, None] ** 2 * np.eye(h)
-        if s.covariance is not None and not s.formed:
-            covariance = s.covariance[train]
-        found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], covariance))
+        specified = None if s.formed else s.covariance
+        covariance = sigma[:, :, None] ** 2 * np.eye(h) if specified is None else specified
+        found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], covariance[train]))
     return found
 
 
 class _System:
     """Rows as a function of the unknowns: parameters, unknown frames, landmarks' coordinates."""
 
-    def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None) -> None:
-        self._sigma_joint, unknown = data.sigma_joint, np.array([table.unknown_frame for table in data.tables])
+    def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None, weighted: bool) -> None:
+        self._sigma_joint, self._weighted = data.sigma_joint, weighted
+        unknown = np.array([table.unknown_frame for table in data.tables])
         estimated, n, n_frames = data.estimated(), len(robot.parameters), int(unknown.sum())
         places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.landmarks.sizes]).tolist())]
         self._coordinates: Floats = data.landmarks.start
@@ -338,15 +331,14 @@ class _System:
         out[self._estimated] = self.parameters(x)[self._edge :]
         return out
 
-    def evaluate(self, x: Floats, weights: Weights | None) -> tuple[Floats, Floats]:
-        """Residuals, shape (m,), and derivatives, shape (m, n_unknowns); not weighted if `weights` is None."""
+    def evaluate(self, x: Floats, weights: Weights) -> tuple[Floats, Floats]:
+        """Whitened residuals, shape (m,), and their derivatives, shape (m, n_unknowns)."""
         coordinates, found_r, found_J = self._landmarks(x), [], []
-        for i, rows in enumerate(self._rows):
-            r, J = residuals.linearise(rows.at(coordinates), self._chain(rows.table, x))
-            if weights is not None:
-                r = (weights[i] @ np.where(rows.use, r, 0.0)[:, :, None])[:, :, 0]
-                J = weights[i] @ (J * rows.use[:, :, None])
-            r, J, of = r[rows.use], J[rows.use], np.nonzero(rows.use)[0]
+        for W, rows in zip(weights, self._rows, strict=True):
+            block = replace(rows.block, nuisances=coordinates[rows.landmarks])
+            r, J = residuals.linearise(block, self._chain(rows.table, x))
+            r = (W @ np.where(rows.use, r, 0.0)[:, :, None])[:, :, 0][rows.use]
+            J, of = (W @ (J * rows.use[:, :, None]))[rows.use], np.nonzero(rows.use)[0]
             wide = np.zeros((len(r), len(x) + 1))  # the last column for known coordinates
             wide[:, : self.n_core] = J[:, : self.n_core]
             for k, columns in enumerate(self._column[rows.landmarks[of]].T):
@@ -354,25 +346,25 @@ class _System:
             found_r.append(r)
             found_J.append(wide[:, :-1])
         for place, mean, sigma in self._priors:
-            weight = 1.0 if weights is None else sigma
-            found_r.append((coordinates[place] - mean) / weight)
-            found_J.append(np.eye(len(x) + 1)[self._column[place], :-1] / weight)
+            found_r.append((coordinates[place] - mean) / (sigma if self._weighted else 1.0))
+            found_J.append(np.eye(len(x) + 1)[self._column[place], :-1] / (sigma if self._weighted else 1.0))
         return np.concatenate(found_r), np.concatenate(found_J)
 
     def _weights(self, x: Floats) -> Weights:
         coordinates = self._landmarks(x)
+        if not self._weighted:
+            return tuple(np.broadcast_to(np.eye(r.use.shape[1]), r.covariance.shape) for r in self._rows)
         return tuple(r.whitening(self._chain(r.table, x), coordinates, self._sigma_joint) for r in self._rows)
 
-    def solve(self, weighted: bool) -> tuple[Fit, Weights | None]:
+    def solve(self) -> tuple[Fit, Weights]:
         """The fit and its weights: those at the estimate, where joint noise makes them depend on it."""
-        if not weighted:
-            return gauss_newton(partial(self.evaluate, weights=None), self._start[self._index]), None
         x, iterations, moved = self._start[self._index], 0, np.inf
+        reweighted = self._weighted and bool(np.any(self._sigma_joint > 0.0))
         for _ in range(_ROUNDS):
             weights = self._weights(x)
-            fit = scipy_fit(partial(self.evaluate, weights=weights), x)
+            fit = (scipy_fit if self._weighted else gauss_newton)(partial(self.evaluate, weights=weights), x)
             moved, x, iterations = float(np.linalg.norm(fit.x - x)), fit.x, iterations + fit.iterations
-            if not fit.converged or moved <= REWEIGHTED or not np.any(self._sigma_joint > 0.0):
+            if not fit.converged or moved <= REWEIGHTED or not reweighted:
                 return replace(fit, iterations=iterations), weights
         return Fit(x, False, f"not converged: new weights still move it by {moved:.1e}", iterations), weights
 

@@ -162,7 +162,9 @@ def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot
         *(*result.findings, *result.reservations),
         *section("Expected error, by the covariance of the calibration", size_table(found), *percentages(found)),
         *section(f"Where it is largest{in_part}", *_worst_in_words(found, robot, names)),
-        *section("Parameters that it comes from", _responsible(found, result)),
+        *section(
+            "Parameters that it comes from (fall of the mean square if known exactly)", _responsible(found, result)
+        ),
         *section("Configurations", *listed),
         *section("Notes", *_prediction_notes(found, robot)),
     )
@@ -225,7 +227,7 @@ def _responsible(found: PredictedErrors, result: Result) -> Table:
     worst = () if found.worst is None else found.worst.responsible
     every, there = ({p.name: p.share for p in of} for of in (found.responsible, worst))
     rows = [(name, every.get(name), there.get(name), classes[name]) for name in every | there]
-    return table_of(("known, reduces the square", "of all|.0%", "where largest|.0%", "class"), rows)
+    return table_of(("", "of all|.0%", "where largest|.0%", "class"), rows)
 
 
 def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Table:

@@ -15,14 +15,11 @@ from tolerances import rounding
 
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
-from fg_calib.baseline.least_squares import fit_least_squares
-from fg_calib.graph.build import problem_of
 from fg_calib.inputs import InputError, Options
 from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot
 from fg_calib.job import Job
-from fg_calib.measurements.table import Table
 from fg_calib.report.compare import comparison_document
 from fg_calib.robot.kinematics import pose
 
@@ -94,24 +91,6 @@ def test_all_estimators_run_on_the_same_job(simulated_job):
     assert weighted.predicted_position_rms == pytest.approx(keep.predicted_position_rms, rel=2e-3)
 
 
-@pytest.mark.slow
-def test_a_prediction_is_the_trace_of_the_propagated_covariance(simulated_job):
-    found = compare(simulated_job)
-    job, weighted = simulated_job, found.estimates[3]
-    readings = job.measurements.readings[job.measurements.test]
-    fit = fit_least_squares(job.robot, problem_of(job).data, names=list(weighted.sigma), weighted=True)
-    total = 0.0
-    for q in readings:
-        G = np.empty((3, len(fit.names)))
-        for k, name in enumerate(fit.names):
-            step = np.zeros(len(fit.robot.nominal))
-            step[fit.robot.index(name)] = 1e-6
-            up, down = (tool_pose(fit.robot.with_values(fit.robot.nominal + h), q)[:3, 3] for h in (step, -step))
-            G[:, k] = (up - down) / 2e-6
-        total += np.trace(G @ fit.covariance @ G.T)
-    assert weighted.predicted_position_rms == pytest.approx(np.sqrt(total / len(readings)), rel=1e-6)
-
-
 @pytest.mark.parametrize("prefer", [(), ("theta4", "d4")])
 def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
     """What is held of an unknown tool stays at nominal, not where the closed form would start it."""
@@ -143,11 +122,9 @@ def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
     assert (found.judged_on, found.n_judged, found.errors_before) == ("train", 85, None)
     assert all(e.errors is None for e in found.estimates)
     text = format_comparison(found)
-    assert "judged at 85 train configurations" in text
     assert "  no test rows: judged at the train configurations, which is optimistic for every estimator" in text
     assert "  the truth is unknown: no real errors (key truth of a job)" in text
     assert "Real error" not in text
-    assert "truth " not in text.partition("Corrections")[2].partition("Estimators")[0]
 
 
 @pytest.mark.slow
@@ -196,41 +173,12 @@ def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "instrument",
-    [
-        *("targets", "targets nearly", "targets stations", "anchors offset"),
-        *(
-            "planes",
-            "pixels",
-        ),
-    ],
+    ["targets", "targets stations", "anchors offset", "planes", "pixels"],
 )
 def test_plain_least_squares_finds_the_graphs_optimum_of_every_instrument(instrument, tmp_path):
     """Two roads that share residuals alone, places and frames unknown to both: to a thousandth of a sigma."""
     robot, true, table = measured_by(instrument, np.random.default_rng(0))
     _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("instrument", ["anchors", "board"])
-def test_of_one_row_a_configuration_joint_noise_weighs_as_in_the_graph(instrument, tmp_path):
-    robot, true, table = measured_by(instrument, np.random.default_rng(0), sigma_joint=5e-4)
-    _same_optimum(compare(Job(tmp_path / "job.yaml", robot, (table,), Options(), true)))
-
-
-@pytest.mark.slow
-def test_several_tables_have_one_optimum_and_are_told_of_together(tmp_path):
-    """Each table has its own model and frame; the test configurations of all of them judge."""
-    rng = np.random.default_rng(1)
-    robot, true, lengths = measured_by("anchors", rng, n_test=6)
-    q = rng.uniform(-2.0, 2.0, (25, 4))
-    seen = measure(true, 25, rng, frame=FRAME, sigma=(1e-4, 1e-4), readings=q)
-    tables = (lengths, Table(seen, "position", frame="unknown"))
-    found = compare(Job(tmp_path / "job.yaml", robot, tables, Options(), true))
-    _same_optimum(found)
-    assert (found.judged_on, found.n_judged) == ("test", 6)
-    assert format_comparison(found).startswith("small-arm: anchor + position, judged at 6 test configurations\n")
-    document = comparison_document(found)
-    assert (document["model"], document["frame"], document["pairing"]) == ("anchor + position", "unknown", None)
 
 
 def _same_optimum(found):
@@ -289,89 +237,25 @@ def test_an_arm_that_was_only_moved_has_no_error_after_the_fit():
 @pytest.mark.slow
 def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
     found = compare(simulated_job)
-    text = format_comparison(found)
-    lines = text.splitlines()
+    lines = format_comparison(found).splitlines()
     assert lines[0] == "space-robot: distance-rotation, judged at 25 test configurations"
     assert lines[2].split() == ["nominal", "graph", "graph-keep", "gauss-newton", "scipy"]
     errors = [found.errors_before, *(e.errors for e in found.estimates)]
 
-    def figures(label, after="Real error in the base frame"):
-        section = lines[lines.index(after) :]
-        line = next(line for line in section if line.strip().startswith(label))
-        return line.split(label)[1].split()
+    def values(label, after="Real error in the base frame"):
+        row = next(line for line in lines[lines.index(after) :] if line.strip().startswith(label))
+        return row.split(label)[1].split()
 
-    assert figures("max") == ["mm", *(f"{e.base_frame.max * 1e3:.3f}" for e in errors)]
-    assert figures("orientation rms") == ["deg", *(f"{np.rad2deg(e.base_frame.orientation_rms):.4f}" for e in errors)]
-    fitted = [f"{e.best_rigid_fit.rms * 1e3:.3f}" for e in errors]
-    assert figures("rms", "Real error after the best rigid fit") == ["mm", *fitted]
-    predicted = [f"{e.predicted_position_rms * 1e3:.3f}" for e in found.estimates]
-    assert figures("predicted position rms", "Error predicted by its sigmas") == [
-        "mm",
-        "-",
-        *predicted,
-    ]
+    assert values("max") == ["mm", *(f"{e.base_frame.max * 1e3:.3f}" for e in errors)]
+    assert values("orientation rms") == ["deg", *(f"{np.rad2deg(e.base_frame.orientation_rms):.4f}" for e in errors)]
     angles = [np.rad2deg(e.residual_rms["test"]["angle"]) for e in found.estimates]
-    assert figures("angle", "Residuals, test rows (RMS)")[2:] == [f"{a:.4f}" for a in angles]
-    assert figures("n estimated") == ["-", "35", "23", "23", "23"]
-    assert figures("converged") == ["-", "yes", "yes", "yes", "yes"]
+    assert values("angle", "Residuals, test rows (RMS)")[2:] == [f"{a:.4f}" for a in angles]
+    assert values("n estimated") == ["-", "35", "23", "23", "23"]
+    assert values("converged") == ["-", "yes", "yes", "yes", "yes"]
     a2 = next(line for line in lines if line.startswith("a2 "))
     shown = [f"{found.correction(e.robot, 'a2') * 1e3:+.3f} ±{e.sigma['a2'] * 1e3:.3f}" for e in found.estimates]
     truth = f"{found.correction(simulated_job.truth, 'a2') * 1e3:+.3f}"
     assert a2.split() == ["a2", "mm", truth, *" ".join(shown).split()]
-    a1 = next(line for line in lines if line.startswith("a1 "))
-    assert a1.split()[-3:] == ["fixed"] * 3
-    assert all(len(line) <= 100 for line in lines)
-    assert "…" not in text
-    assert " -0.000 " not in text
-
-
-@pytest.mark.slow
-def test_a_doubtful_graph_is_doubtful_in_the_comparison(simulated_job):
-    m = simulated_job.measurements
-    optimistic = replace(m, sigma_position=m.sigma_position / 20, sigma_orientation=m.sigma_orientation / 20,
-                         sigma_joint=m.sigma_joint / 20)  # fmt: skip
-    found = compare(replace(simulated_job, measurements=optimistic))
-    assert not found.trustworthy
-    assert format_comparison(found).splitlines()[1].startswith("DOUBTFUL: reduced chi-square")
-    assert comparison_document(found)["trustworthy"] is False
-
-
-def _refuse(constant):
-    raise AssertionError(f"{constant} is no JSON")
-
-
-@pytest.mark.slow
-def test_comparing_the_bundled_example(fg_calib, whole_example):
-    example = whole_example
-    job = example / "calibration.yaml"
-    text = job.read_text().replace("truth:", "# truth:")
-    job.write_text(text)
-    ended = fg_calib("compare", job, "--json", "--out", example / "out")
-    assert (ended.code, ended.err) == (0, "")
-    document = json.loads(ended.out, parse_constant=_refuse)
-    written = json.loads((example / "out" / "comparison.json").read_text(), parse_constant=_refuse)
-    assert list(written) == list(document)
-    assert [f.name for f in (example / "out").iterdir()] == ["comparison.json"]
-    assert document["schema"] == "fg-calib/comparison/1"
-    assert (document["robot"], document["model"], document["pairing"]) == ("space-robot", "distance-rotation", "star")
-    assert (document["judged_on"], document["n_judged"], document["truth_known"]) == ("test", 500, False)
-    assert document["nominal"]["errors"] is None
-    assert [e["name"] for e in document["estimates"]] == list(ESTIMATORS)
-    # Without priors the arm is worse than nominal far from where it was seen.
-    rms = [e["residual_rms"]["test"]["distance"] for e in (document["nominal"], *document["estimates"])]
-    assert rms[1] < rms[0] < min(rms[2:])
-    for e in document["estimates"]:
-        assert (e["ran"], e["converged"], e["errors"]) == (True, True, None)
-        assert "position" not in e["residual_rms"]["test"]
-        assert e["residual_rms"]["test"]["distance"] > 0.0
-        assert len(e["parameters"]) == 30
-        for p in e["parameters"]:
-            assert p["correction"] == p["estimate"] - p["nominal"]
-            assert p["true"] is None
-            assert p["held"] == (p["sigma"] is None) == (p["correction"] == 0.0)
-            assert p["held"] or p["sigma"] > 0.0
-        assert sum(not p["held"] for p in e["parameters"]) == e["n_estimated"]
-    assert "poses.csv" in document["inputs"]
 
 
 @pytest.mark.slow
@@ -380,7 +264,10 @@ def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simula
     ended = fg_calib("compare", job)
     assert (ended.code, ended.err) == (0, "")
     assert "Real error in the base frame" in ended.out
-    document = json.loads(fg_calib("compare", job, "--json").out, parse_constant=_refuse)
+    document = json.loads(fg_calib("compare", job, "--json", "--out", simulated_folder / "out").out)
+    written = json.loads((simulated_folder / "out" / "comparison.json").read_text())
+    assert list(written) == list(document)
+    assert [e["name"] for e in document["estimates"]] == list(ESTIMATORS)
     given = read_job(job)
     q = given.measurements.readings[given.measurements.test]
     for e in document["estimates"]:

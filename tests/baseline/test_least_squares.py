@@ -90,8 +90,6 @@ def test_weighted_by_joint_noise_it_is_the_graph(model):
     covariance = assess(solution).spread.named()  # what was left out counts as known in plain least squares
     closely = max(closely, 1e-6)
     assert fit.covariance == pytest.approx(covariance, rel=closely, abs=closely * np.abs(covariance).max())
-    plain = fit_least_squares(robot, measurements, model=model, names=names)
-    assert np.abs(plain.robot.nominal - fit.robot.nominal).max() > 1e-5
 
 
 def test_a_row_that_was_not_measured_does_not_weigh_on_the_other_of_its_pair():
@@ -213,19 +211,6 @@ def test_what_the_measurements_leave_open_has_no_sigma():
     assert np.all(np.isnan(fit.covariance))
 
 
-def test_without_a_row_too_many_the_residuals_say_nothing():
-    two = planar_measurements(np.array([1e-3, 1e-3]))
-    pairs = Pairs(*(np.array([v]) for v in (0, 1, 2.001, np.nan, 1e-3, np.nan, False)))
-    robot = planar_robot()
-    fit = fit_least_squares(robot, replace(two, pairs=pairs), model="distance", names=["a2"])
-    assert (fit.converged, fit.n_rows) == (True, 1)
-    assert fit.robot.nominal[robot.index("a2")] == pytest.approx(1.0005)
-    assert np.isnan(fit.sigma["a2"])
-    assert np.isfinite(
-        fit_least_squares(robot, replace(two, pairs=pairs), model="distance", names=["a2"], weighted=True).sigma["a2"]
-    )
-
-
 # --- rows, ends, messages ---------------------------------------------------------------------------------------------
 
 
@@ -273,14 +258,6 @@ def test_a_fit_says_when_no_step_is_possible(weighted):
     said = ("diverged: residuals are not finite after 0 steps", "no step possible: ")[weighted]
     assert (fit.converged, fit.message[: len(said)]) == (False, said)
     assert np.isfinite(fit.robot.nominal).all()
-
-
-def test_weighted_it_takes_fewer_rows_than_unknowns():
-    robot = paper_robot()
-    measurements = replace(simulated(robot, "pose"), test=np.arange(80) >= 4)
-    fit = fit_least_squares(robot, measurements, model="pose", weighted=True)
-    assert fit.n_rows == 24
-    assert pose(fit.robot, measurements.readings[:4]).position == pytest.approx(measurements.position[:4], abs=1e-7)
 
 
 ROBOT = planar_robot()

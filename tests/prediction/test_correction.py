@@ -66,14 +66,6 @@ def test_the_pose_to_command_is_where_the_nominal_arm_finds_these_joint_values(c
     assert given.far.tolist() == (np.abs(given.readings - q) > 0.1).any(axis=1).tolist()
 
 
-def test_a_program_of_joint_values_alone_means_the_nominal_poses(calibrated):
-    robot, _, found = calibrated
-    q, T = some(robot)
-    given, same = correct(found, near=q), correct(found, T[:, :3, 3], T[:, :3, :3], near=q)
-    assert given.readings == pytest.approx(same.readings, abs=1e-9)
-    assert given.uncorrected == pytest.approx(same.uncorrected, abs=1e-9)
-
-
 def test_positions_alone_take_any_orientation_and_stay_near(calibrated):
     robot, _, found = calibrated
     q, T = some(robot)

@@ -7,7 +7,7 @@ from tolerances import rounding
 
 from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, predict, solve
 from fg_calib.prediction import workspace
-from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
+from fg_calib.prediction.tool_pose import ToolPoseUncertainty
 from fg_calib.prediction.workspace import predict_errors, summed_up
 from fg_calib.robot import pose
 from fg_calib.robot.model import Joint, RobotBuilder
@@ -118,14 +118,6 @@ def test_a_slide_without_limits_is_drawn_between_its_readings():
     assert (slides.min() >= 0.1 - 1e-3, slides.max() <= 0.9 + 1e-3) == (True, True)  # nominal, but for its estimate
 
 
-def test_measured_configurations_have_the_error_after_the_best_fit_that_is_expected_there(calibrated):
-    result, m = calibrated
-    found = ToolPoseUncertainty.of(result.posterior, m.readings).at(m.readings).fitted
-    _, fitted = errors_at(result.posterior, m.readings)
-    rms = np.sqrt(np.mean(found**2, axis=0))
-    assert rms == pytest.approx([fitted.position, fitted.orientation], rel=1e-7)
-
-
 def test_what_a_parameter_is_responsible_for_goes_when_it_is_known(calibrated):
     """The covariance conditioned on one parameter, by its own formula."""
     result, _ = calibrated
@@ -190,17 +182,6 @@ def test_what_cannot_be_used_is_one_line(calibrated, given, message):
     with pytest.raises(InputError, match=message) as caught:
         predict(calibrated[0], **given)
     assert "\n" not in str(caught.value)
-
-
-def test_an_arm_that_was_only_evaluated_has_no_expected_error():
-    rng = np.random.default_rng(8)
-    robot = small_arm(tolerance=LARGE)
-    m = measure(robot, 20, rng)
-    all_test = Measurements.from_arrays(
-        m.readings, position=m.position, sigma_position=1e-4, test=np.ones(20, dtype=bool)
-    )
-    with pytest.raises(InputError, match="only evaluated"):
-        predict(calibrate(robot, all_test, model="position"))
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import Robot
-from fg_calib.prediction.correction import misses, reach
+from fg_calib.prediction.correction import reach
 from fg_calib.robot import pose
 from fg_calib.robot.inverse import REACHED, random_readings
 
@@ -32,19 +32,6 @@ def test_a_pose_out_of_reach_is_reached_at_its_point_with_the_tool_turned_least(
     best = minimize(turn, NEAR + 1e-3, constraints=held, method="SLSQP", options={"ftol": 1e-14, "maxiter": 500})
     assert found.miss_rotation[0] == pytest.approx(turn(found.readings[0]), abs=1e-12)
     assert found.miss_rotation[0] <= best.fun + 1e-7  # SLSQP's own accuracy, by finite differences
-
-
-@pytest.mark.slow
-def test_what_can_be_reached_is_reached_and_what_cannot_is_missed_by_what_is_said():
-    robot = small_arm()
-    T = tool_pose(robot, NEAR)
-    far = np.array([30.0, 0.0, 0.0])
-    found = reach(robot, np.array([T[:3, 3], far]), np.array([T[:3, :3]] * 2), np.array([NEAR + 0.05] * 2))
-    assert found.reached.tolist() == [True, False]
-    assert found.miss_position[1] == pytest.approx(np.linalg.norm(far - tool_pose(robot, found.readings[1])[:3, 3]))
-    off, turned = misses(robot, found.readings, np.array([T[:3, 3], far]), None)
-    assert off == pytest.approx(found.miss_position, abs=1e-12)
-    assert (turned == 0.0).all()
 
 
 SEVEN = [[0, 0, 0.34, 0], [0, -np.pi / 2, 0, 0], [0, np.pi / 2, 0.4, 0], [0, np.pi / 2, 0, 0], [0, -np.pi / 2, 0.4, 0],

@@ -12,7 +12,7 @@ from simulated import measure, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
 from fg_calib.calibration import write_report
-from fg_calib.report.charts import Scale, limits_of, short
+from fg_calib.report.charts import Scale
 from fg_calib.report.html import build_page
 
 WEAKLY = "Weakly determined (sigma above a tenth of the prior sigma, or of 1 mrad at the reach)"
@@ -85,13 +85,6 @@ def test_the_verdict_comes_first_with_its_values(made, page):
     assert expected in tiles
 
 
-def test_every_estimated_parameter_is_in_a_table_with_its_estimate(made, page):
-    rows = {text_of(row[0]): text_of(row[1]) for row in page.xpath("//table//tr[td]") if len(row) == 8}
-    for p in made.result.estimated:
-        factor = 1e3 if p.unit == "m" else 180.0 / np.pi
-        assert float(rows[p.name]) == pytest.approx(p.estimate * factor, abs=1e-4)
-
-
 def test_page_and_text_show_the_same_tables(made, page):
     text = " ".join(str(made).split())
     for row in page.xpath("//section[h2 = 'Parameters' or h2 = 'Goodness of fit (1 sigma of a row)']//tr[td]"):
@@ -138,18 +131,6 @@ def test_without_tables_the_page_says_what_is_missing(folder, tmp_path):
     assert "no table of residuals: calibrate again with --out and without --residuals none" in page
 
 
-def test_a_page_that_is_not_ours_is_not_replaced(folder, tmp_path, fg_calib):
-    (tmp_path / "report.html").write_text("mine")
-    ended = fg_calib("report", folder, "--out", tmp_path)
-    assert ended.code == 1
-    assert "report.html: is there already, not written by this command" in ended.err
-
-
-def test_cross_validation_is_a_table():
-    page = text_of(html.fromstring(build_page(calibrated(folds=3).report_data)))
-    assert "Cross-validation (3 folds of configurations, each predicted without it; RMS) held out before" in page
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("instrument", ["anchors", "planes", "board", "targets"])
 def test_every_instrument_has_a_page(instrument):
@@ -173,12 +154,3 @@ def test_ticks_are_round_and_within(low, high):
     assert low <= min(ticks) + 1e-12 * abs(high)
     assert max(ticks) <= high * (1.0 + 1e-12)
     assert f"{ticks[1] - ticks[0]:.6e}"[:8] in ("1.000000", "2.000000", "5.000000")
-
-
-def test_nothing_to_show_has_limits_too():
-    assert limits_of(np.full(3, np.nan)) == pytest.approx((-0.05, 1.05))
-    assert limits_of([2.0, 2.0]) == pytest.approx((1.9, 2.1))
-
-
-def test_a_long_name_keeps_its_end():
-    assert short("shoulder_pan_joint.roll") == "should…nt.roll"
