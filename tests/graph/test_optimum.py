@@ -250,7 +250,7 @@ def test_the_graph_has_one_factor_a_measurement_and_the_same_optimum_and_margina
             assert sum(isinstance(factor, kind) for factor in factors) == wanted
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    nearly = 1e-2 if "touches" in name else 1e-6  # contacts one by one have other derivatives than together
+    nearly = 5e-3 if "touches" in name else 1e-6  # contacts one by one have other derivatives than together
     values = gtsam.LevenbergMarquardtOptimizer(graph, problem.initial, parameters).optimize()
     assert graph.error(values) == pytest.approx(solution.weighted_cost, rel=1e-3 * nearly)
     assert graph.error(solution.values) == pytest.approx(solution.weighted_cost, rel=1e-6)
