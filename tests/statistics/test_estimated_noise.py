@@ -7,6 +7,7 @@ import pytest
 from dense import SeriesRows
 from instruments import TOLERANCE, measured_by
 from simulated import measure, small_arm, true_robot
+from sparing import as_case
 from touches import reach, reach_faces
 
 from fg_calib.assessment import assess
@@ -39,9 +40,11 @@ def touched(what, rng, n=36, n_points=3):
     return robot, Table(data, "anchor", known={"p0": KnownPoint(points[0])})
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("without_reasons", "without_mistakes")
-@pytest.mark.parametrize("instrument", [*TOUCHED, "board", "targets", "anchors", "planes"])
+@pytest.mark.parametrize(
+    "instrument",
+    ["faces", *(as_case(x, is_slow=True) for x in ("contacts", "board", "targets", "anchors", "planes"))],
+)
 def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(instrument):
     """All readings exchanged with those of other rows: the noise estimated is then as large as what was measured."""
     rng = np.random.default_rng(0)
