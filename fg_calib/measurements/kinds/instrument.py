@@ -242,7 +242,7 @@ class Instrument:
         nuisances = self._nuisances(m, kinds, lambda kind, names: np.array([places(kind, name) for name in names]))
         sizes = [math.prod(of.shape) for of in self.measured]
         data = np.zeros((n, sum(sizes)))
-        for kind, chosen in kinds:
+        for kind, chosen in (each for each in kinds if each[1].any()):
             rows = np.flatnonzero(chosen)
             at = Frames(poses.rotation[rows, None], poses.position[rows, None])
             nothing, noise = np.zeros((len(rows), kind.width)), np.zeros((len(rows), kind.residual_dim))
