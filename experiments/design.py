@@ -2,7 +2,7 @@
 
     python experiments/design.py [--quick] [--only QUESTION ...] [--workers 2]
 
-The paper's arm, its noise and priors, poses of the board in an unknown frame, 52 views chosen among candidates; beside
+The paper's arm, its noise and priors, poses of the board in an unknown frame, 52 views chosen among candidates; next to
 them 52 random candidates, and the smallest designed set that is as good as these. Each set is then measured and
 calibrated with true arms, frames and noise drawn anew: RMS error of the tool at the task's configurations after the
 best rigid fit, realised over what the design predicted.

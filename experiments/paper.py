@@ -117,7 +117,7 @@ DETERMINED = {"distance": 3, "distance-rotation": 4, "pose": 5}
 """How many of `SUMS` a model determines."""
 
 ESTIMATORS = ("least squares", "graph")
-"""Plain least squares as in the paper (metres beside radians, its parameters), and the graph with priors."""
+"""Plain least squares as in the paper (metres and radians alike, its parameters), and the graph with priors."""
 
 
 def paper_scenario(frame: Any = "base", **views: Any) -> Scenario:
@@ -184,7 +184,7 @@ def arm_of_table_2() -> Robot:
 
 
 def identify(task: Task) -> Row:
-    """Classes of one model beside the paper's, and the same directions through GTSAM's graph."""
+    """Classes of one model against the paper's, and the same directions through GTSAM's graph."""
     (model,) = task
     robot = arm_of_table_2()
     found = observe_structure(robot, model, n_configurations=200, seed=0).observability
@@ -345,7 +345,7 @@ def _errors_of(robot: Robot, true: Robot, readings: Floats) -> list[float]:
 
 
 def validation_summary(tasks: Sequence[Task], rows: Sequence[Row]) -> Row:
-    """Rows by model, beside the paper's Table 10."""
+    """Rows by model, against the paper's Table 10."""
     return {m: row | {"paper": PAPER_TABLE_10[m]} for (m, _), row in zip(tasks, rows, strict=True)}
 
 

@@ -36,7 +36,7 @@ from matplotlib.figure import Figure
 ADAPTERS = HERE / "peer_adapters"
 sys.path.insert(0, str(ADAPTERS))
 
-import works  # noqa: E402 - beside the adapters, for the peers' processes too
+import works  # noqa: E402 - next to the adapters, for the peers' processes too
 
 CAP = 120.0
 """Seconds after which a solve is ended, and processor seconds after which no further draw is begun."""

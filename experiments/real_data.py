@@ -1,4 +1,4 @@
-"""Real arms: held-out errors before and after calibration, beside independent references.
+"""Real arms: held-out errors before and after calibration, against independent references.
 
     FG_CALIB_DATA=FOLDER python experiments/real_data.py [--quick] [--only QUESTION ...]
 

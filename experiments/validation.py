@@ -1,4 +1,4 @@
-"""Simulated calibrations beside their truth: are sigmas honest, and is what is said of the arm true?
+"""Simulated calibrations against their truth: are sigmas honest, and is what is said of the arm true?
 
     python experiments/validation.py [--quick] [--only QUESTION ...] [--draws N] [--workers 2]
 
@@ -14,7 +14,7 @@ the truth.
 | instruments | which instrument for how many poses: error of the tool at 10 to 80 poses |
 | anchors | lengths to three unknown anchors without priors, over the Cramer-Rao bound |
 | outliers | 10 and 30 % of rows wrong by up to 50 sigma, by loss, over the fit without them |
-| monitoring | `check` of healthy arms and of slipped joints, `update` beside a calibration of all rows |
+| monitoring | `check` of healthy arms and of slipped joints, `update` against a calibration of all rows |
 | prior_scales | `tolerance: estimate` where true errors are 0.1 to 10 times the prior sigmas |
 
 Values: NEES, e^T C^-1 e over the number of parameters, 1 where the covariance is true, with 99 % bounds by chance;

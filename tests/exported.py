@@ -1,4 +1,4 @@
-"""Arms of several conventions, as drawn and a little off, and what others compute of them."""
+"""Arms of several conventions, nominal and a little off, and what others compute of them."""
 
 import warnings
 
@@ -40,7 +40,7 @@ TREE = """<?xml version='1.0'?>
     <parent link="column"/><child link="plate"/></joint>
   <joint name="turn" type="continuous"><origin xyz="0 0 0.1"/>
     <parent link="plate"/><child link="upper"/><axis xyz="1 2 -3"/></joint>
-  <joint name="bend" type="revolute"><origin xyz="0.4 0 0" rpy="0 1.5707963267948966 0.2"/>
+  <joint name="swivel" type="revolute"><origin xyz="0.4 0 0" rpy="0 1.5707963267948966 0.2"/>
     <parent link="upper"/><child link="lower"/><axis xyz="0 -1 0"/>
     <limit lower="-2" upper="1.5" effort="1" velocity="1"/></joint>
   <joint name="roll" type="continuous"><!-- no axis: x --><origin rpy="0.5 0 0" xyz="0.3 0.02 0"/>

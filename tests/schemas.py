@@ -2,7 +2,7 @@
 
 
 def without_defaults(schema):
-    """A schema without what holds unsaid too: later pydantics write it of any mapping, earlier ones beside `const`."""
+    """A schema without what holds unsaid too: later pydantics write it of any mapping, earlier ones next to `const`."""
     if isinstance(schema, list):
         return [without_defaults(item) for item in schema]
     if not isinstance(schema, dict):

@@ -209,7 +209,7 @@ def test_public_names_come_from_a_fresh_import():
 
 
 def test_all_that_is_imported_is_installed_with_the_package():
-    """What the tests need beside, such as yourdfpy, is not; an extra is imported by one module."""
+    """What the tests need besides, such as yourdfpy, is not; an extra is imported by one module."""
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     installed = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
     installed = {name.replace("-", "_") for name in installed} - {"pyyaml"} | {

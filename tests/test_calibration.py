@@ -161,7 +161,7 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
         with pytest.raises(InputError, match="it was loaded from a folder"):
             getattr(again, nothing)
     with pytest.raises(InputError, match="it was loaded from a folder"):
-        again.save(tmp_path / "elsewhere")
+        again.save(tmp_path / "again")
 
 
 @pytest.mark.slow

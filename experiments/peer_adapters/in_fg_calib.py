@@ -42,7 +42,7 @@ class Prepared(protocol.Peer):
 
 
 class Calibrate(Prepared):
-    """`calibrate()`: built, solved, looked at from elsewhere, judged, with all covariances."""
+    """`calibrate()`: built, solved, started from other places, judged, with all covariances."""
 
     def solve(self) -> None:
         """One call."""

@@ -56,7 +56,7 @@ class Robotkinecal(protocol.Peer):
         """One figure a joint: the norm of four variances, lengths and angles together."""
         found = self.result.iteration_results[-1].get_statistics()["joints_uncertainty"]
         figures = np.asarray(found, dtype=float).ravel()
-        return {"states": f"the norm of four variances a joint, lengths beside angles ({len(figures)} figures)"}
+        return {"states": f"the norm of four variances a joint, lengths and angles in one ({len(figures)} figures)"}
 
 
 if __name__ == "__main__":

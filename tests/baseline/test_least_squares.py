@@ -38,7 +38,7 @@ def apart(fit, values):
 
 
 def simulated(robot, model, seed=1, *, sigma=NOISE, sigma_joint=0.0, n=80):
-    """Measurements whose rows all have one weight, metres and radians alike, the pairs' away from kinks."""
+    """Measurements whose rows all have one weight, metres and radians alike, the pairs' far from 0 and half a turn."""
     rng = np.random.default_rng(seed)
     measurements = measure(true_robot(robot, rng), n, rng, sigma=(sigma, sigma), sigma_joint=sigma_joint)
     if model in ("pose", "position", "orientation"):

@@ -35,7 +35,7 @@ def drawn(folder, board, rng, n=N, **of_views):
 
 @pytest.fixture(scope="module")
 def drawing(tmp_path_factory):
-    """Images of a checkerboard, board and camera beside them, and the true poses."""
+    """Images of a checkerboard, board and camera next to them, and the true poses."""
     folder = tmp_path_factory.mktemp("board")
     (folder / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD))
     (folder / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA)))

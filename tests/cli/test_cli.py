@@ -192,7 +192,7 @@ def test_json_puts_the_result_and_nothing_else_on_stdout(fg_calib, example):
     for document in (printed, written):
         assert document["solver"].pop("seconds") > 0
     assert printed.pop("files") == {}
-    assert set(written.pop("files")) == {"configurations.csv", "residuals.csv"}  # the tables that are beside it
+    assert set(written.pop("files")) == {"configurations.csv", "residuals.csv"}  # the tables next to it
     assert printed == written
 
 
@@ -268,7 +268,7 @@ def test_a_urdf_gives_a_calibrated_urdf_that_reads_back_to_the_estimates(fg_cali
     (tmp_path / "arm.urdf").write_text(TREE)
     nominal = read_robot(tmp_path / "arm.urdf", tip_link="tip")
     rng = np.random.default_rng(5)
-    error = {"bend.x": 0.002, "bend.roll": 0.003, "turn.z": -0.001}
+    error = {"swivel.x": 0.002, "swivel.roll": 0.003, "turn.z": -0.001}
     true = nominal.with_values([p.nominal + error.get(p.name, 0.0) for p in nominal.parameters])
     lower, upper = np.nan_to_num(nominal.limits, neginf=-2.5, posinf=2.5).T
     q = rng.uniform(lower, upper, (42, nominal.n_joints))

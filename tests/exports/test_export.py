@@ -266,7 +266,7 @@ def test_zeros_that_are_all_that_is_off_are_found(name, tmp_path):
 
 
 def shifted(robot, zeros):
-    """The robot whose joints stand elsewhere by their zeros: each moved in its own sense."""
+    """The robot whose joints stand at other angles by their zeros: each moved in its own sense."""
     from dataclasses import replace
 
     elements = tuple(

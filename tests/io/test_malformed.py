@@ -1,6 +1,6 @@
 """One table of malformed input over every format and command, with the whole message of each.
 
-More stand beside the tests of each reader. What an enemy would write: figures in other units, bases and spellings, keys
+More stand in the tests of each reader. What an enemy would write: figures in other units, bases and spellings, keys
 of another case, files of another kind or encoding, links in circles, control characters, numbers beyond all arithmetic.
 """
 

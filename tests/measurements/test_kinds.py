@@ -145,7 +145,7 @@ def test_the_mirror_image_of_a_plane_has_the_same_readings_in_the_mean():
     image = PlaneDistance().mirrored(points, np.array([[0.1], [0.3]]), np.concatenate([c, f]))
     there = Frames(np.tile(np.eye(3), (2, 1, 1, 1)), points[:, None])
     readings = PlaneDistance().rows(there, np.zeros((2, 1)), np.tile(image, (2, 1))).residual[:, 0]
-    assert readings == pytest.approx([0.3, 0.1], abs=rounding(1.0))  # from the other side, in the mean the same
+    assert readings == pytest.approx([0.3, 0.1], abs=rounding(1.0))  # reversed, in the mean the same
     assert PlaneDistance().mirrored(points, np.zeros((2, 1)), np.concatenate([c, f])) is None
 
 

@@ -13,7 +13,7 @@ from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 
 FINE = (5e-8, 1e-7)
-"""Noise so small that nothing bends: a thousandth of an instrument's."""
+"""Noise so small that all is linear: a thousandth of an instrument's."""
 
 
 def tables_of(sigma, unknown, model, rng, true, n=(30, 12)):
@@ -87,7 +87,7 @@ def test_targets_stay_known_although_a_month_does_not_see_them():
 
 
 def fine_arm(**more):
-    """An arm that is nearly as drawn, so that nothing bends."""
+    """An arm that is nearly nominal, so that all is linear."""
     robot = arm(**more)
     tolerance = {p.name: 1e-3 * p.tolerance for p in robot.parameters if p.tolerance}
     return replace(robot, parameters=tuple(replace(p, tolerance=tolerance.get(p.name)) for p in robot.parameters))

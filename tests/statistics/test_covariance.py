@@ -180,7 +180,7 @@ def test_frame_estimate_is_world_T_base():
     )
     found = uncertainty.estimates.frame
     turned = Rotation.from_quat(found.quaternion_xyzw).inv() * frame[0]
-    # the base itself is not determined beside the frame: where its columns are open, the frame moves with them
+    # the base itself is not determined next to the frame: where its columns are open, the frame moves with them
     assert turned.magnitude() < 0.01
     assert found.xyz == pytest.approx(frame[1], abs=0.01)
 

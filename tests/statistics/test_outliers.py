@@ -21,7 +21,7 @@ TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 @pytest.mark.slow
 @pytest.mark.parametrize("swapped", [3, 4])
 def test_anchors_exchanged_where_the_fit_goes_far_astray_are_outliers(swapped):
-    """Half a metre, beside one row too many a parameter."""
+    """Half a metre, and one row too many a parameter."""
     robot, _, table = measured_by("anchors", np.random.default_rng(10), n=45)
     m = table.measurements
     anchor = m.labels["anchor"]

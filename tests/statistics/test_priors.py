@@ -89,7 +89,7 @@ def test_the_normal_approximation_is_near_a_skew_posterior_on_a_fine_grid():
 
 
 def test_a_group_that_rows_do_not_determine_goes_with_the_others():
-    """As far as a common factor explains these, and it is known no better than a group is beside the others."""
+    """As far as a common factor explains these, and it is known no better than a group is against the others."""
     *_, corrections = drawn(np.random.default_rng(4), [10.0, 10.0, 1.0], rows=200, noise=1e-3, unseen=[5])
     found = fit_scales(corrections)
     assert found.mean.determined[2] == pytest.approx(0.0, abs=rounding())
