@@ -85,7 +85,7 @@ MOST_ANGLE = 4.0 * np.pi
 """How large an angle of a robot in rad may be: most of those in deg are larger."""
 
 MOST_LIMIT = 16.0 * np.pi
-"""How far a joint of limited range turns at most, [rad]: limits beyond that are told of as probably in deg."""
+"""How far a joint of limited range turns at most, [rad]: limits beyond that are warned of as probably in deg."""
 
 IN_RAD = "angles in rad, two turns at most"
 """What is expected instead."""
@@ -191,7 +191,7 @@ class Element:
     def __post_init__(self) -> None:
         """Check that a basis has a coefficient and nothing else."""
         if self.basis is not None and (self.parameter is None or self.joint is not None or self.constant != 0.0):
-            raise InputError("element", "a basis beside a constant or a reading", "a basis and its parameter alone")
+            raise InputError("element", "a basis with a constant or a reading", "a basis and its parameter alone")
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ class Robot:
     urdf: UrdfSource | None = field(default=None, repr=False)
 
     from_urdf: ClassVar[Callable[..., Robot]]
-    """`files.urdf.read_urdf`, attached by the package: this folder knows nothing of files."""
+    """`io.urdf.read_urdf`, attached by the package: this folder knows nothing of files."""
 
     @classmethod
     @checked
@@ -530,7 +530,7 @@ class RobotBuilder:
             check_names(f"{place}: {key}", chosen, names_of(self._parameters))
         both = sorted(set(fixed) & set(estimate))
         if both:
-            raise InputError(f"{place}: estimate", f"{both[0]!r} stands under fixed too", "it under one of the two")
+            raise InputError(f"{place}: estimate", f"{both[0]!r} is under fixed too", "it under one of the two")
         tolerance = dict(tolerance or {})
         for key, figure in tolerance.items():
             check_number(f"tolerance: {key}", figure, above=True)

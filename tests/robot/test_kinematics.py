@@ -238,7 +238,7 @@ def test_coefficients_that_are_fixed_at_zero_do_nothing():
 
 
 def test_bases_that_make_no_sense_are_refused():
-    with pytest.raises(InputError, match="a basis beside a constant or a reading"):
+    with pytest.raises(InputError, match="a basis with a constant or a reading"):
         Element(Axis.RZ, parameter=0, joint=1, basis=Basis("sin", 1))
     rng = np.random.default_rng(9)
     robot = with_coefficients(random_robot("dh", 2, rng), rng)
