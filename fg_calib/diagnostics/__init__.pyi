@@ -1,5 +1,5 @@
 from .inspection import Inspection, inspect_job
-from .nominal_residuals import MAX_ROWS, Disagreements
+from .nominal_residuals import MAX_ROWS
 from .setup_check import SetupCheck, check_setup, check_tables, reporting
 from .unmodelled_effects import basis_of
 from .verdict import LIKE_NOISE, MOST_ESTIMATED, Verdict, chi2_in_words, judge, predicted_in_words, probability
@@ -8,7 +8,6 @@ __all__ = [
     "LIKE_NOISE",
     "MAX_ROWS",
     "MOST_ESTIMATED",
-    "Disagreements",
     "Inspection",
     "SetupCheck",
     "Verdict",

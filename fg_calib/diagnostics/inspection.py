@@ -14,9 +14,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fg_calib.diagnostics.linearity import find_ambiguous_rows
-from fg_calib.diagnostics.nominal_residuals import Disagreements, find_disagreements
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
-from fg_calib.diagnostics.verdict import Severity, Statement, listed, texts
+from fg_calib.diagnostics.verdict import Statement, listed, texts
 from fg_calib.graph import Problem, Solution, linear_system, problem_of, tables_of, unsolved
 from fg_calib.inputs import Brief, checked
 from fg_calib.job import Job
@@ -112,7 +111,6 @@ class Inspection(Brief):
         tables: Counts, table by table (a table seen from several stations is several).
         joints: The ranges of the readings.
         setups: Typical residuals of each table before calibration, and a mistake in its set-up if one explains them.
-        disagreements: Rows that disagree with the nominal arm far more than the others do.
         identifiability: What the train rows determine, at nominal.
         expected_error: How far off the calibrated tool is expected to be; None where the arm is only evaluated.
         n_residuals: Scalar residuals of the fit.
@@ -129,7 +127,6 @@ class Inspection(Brief):
     tables: tuple[TableSurvey, ...]
     joints: tuple[JointRange, ...]
     setups: tuple[SetupCheck, ...]
-    disagreements: Disagreements
     identifiability: Identifiability
     expected_error: ExpectedError | None
     n_residuals: int
@@ -163,10 +160,6 @@ def inspect_job(job: Job) -> Inspection:
     tables = tables_of(job.measurements, job.options)
     whole = problem.whole or problem
     judged = replace(whole, robot=job.robot) if problem.evaluated else whole
-    setups, disagreements = check_tables(judged, whole.start, with_landmarks=True), Disagreements()
-    if not any(check.explanations for check in setups):  # else all rows disagree
-        labels = problem.data.labels if len(tables) > 1 else ("",)
-        disagreements = find_disagreements(job.robot, tables, labels)
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
     n_directions = spread.rank + linear_system(problem, problem.start).left.rank
@@ -174,8 +167,7 @@ def inspect_job(job: Job) -> Inspection:
         robot=job.robot.name,
         tables=tuple(_survey(at_nominal, number, table) for number, table in enumerate(tables)),
         joints=_joints(problem, job.robot),
-        setups=tuple(setups),
-        disagreements=disagreements,
+        setups=tuple(check_tables(judged, whole.start, with_landmarks=True)),
         identifiability=identifiability_of(problem.whole or problem, problem.start, "practical"),
         expected_error=None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread)),
         n_residuals=problem.n_residuals,
@@ -237,27 +229,11 @@ def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
 
 
 def _check_setups(found: Inspection, job: Job) -> Iterator[Statement]:
-    """Check the set-up of each table; where single rows disagree with the arm the others are not to blame."""
+    """Check the set-up of each table, and the range of the readings."""
     arm = [p for p in job.robot.parameters if p.estimated and 1 <= p.owner <= job.robot.n_joints]
     has_priors = job.options.has_priors and all(p.tolerance is not None for p in arm)
-    wrong = {one.table for one in found.disagreements.found}
     for check in reporting(found.setups):
-        severity: Severity = "error" if check.explanations or has_priors else "note"
-        yield Statement(severity, str(check), check.explanations or check.table not in wrong)
-
-
-def _check_disagreements(found: Inspection, job: Job) -> Iterator[Statement]:
-    """Check single rows, and the range of the readings."""
-    wrong, loss = found.disagreements.found, job.options.loss
-    if wrong:
-        tables, tested = {one.table for one in wrong}, sum(one.test for one in wrong)
-        names = [f"{'-'.join(one.ends)}{f' of {one.table}' * (len(tables) > 1)}" for one in wrong]
-        of = f" of {wrong[0].table}" * (len(tables) == 1 and bool(wrong[0].table))
-        text = f"measurements that disagree with the nominal arm far more than the others do: {len(wrong)}"
-        text += f" ({listed(list(dict.fromkeys(names)))}{of})" + ": look at them" * bool(tested or loss == "none")
-        text += ", or let a robust loss do so (loss: gnc)" * (loss == "none" and tested < len(wrong))
-        text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
-        yield Statement("error" if tested or loss == "none" else "note", text)
+        yield Statement("error" if check.explanations or has_priors else "note", str(check))
     for joint in found.joints:
         text = f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
         yield Statement("error", text, joint.n_outside)
@@ -310,5 +286,5 @@ def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
     yield Statement("note", text, unseen)
 
 
-CHECKS = (_check_setups, _check_disagreements, _check_result, _check_tables)
+CHECKS = (_check_setups, _check_result, _check_tables)
 """The checks of a job, in the order of their statements."""

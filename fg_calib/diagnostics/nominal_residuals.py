@@ -4,48 +4,25 @@ The nominal arm, its unknown frames, tool and landmarks fitted to the rows, miss
 
     r = J e + n,    its length on average by the root of tr(J T^2 J^T + N)
 
-with J the derivatives in the arm's estimated parameters, T their prior sigmas (`USUAL_LENGTH` and `USUAL_ANGLE` where
-there are none) and N the covariance of the noise. The *excess* is the median length over the median expected: medians
-are not moved by a few gross errors. What is fitted takes up a part of the arm's errors, so healthy tables have an
-excess of a fifth to one.
-
-Measurements *disagree* with the nominal arm where their distance is far above the median of all,
-
-    d^2 = r^T (J T^2 J^T + N)^-1 r over the number of rows
-
-for all rows have the arm's errors in common, which may be larger or smaller than the prior sigmas. Frames, base, tool
-and landmarks are fitted to all rows, train and test, with Cauchy's weights. Pairs formed from poses are screened as
-these poses in an unknown frame, for one wrong pose spoils many pairs.
+with J the derivatives in the arm's estimated parameters, T their prior sigmas (`USUAL` where there are none) and N the
+covariance of the noise. The *excess* is the median length over the median expected: medians are not moved by a few
+gross errors. What is fitted takes up a part of the arm's errors, so healthy tables have an excess of a fifth to one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
-from fg_calib.graph import (
-    Problem,
-    RowNoise,
-    build_variables,
-    noises_at,
-    problem_of_tables,
-    relinearized_at,
-    tables_of,
-    take_steps,
-    whitening_of,
-)
+from fg_calib.graph import Problem, build_variables, noises_at, problem_of_tables, tables_of, take_steps
 from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
 from fg_calib.measurements import INSTRUMENTS, Instrument, Table, residuals
-from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
-from fg_calib.statistics import MAX_OUTLIER_SHARE
 
-USUAL_LENGTH, USUAL_ANGLE = 2e-3, 5e-3
+USUAL = {"m": 2e-3, "rad": 5e-3}
 """1 sigma of true minus nominal where a parameter has no prior: 2 mm and 5 mrad (0.3 degrees)."""
 
 MAX_ROWS, MAX_IMAGES, MAX_CORNERS = 60, 20, 8
@@ -173,29 +150,15 @@ def nominal_residuals(setup: Setup) -> tuple[TypicalResidual, ...]:
     """Residuals of a set-up by kind, frame, tool and landmarks fitted; empty if there are too few rows, or no fit."""
     options = Options(gauge="none")
     try:
-        problem = nominal_problem(setup.robot, tables_of(setup.table, options), options)
+        tables = [t.tested_on(np.ones_like(t.measurements.test)).by_itself() for t in tables_of(setup.table, options)]
+        problem = problem_of_tables(setup.robot, tables, options)  # of test rows alone: the arm stays at nominal
         located = setup.instrument.is_pose and not setup.has_landmarks  # in closed form
-        parameters = problem.start if located else fit_landmarks(problem)
+        parameters = problem.start if located else take_steps(problem, MAX_STEPS)
     except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
         return ()
     n_free = problem.variables.n_columns + problem.variables.n_nuisance
     enough = problem.n_residuals >= 2 * n_free + 6 + setup.has_landmarks * n_free
     return residuals_at(problem, parameters, setup.robot) if enough else ()
-
-
-def nominal_problem(robot: Robot, tables: Sequence[Table], options: Options) -> Problem:
-    """The problem of frames, base, tool and landmarks with the arm at nominal: every row is a test row."""
-    tests = [t.tested_on(np.ones(t.measurements.n_configurations, dtype=np.bool_)).by_itself() for t in tables]
-    return problem_of_tables(robot, tests, options)
-
-
-def fit_landmarks(problem: Problem) -> Floats:
-    """The parameter vector with frames, tool and landmarks fitted to the rows, whitened as at the start.
-
-    Args:
-        problem: A problem of the arm as it is (see `Problem.evaluated`).
-    """
-    return take_steps(problem, MAX_STEPS)
 
 
 def residuals_at(
@@ -206,200 +169,28 @@ def residuals_at(
     Args:
         problem: The problem; at most `3 * MAX_ROWS` rows of a series are looked at.
         parameters: The parameter vector.
-        robot: The robot with what is estimated of the arm.
+        robot: The robot with what is estimated of the arm, whose prior sigmas are usual ones where it has none.
         table: Number of the table that is asked for; all if None.
     """
     series = [s for s in problem.data.blocks if table in (None, s.table) and len(s.train) and s.kind.ends]
     some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in series)
-    sampled = replace(problem, data=replace(problem.data, blocks=some))
-    found: list[TypicalResidual] = []
-    for noise, of_arm in with_arm_errors(sampled, parameters, robot):
-        variance = np.einsum("nii->ni", of_arm) + noise.sigma**2
-        found += _by_kind(noise, noise.residual() ** 2, variance)
-    return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()
-
-
-def with_arm_errors(problem: Problem, parameters: Floats, robot: Robot) -> Iterator[tuple[RowNoise, Floats]]:
-    """The rows of each series, and their covariance by the arm's errors, shape (n, residual_dim, residual_dim).
-
-    Args:
-        problem: The problem.
-        parameters: The parameter vector.
-        robot: The robot with what is estimated of the arm, whose prior sigmas are usual ones where it has none.
-    """
-    variables, scale = build_variables(robot, [t.unknown_frame for t in problem.data.tables]), list[float]()
-    by_name = {p.name: p for p in robot.parameters if 1 <= p.owner <= robot.n_joints}
-    for name in variables.names:
-        p = by_name.get(name)
-        usual = 0.0 if p is None else USUAL_LENGTH if p.unit == "m" else USUAL_ANGLE
-        scale.append(usual if p is None or p.tolerance is None else p.tolerance)
+    variables = build_variables(robot, [t.unknown_frame for t in problem.data.tables])
+    arm = {p.name: p for p in robot.parameters if 1 <= p.owner <= robot.n_joints}
+    usual = {p.name: USUAL[p.unit] if p.tolerance is None else p.tolerance for p in arm.values()}
+    scale = np.array([usual.get(name, 0.0) for name in variables.names])
     values = np.concatenate([parameters[problem.variables.robot_span], parameters[problem.variables.frame_span]])
-    for noise in noises_at(problem, parameters):
+    found: list[TypicalResidual] = []
+    for noise in noises_at(replace(problem, data=replace(problem.data, blocks=some)), parameters):
         chain = variables.chains[noise.series.table].at(values)
         J = residuals.linearise(noise.rows_at(slice(None)), chain)[1][:, :, : len(scale)] * scale
-        yield noise, J @ np.swapaxes(J, 1, 2)
-
-
-def _by_kind(noise: RowNoise, squares: Floats, variance: Floats) -> Iterator[TypicalResidual]:
-    """Residuals of one series, by kind of noise.
-
-    Args:
-        noise: Its rows and their noise.
-        squares: Squared residual of each row, shape (n, residual_dim).
-        variance: Variance of each row by noise and the arm's errors, shape (n, residual_dim).
-    """
-    kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
-    for kind in dict.fromkeys(kinds.tolist()):
-        of = used & (kinds == kind)
-        rows = of.any(axis=1)
-        if rows.any():
-            size, expected = (float(np.median(np.sqrt(np.sum(v, axis=1, where=of)[rows]))) for v in (squares, variance))
-            yield TypicalResidual(kind, _UNITS.get(kind, "m"), size, max(expected, 1e-9), int(rows.sum()))
-
-
-# --- measurements that disagree ---------------------------------------------------------------------------------------
-
-MAX_SCREENED = 5000
-"""Rows of a table up to which all are screened; of more, so many that are evenly spaced."""
-
-DISAGREES = 5.0
-"""Distance from which a measurement disagrees, over the median one or the expected one, whichever is larger."""
-
-ROUNDS, HALF_WEIGHT = 4, 2.4
-"""Fits with weights by the distances before, and the distance over the typical one of a weight of one half."""
-
-
-@dataclass(frozen=True)
-class Disagreement:
-    """A measurement that disagrees with the nominal arm.
-
-    Attributes:
-        table: Name of its table; empty of one alone.
-        ends: Names of the configurations, or of what else it is between.
-        of: Its target, anchor or corner; empty where the table names none.
-        row: Row of the table, counted from 0; -1 of a pair.
-        kind: Kind of noise that is farthest off: `position`, `orientation`, `distance`, ...
-        unit: `m`, `rad` or `px`.
-        size: Length of the residual of that kind.
-        expected: 1 sigma of it by noise and prior sigmas.
-        ratio: Its distance over the typical one; `DISAGREES` and more.
-        test: Whether it is a test row.
-    """
-
-    table: str
-    ends: tuple[str, ...]
-    of: str
-    row: int
-    kind: str
-    unit: str
-    size: float
-    expected: float
-    ratio: float
-    test: bool
-
-
-@dataclass(frozen=True)
-class Disagreements:
-    """Measurements that disagree with the nominal arm, the farthest first.
-
-    Attributes:
-        found: The measurements; empty where there are none, or more than a few.
-        n: Number of measurements screened.
-        of: Number of measurements.
-    """
-
-    found: tuple[Disagreement, ...] = ()
-    n: int = 0
-    of: int = 0
-
-
-def find_disagreements(robot: Robot, tables: Sequence[Table], labels: Sequence[str]) -> Disagreements:
-    """The measurements that disagree with the nominal arm.
-
-    Args:
-        robot: The nominal robot.
-        tables: What was measured.
-        labels: Names of the tables.
-    """
-    chosen, found, n, of = [_sampled(table) for table in tables], list[Disagreement](), 0, 0.0
-    with one_blas_thread:
-        try:
-            problem = nominal_problem(robot, chosen, Options(gauge="none"))
-            rows = _distances(problem, problem.start, robot)
-            for _ in range(ROUNDS if problem.variables.keys else 0):
-                weights = tuple(share / (1.0 + (d / HALF_WEIGHT) ** 2) for *_, d, share in rows)
-                problem = relinearized_at(problem, problem.start, replace(problem.state, weights=weights))
-                problem = relinearized_at(problem, fit_landmarks(problem))
-                rows = _distances(problem, problem.start, robot)
-        except (InputError, ProblemError, SolverError, RuntimeError, np.linalg.LinAlgError):
-            return Disagreements()
-    for noise, covariance, d, _ in rows:
-        k = noise.series.table
-        whole, test = tables[k].measurements.n_configurations, chosen[k].measurements.test
-        n, of = n + int(np.sum(d > 0.0)), of + whole / len(test) * float(np.sum(d > 0.0))
-        for i in np.flatnonzero(d > DISAGREES).tolist():
-            found.append(_disagreement(problem, noise, i, covariance[i], (labels[k], float(d[i]), test)))
-    found = sorted(found, key=lambda one: -one.ratio) if len(found) <= MAX_OUTLIER_SHARE * n else []
-    return Disagreements(tuple(found), n, round(of))
-
-
-def _sampled(table: Table) -> Table:
-    """At most `MAX_SCREENED` rows of a table; pairs that would be formed from poses as these poses."""
-    m = table.measurements
-    m = m if m.part is not None else replace(m, part=np.arange(m.n_configurations))
-    if table.uses_pairs and m.pairs is not None:
-        return replace(table, measurements=replace(m, pairs=m.pairs.select(evenly(m.pairs.n_pairs, MAX_SCREENED))))
-    if m.groups is not None or table.own:
-        return replace(table, measurements=m)
-    m = m.select(evenly(m.n_configurations, MAX_SCREENED))
-    if not table.uses_pairs:
-        return replace(table, measurements=m)
-    model = ("orientation", "position", "pose")[2 * (m.position is not None) + (m.rotation is not None) - 1]
-    return replace(table, measurements=replace(m, labels={}), model=model, frame="unknown")
-
-
-_Rows = list[tuple[RowNoise, Floats, Floats, Floats]]
-
-
-def _distances(problem: Problem, parameters: Floats, robot: Robot) -> _Rows:
-    """The rows of each series, with covariance, distance over the typical one, and part of the noise in it."""
-    found: _Rows = []
-    for noise, of_arm in with_arm_errors(problem, parameters, robot):
-        of_noise, used = noise.total_at(slice(None)), noise.series.used
-        total = of_noise + of_arm
-        n_rows = used.sum(axis=1)
-        r = np.where(used, noise.residual(), 0.0)
-        z = np.linalg.norm(whitening_of(total, used) @ r[:, :, None], axis=(1, 2))
-        expected = np.sqrt(special.chdtri(np.maximum(n_rows, 1), 0.5))
-        typical = max(1.0, float(np.median((z / expected)[n_rows > 0]))) if n_rows.any() else 1.0
-        share = np.einsum("nii->n", of_noise) / np.einsum("nii->n", total)
-        found.append((noise, total, z / np.sqrt(np.maximum(n_rows, 1)) / typical, share))
-    return found
-
-
-def _disagreement(
-    problem: Problem, noise: RowNoise, k: int, covariance: Floats, found: tuple[str, float, NDArray[np.bool_]]
-) -> Disagreement:
-    """A measurement of a series that disagrees.
-
-    Args:
-        problem: The problem of all rows.
-        noise: The series' rows.
-        k: Number of the measurement.
-        covariance: Of its rows by noise and prior sigmas.
-        found: Name of its table, its distance, and which configurations are test rows.
-    """
-    s, data, (label, d, test) = noise.series, problem.data, found
-    kinds = np.array([name.partition(".")[0] for name in s.kind.names])
-    units = dict(zip(kinds.tolist(), s.kind.units, strict=True))
-    r = np.where(s.used[k], noise.residual()[k], 0.0)
-    sizes = {kind: float(np.linalg.norm(r[kinds == kind])) for kind in units}
-    expected = {kind: float(np.sqrt(np.diag(covariance)[kinds == kind].sum())) for kind in units}
-    kind = max(units, key=lambda kind: sizes[kind] / expected[kind])
-    part = data.tables[s.table].measurements.part
-    row = int(part[s.ends[k, 0]]) if part is not None and s.kind.ends == 1 else -1
-    landmarks = data.n_configurations + np.unique(data.landmarks.owners[s.nuisances[k]])
-    ends = tuple(data.names[i] for i in (data.places[s.table][s.ends[k]] if s.kind.ends else landmarks).tolist())
-    of = s.of.names[s.of.index[k]] if s.of is not None and s.of.index[k] >= 0 else ""
-    values = sizes[kind], expected[kind], d, bool(test[s.ends[k]].any())
-    return Disagreement(label, ends, of, row, kind, units[kind], *values)
+        squares, variance = noise.residual() ** 2, np.sum(J**2, axis=2) + noise.sigma**2
+        kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
+        for kind in dict.fromkeys(kinds.tolist()):
+            of = used & (kinds == kind)
+            rows = of.any(axis=1)
+            if rows.any():
+                size, expected = (
+                    float(np.median(np.sqrt(np.sum(v, axis=1, where=of)[rows]))) for v in (squares, variance)
+                )
+                found.append(TypicalResidual(kind, _UNITS.get(kind, "m"), size, max(expected, 1e-9), int(rows.sum())))
+    return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from itertools import combinations, permutations
 
 import numpy as np
@@ -76,14 +75,12 @@ class SetupCheck(Brief):
         explanations: Mistakes that explain them where they are too large, the simplest first.
         table: Which of several tables they are of; empty of one alone.
         others: Checks of others of several tables that report something too.
-        unchecked: Tables that could not be checked: too few rows, or custom kinds.
     """
 
     residuals: tuple[TypicalResidual, ...] = ()
     explanations: tuple[Explanation, ...] = ()
     table: str = ""
     others: tuple[SetupCheck, ...] = ()
-    unchecked: tuple[str, ...] = ()
 
     @property
     def excess(self) -> float:
@@ -166,8 +163,7 @@ def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -
     """
     checks = check_tables(problem, before, doubtful=doubtful, with_landmarks=doubtful)
     found = reporting(checks) or sorted(checks, key=lambda one: -one.excess)[:1]
-    unchecked = [label for label, one in zip(problem.data.labels, checks, strict=True) if not one.residuals]
-    return replace(found[0], others=tuple(found[1:]), unchecked=tuple(unchecked) if doubtful else ())
+    return replace(found[0], others=tuple(found[1:]))
 
 
 def reporting(checks: Sequence[SetupCheck]) -> list[SetupCheck]:
@@ -233,9 +229,9 @@ def _check_alone(setup: Setup, doubtful: bool, together: SetupCheck | None = Non
 def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
     """Mistakes that explain residuals, the simplest first; two together where no single one does."""
     # Where residuals are no larger than predicted only what has unknowns of its own can make them much smaller.
-    least = About.FRAME if given.excess < 1.0 else About.UNIT
-    single, most = [_trial(m) for m in setup_hypotheses(setup) if m.about >= least], given.excess / REDUCTION
-    found = _accepted(single, most)
+    least = HYPOTHESES.index((_frame,)) if given.excess < 1.0 else 0
+    single = [_trial(m) for m in setup_hypotheses(setup) if m.about >= least]
+    found = _accepted(single, given.excess / REDUCTION)
     return found if found or not given.far or setup.has_landmarks else _accepted(_doubles(single, given.excess), np.inf)
 
 
@@ -290,27 +286,17 @@ ANGLES = {np.pi / 180.0: "deg, not rad", 180.0 / np.pi: "rad, not deg"}
 """Units that are meant by values in another, by the factor that converts them."""
 
 
-class About(IntEnum):
-    """The subject of a mistake, the simplest first."""
-
-    UNIT = 0
-    COLUMNS = 1
-    JOINT = 2
-    FRAME = 3
-    TOOL = 4
-
-
 @dataclass(frozen=True)
 class Mistake:
     """A mistake in a set-up, undone.
 
     Attributes:
-        about: Its subject.
+        about: Place of its subject in `HYPOTHESES`: the simplest first.
         words: The end of a sentence "residuals fall if ...".
         without: The set-up with it undone.
     """
 
-    about: About
+    about: int
     words: str
     without: Setup
 
@@ -321,9 +307,8 @@ _Found = Iterator[tuple[str, Setup]]
 
 def setup_hypotheses(setup: Setup) -> Iterator[Mistake]:
     """Every mistake that is known, undone in a set-up."""
-    for about, hypothesis in HYPOTHESES:
-        for words, without in hypothesis(setup):
-            yield Mistake(about, words, without)
+    for about, hypotheses in enumerate(HYPOTHESES):
+        yield from (Mistake(about, *found) for hypothesis in hypotheses for found in hypothesis(setup))
 
 
 def _robot_in_units(setup: Setup) -> _Found:
@@ -482,14 +467,14 @@ def _tool(setup: Setup) -> _Found:
         yield words, setup.with_tool(frozenset(setup.tool if lengths else (*setup.tool[3:], *fitted)))
 
 
-HYPOTHESES: tuple[tuple[About, Callable[[Setup], _Found]], ...] = (
-    *((About.UNIT, found) for found in (_robot_in_units, _measured_in_units, _readings_in_units)),
-    *((About.COLUMNS, found) for found in (_inverted, _columns, _orientations, _conventions)),
-    (About.JOINT, _joint_columns),
-    (About.FRAME, _frame),
-    (About.TOOL, _tool),
+HYPOTHESES: tuple[tuple[Callable[[Setup], _Found], ...], ...] = (
+    (_robot_in_units, _measured_in_units, _readings_in_units),
+    (_inverted, _columns, _orientations, _conventions),
+    (_joint_columns,),
+    (_frame,),
+    (_tool,),
 )
-"""Hypotheses by what they are about."""
+"""Hypotheses on units, on the meaning of columns, on joints, on the frame and on the tool."""
 
 
 def _rotated(setup: Setup, rotation: Rotation, roll_pitch_yaw: Floats | None = None) -> Setup:

@@ -332,10 +332,8 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
     ambiguous = bool(rows.names) and (high or curved or rows.share >= AMBIGUOUS_SHARE)
     text = f"the sign of {len(rows.names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
     share = f"{100.0 * rows.share:.0f} % of the information rests on them"
-    text += (
-        f" ({listed(rows.names)} near 0 or 180 deg; {share}): there may be a better optimum far away, and sigmas may"
-    )
-    text += " be too small; leave these out, or measure longer and wider motions, in which more joints move"
+    text += f" ({listed(rows.names)} near 0 or 180 deg; {share}): there may be a better optimum far away, and sigmas"
+    text += " may be too small; leave these out, or measure longer and wider motions, in which more joints move"
     yield Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text, ambiguous)
     most = f" (most: {listed(nonlinear.rows)})" * bool(nonlinear.rows)
     beyond = f"some {np.sqrt(1.0 + nonlinear.directions):.2g}" if np.isfinite(nonlinear.directions) else "many"
@@ -391,10 +389,8 @@ def check_offsets(case: Case) -> Iterator[Statement]:
         of = f" of {labels[found.table]}" if len(labels) > 1 else ""
         adds = f"{1e3 * found.size:+.3g} mm"
         adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
-        text = (
-            f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: use offset: estimate,"
-        )
-        yield Statement("error" if high else "warning", f"{text} or calibrate the instrument")
+        text = f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: use offset:"
+        yield Statement("error" if high else "warning", f"{text} estimate, or calibrate the instrument")
 
 
 def check_missing(case: Case) -> Iterator[Statement]:
@@ -417,11 +413,6 @@ def check_setup(case: Case, *, fits: bool) -> Iterator[Statement]:
             yield Statement("note" if fits else "error", str(check))
         elif check.far and case.high:
             yield Statement("error", str(check))
-    if case.high and case.setup.unchecked:
-        text = f"the set-up of {', '.join(case.setup.unchecked)} was not checked for common mistakes (units, signs,"
-        yield Statement(
-            "note", f"{text} columns): too few rows to locate its landmarks, or custom kinds of measurement"
-        )
 
 
 def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
@@ -429,9 +420,8 @@ def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
     robot = case.problem.robot
     advice = "; measure positions, or pairs between which more joints move" if case.problem.pair_series else ""
     for other in case.solution.others:
-        here, there = (
-            at[case.problem.variables.robot_span] - robot.nominal for at in (case.solution.parameters, other)
-        )
+        both, span = (case.solution.parameters, other), case.problem.variables.robot_span
+        here, there = (at[span] - robot.nominal for at in both)
         apart = np.abs(there - here) / [p.scale for p in robot.parameters]
         words = []
         for i in [i for i in np.argsort(-apart, kind="stable")[:most].tolist() if apart[i] > 0.3 * apart.max()]:

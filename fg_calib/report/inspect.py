@@ -12,7 +12,7 @@ from rich.console import Group
 from rich.table import Table
 
 from fg_calib import __version__
-from fg_calib.diagnostics import MAX_ROWS, Disagreements, Inspection
+from fg_calib.diagnostics import MAX_ROWS, Inspection
 from fg_calib.inputs import checked
 from fg_calib.io import Observability as Document
 from fg_calib.io import fill_folder, write_text
@@ -114,7 +114,6 @@ def build_inspection_report(found: Inspection, job: Job) -> Group:
         *section("Tables", _tables(found), *_excluded_pairs(found)),
         *section("Joint readings", _joints(found)),
         *section(nominal, _residuals(found)),
-        *section("Rows that disagree with the nominal arm", *_disagreements(found.disagreements)),
         *section(determined, line(f"{counts}: {found.dof} degrees of freedom"), _class_table(o, groups)),
         *section("Not identifiable from these rows", tables.lost_directions(found.identifiability.lost)),
         *section(tables.WEAKLY, tables.weak_directions(o)),
@@ -166,18 +165,6 @@ def _residuals(found: Inspection) -> Table:
     return table_of(("", "|unit", "observed|q:.3g", "predicted|q:.3g", "ratio|.3g", ""), rows)
 
 
-def _disagreements(found: Disagreements, most: int = 5) -> list[Content]:
-    """Rows that disagree with the nominal arm, the farthest first."""
-    rows = [
-        ("-".join(one.ends), one.table, one.of, one.kind, one.size, one.expected, one.unit, "test" * one.test)
-        for one in found.found[:most]
-    ]
-    more = [f"and {len(found.found) - most} more"] if len(found.found) > most else []
-    compared = [f"{found.n} of {found.of} were compared"] if rows and found.n < found.of else []
-    columns = ("", "table", "of", "", "off by|q:.3g", "expected|q:.3g", "|unit", "")
-    return [table_of(columns, rows), *more, *compared]
-
-
 def _class_table(o: Observability, relative: Sequence[str]) -> Table:
     """Classes of the parameters."""
     classes = {"Independent": o.named("independent"), "Relative": relative, "Ineffective": o.named("ineffective")}
@@ -193,13 +180,12 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "tables": [the fields of `TableSurvey`], "joints": [the fields of `JointRange`, with "share" and "still"],
       "residuals": [{"table", "kind", "unit", "size", "expected", "excess", "n"}],
       "explanations": [{"table", "mistakes"}],
-      "disagreements": {"found": [the fields of `Disagreement`], "n", "of"},
       "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded": {reason: count},
       "observability": as observability.json,
       "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
       "inputs": {path: sha256} }
     """
-    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "disagreements", "expected_error")
+    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "expected_error")
     counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
     document: dict[str, Any] = tables.plain(
         {
