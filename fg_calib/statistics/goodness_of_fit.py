@@ -466,7 +466,8 @@ class RowStatistics:
         if part.covariance is not None and n:
             chosen = np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
             z = np.sign(table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
-            chi2, expected, nu = part.covariance.whitened(z, chosen)
+            chi2, expected = part.covariance.whitened(z, chosen)
+            nu = expected
         else:
             chi2, expected, nu = float(np.sum(part.squares)), float(n), part.degrees(chosen)
         of_noise = self._degrees_of_noise(np.arange(len(self.fitted.rows)))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from scipy.sparse import csgraph
 
 from fg_calib.graph import PRIVATE_SHARE, Problem, RowNoise, at_parameters, felt, linear_system, reach, says_where
 from fg_calib.inputs import Booleans, Floats, Integers
@@ -20,6 +21,9 @@ from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
 
 Sparse = scipy.sparse.csr_array
+
+FEW = 4
+"""An error of more than one in so many rows is one of a covariance's low rank."""
 
 
 @dataclass(frozen=True)
@@ -44,33 +48,46 @@ class ResidualCovariance:
         out: Floats = self.d + row_squares(self.L) + np.einsum("ij,ij->i", self.P @ self.M, self.P)
         return out
 
+    def at(self, rows: Integers) -> ResidualCovariance:
+        """The part at some rows; errors of more than one in `FEW` of them are columns of P."""
+        L = self.L[rows]
+        many = FEW * np.bincount(L.indices, minlength=L.shape[1]) > len(rows)
+        M = scipy.linalg.block_diag(self.M, np.eye(int(many.sum())))
+        return ResidualCovariance(self.d[rows], L[:, ~many], np.hstack([self.P[rows], L[:, many].toarray()]), M)
+
     def moments(self, rows: Integers) -> tuple[float, float]:
         """Trace, and trace of the square, of the part at some rows."""
-        part = ResidualCovariance(self.d[rows], self.L[rows], self.P[rows], self.M)
-        d, L, variances, PMP, LP = part.d, part.L, part.diagonal, part.P.T @ part.P @ self.M, part.L.T @ part.P
-        square = d @ (2.0 * variances - d) + Sparse(L.T @ L).power(2).sum()
-        square += 2.0 * np.vdot(LP @ self.M, LP) + np.vdot(PMP, PMP.T)
+        part = self.at(rows)
+        d, L, P, M, variances = part.d, part.L, part.P, part.M, part.diagonal
+        gram, PMP, LP = L @ L.T if L.shape[0] < L.shape[1] else L.T @ L, P.T @ P @ M, L.T @ P
+        square = d @ (2.0 * variances - d) + gram.power(2).sum() + 2.0 * np.vdot(LP @ M, LP) + np.vdot(PMP, PMP.T)
         return float(np.sum(variances)), float(square)
 
-    def whitened(self, z: Floats, rows: Integers) -> tuple[float, float, float]:
-        """Sum of squares of some rows, whitened together; its mean, and its degrees of freedom.
+    def whitened(self, z: Floats, rows: Integers) -> tuple[float, float]:
+        """Sum of squares of some rows, whitened together, and its mean.
 
-        D counts as `PRIVATE_SHARE` of the noise at least.
+        D counts as `PRIVATE_SHARE` of the noise at least. D + L L^T falls into parts that share no errors.
 
         Args:
             z: The residuals, shape (n_rows,).
             rows: Which.
         """
-        d, L, P = self.d[rows], self.L[rows], self.P[rows]
-        C = np.diag(d) + (L @ L.T).toarray() + P @ self.M @ P.T
-        added = np.maximum(PRIVATE_SHARE * (d + row_squares(L)) - d, 0.0)
-        factor = scipy.linalg.cho_factor(C + np.diag(added))
-        chi2, n = float(z @ scipy.linalg.cho_solve(factor, z)), float(len(z))
-        if not added.any():
-            return chi2, n, n
-        share = scipy.linalg.cho_solve(factor, C)
-        expected = float(np.trace(share))
-        return chi2, expected, expected**2 / float(np.vdot(share, share.T))
+        part, noise = self.at(rows), self.d[rows] + row_squares(self.L[rows])
+        d = np.maximum(part.d, PRIVATE_SHARE * noise)
+        T = (part.L @ part.L.T + scipy.sparse.diags_array(d)).tocsr()
+        dense, columns = T.toarray(), np.column_stack([part.P, z])
+        weighed, variances = np.empty(columns.shape), np.empty(len(z))
+        label = csgraph.connected_components(T, directed=False)[1]
+        size = np.bincount(label)[label]
+        for n in np.unique(size):
+            together = np.lexsort((label, size != n))[: np.sum(size == n)].reshape(-1, n)
+            inverse = np.linalg.inv(dense[together[:, :, None], together[:, None]])
+            weighed[together] = inverse @ columns[together]
+            variances[together] = np.einsum("kii->ki", inverse)
+        V, Tz = weighed[:, :-1], weighed[:, -1]
+        G = part.M @ np.linalg.inv(np.eye(V.shape[1]) + part.P.T @ V @ part.M)  # C^-1 = T^-1 - V G V^T
+        lost = (d - part.d) @ (variances - np.einsum("ij,ij->i", V @ G, V))
+        return float(z @ Tz - (V.T @ z) @ G @ (V.T @ z)), float(len(z) - lost)
 
 
 @dataclass(frozen=True)
