@@ -243,6 +243,13 @@ def test_a_correction_beyond_its_prior_is_named_and_what_follows_it_is_not():
     assert not list(_beyond(("a", "b", "c"), np.array([2.5, 2.5, 1.0]), A, 3))
 
 
+def test_a_correction_is_judged_by_what_it_varies_by_without_the_priors_before_it():
+    """The second is 2.1 from what the first makes of it, 0.9 of it, and varies by 1 - 0.9^2: 4.8 sigma."""
+    A = np.array([[1.0, 0.9], [0.9, 1.0]])
+    assert [one.name for one in _beyond(("a", "b"), np.array([30.0, 29.1]), A, 2)] == ["a", "b"]
+    assert [one.name for one in _beyond(("a", "b"), np.array([30.0, 28.3]), A, 2)] == ["a"]
+
+
 def test_what_has_no_prior_follows_the_corrections():
     """The information on the corrections is that of the rows, the measurement frame moved along."""
     problem, _ = drawn_problem(frame="unknown")
