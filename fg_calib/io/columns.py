@@ -6,13 +6,11 @@ import csv
 import logging
 import math
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from io import BytesIO, StringIO
-from itertools import islice
-from numbers import Real
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +25,11 @@ from fg_calib.inputs import (
     Booleans,
     Floats,
     InputError,
+    Integers,
     as_frame,
     check_different,
     check_names,
+    check_number,
     did_you_mean,
 )
 from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
@@ -76,10 +76,6 @@ def names_of(sets: Iterable[ColumnSet]) -> frozenset[str]:
 KNOWN = names_of(OF_CONFIGURATIONS.values())
 """Names of the columns of a table of configurations, besides the joint readings."""
 
-_OF_WORDS = {"id", "split", "a", "b", "group", *(name for one in INSTRUMENTS.values() for name in one.labels)}
-"""Columns with a meaning that hold no numbers."""
-
-
 @dataclass(frozen=True)
 class Column:
     """A table's own name of a column, and how its values convert: (value - zero) * scale, as encoder counts do.
@@ -100,9 +96,10 @@ class Column:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name.strip():
             raise InputError("columns: name", f"found {shown(self.name)}", "the name of a column")
-        for key, number, more in (("scale", self.scale, " other than 0"), ("zero", self.zero, "")):
-            if not isinstance(number, Real) or not math.isfinite(number) or (more and number == 0.0):
-                raise InputError(f"columns: {self.name}: {key}", f"found {shown(number)}", f"a finite number{more}")
+        for key in ("scale", "zero"):
+            check_number(f"columns: {self.name}: {key}", getattr(self, key), least=-math.inf)
+        if not self.scale:
+            raise InputError(f"columns: {self.name}: scale", "found 0", "a number other than 0")
 
 
 @dataclass(frozen=True)
@@ -112,15 +109,17 @@ class Table:
     Attributes:
         name: File name, or what a frame is called, for messages.
         columns: Names of all its columns, as they are known.
-        frame: The columns, without blank rows. Those of a CSV are numbers or texts.
-        csv: The file that it was read from; None of others than CSV.
+        frame: The columns, without blank rows. Those of a CSV are texts.
+        separator: The character between the cells of a CSV; empty of others.
+        lines: The line of each row of a CSV; empty of others.
         renamed: By column, its conversion, where the table has its own name for it.
     """
 
     name: str
     columns: tuple[str, ...]
     frame: pl.DataFrame
-    csv: _Csv | None = None
+    separator: str = ""
+    lines: Integers | Sequence[int] = ()
     renamed: Mapping[str, Column] = field(default_factory=dict)
 
     @classmethod
@@ -146,23 +145,17 @@ class Table:
             InputError: It cannot be read, it has no rows, or `columns` does not fit.
         """
         require_polars(name)
+        is_file = isinstance(table, os.PathLike | str)
+        name = Path(table).name if is_file else name
         with _one_line(name, "no table"):
-            given = _open(table, name)
-            header = [column.strip() for column in given.columns]
-            name = given.name if isinstance(given, _Csv) else name if _is_frame(table) else Path(table).name
+            found = _read_file(Path(table)) if is_file else cls(name, (), _as_polars(table, name))
+            header = [column.strip() for column in found.columns or found.frame.columns]
             check_different(name, header)
             names = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
-            numbers = {*(known or ()), *joints} - _OF_WORDS
-            frame = given.read([column in numbers for column in names]) if isinstance(given, _Csv) else given
-        frame.columns = names
-        if not frame.height:
+            found.frame.columns = names
+        if not found.n_rows:
             raise InputError(name, "no rows", "at least one")
-        return cls(name, tuple(names), frame, given if isinstance(given, _Csv) else None, dict(columns or {}))
-
-    @property
-    def separator(self) -> str:
-        """The character between the cells of a CSV, empty for others."""
-        return "" if self.csv is None else self.csv.separator
+        return replace(found, columns=tuple(names), renamed=dict(columns or {}))
 
     @property
     def n_rows(self) -> int:
@@ -259,106 +252,61 @@ class Table:
         """Raise for the first cell of `column` that is not `good`, shape (n_rows,)."""
         if not good.all():
             row = int(np.argmin(good))
-            cell = self.frame[column][row] if self.csv is None else self.csv.row(row)[1][self.columns.index(column)]
+            cell = self.frame[column][row]
             cell = cell.strip() if isinstance(cell, str) else cell
             found = "an empty cell" if cell in {None, ""} else shown(cell)
             raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, hint or number_hint(cell))
 
     def place(self, row: int) -> str:
         """File and line of a row of a CSV (the header is line 1); of a Parquet file or a frame the 0-based row."""
-        return f"{self.name}: row {row}" if self.csv is None else f"{self.name}:{self.csv.row(row)[0]}"
+        return f"{self.name}:{self.lines[row]}" if self.separator else f"{self.name}: row {row}"
 
 
-@dataclass(frozen=True)
-class _Csv:
-    """A text of cells with a separator between, which its header tells."""
-
-    name: str
-    text: str
-    separator: str
-    columns: Sequence[str]
-
-    @classmethod
-    def of(cls, name: str, text: str) -> _Csv:
-        """The CSV of a text.
-
-        Raises:
-            InputError: It is empty, or a quote is not closed.
-        """
-        if '"' in text and text.count('"') % 2:
-            line = next(i for i, one in enumerate(text.splitlines(), start=1) if one.count('"') % 2)
-            raise InputError(f"{name}:{line}", "a quote that is not closed", "whole cells in quotes, or none")
-        first = re.search(r"[^\r\n]*[^\s,;][^\r\n]*", text)
-        if first is None:
-            raise InputError(f"{name}:1", "an empty file", "a header and rows")
-        separator = max(",;\t", key=re.sub(r'"[^"]*"', "", first[0]).count)
-        names = next(csv.reader([first[0].removeprefix("#")], delimiter=separator))  # as numpy writes it
-        return cls(name, text, separator, names)
-
-    def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """The line where each row begins, and its cells; the header first, rows of empty cells left out."""
-        reader = csv.reader(StringIO(self.text, newline=None), delimiter=self.separator)
-        line = 1
-        try:
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    yield line, cells
-                line = reader.line_num + 1
-        except csv.Error as error:
-            raise InputError(f"{self.name}:{line}", f"not a CSV: {error}") from None
-
-    def row(self, row: int) -> tuple[int, list[str]]:
-        """The line and the cells of a row, the first one behind the header being 0."""
-        return next(islice(self.rows(), row + 1, None))
-
-    def read(self, are_numbers: Sequence[bool]) -> pl.DataFrame:
-        """The rows: numbers where all is plain, else texts, of which any may be no number.
-
-        Raises:
-            InputError: A row has more or fewer cells than the header.
-        """
-        import polars as pl
-
-        n, text, separator = len(are_numbers), self.text, self.separator
-        n_lines = text.count("\n") + (not text.endswith("\n"))
-        is_plain = '"' not in text and text.count("\r") == text.count("\r\n")
-        if is_plain and text.count(separator) == (n - 1) * n_lines:
-            schema = {str(i): pl.Float64 if is_number else pl.String for i, is_number in enumerate(are_numbers)}
-            with suppress(pl.exceptions.PolarsError):
-                frame = pl.read_csv(text.encode(), separator=separator, schema=schema, has_header=False, skip_rows=1)
-                if frame.height == n_lines - 1 and not frame.select(pl.all_horizontal(pl.all().is_null()).any()).item():
-                    return frame
-        rows = list(self.rows())[1:]
-        for line, cells in rows:
-            if len(cells) != n:
-                found = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
-                raise InputError(f"{self.name}:{line}", found, f"{n} as in the header")
-        return pl.DataFrame([cells for _, cells in rows], {str(i): pl.String for i in range(n)}, orient="row")
-
-
-def _is_frame(table: Path | str | Any) -> bool:
-    return not isinstance(table, os.PathLike | str)
-
-
-def _open(table: Path | str | Any, name: str) -> pl.DataFrame | _Csv:
-    """The columns of a Parquet file or a frame, or else a CSV.
+def _read_file(path: Path) -> Table:
+    """The columns of a Parquet file or a CSV.
 
     Raises:
         InputError: It is missing, or is no table.
     """
     import polars as pl
 
-    if _is_frame(table):
-        return _as_polars(table, name)
-    path = Path(table)
     content, ending = read_bytes(path), path.suffix.lower()
     if ending == ".csv":
-        return _Csv.of(path.name, decoded(content, path.name))
+        return _read_csv(path.name, decoded(content, path.name))
     if ending not in (".parquet", ".pq"):
         hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
         raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
     with _one_line(path.name, "not a Parquet file"):
-        return pl.read_parquet(BytesIO(content))
+        return Table(path.name, (), pl.read_parquet(BytesIO(content)))
+
+
+def _read_csv(name: str, text: str) -> Table:
+    """The cells of a CSV as texts, without blank rows; the header tells the separator.
+
+    Raises:
+        InputError: It is empty, a quote is not closed on its line, or a row has more or fewer cells than the header.
+    """
+    import polars as pl
+
+    if not text.strip(" \t\r\n,;"):
+        raise InputError(f"{name}:1", "an empty file", "a header and rows")
+    read = partial(pl.read_csv, has_header=False, infer_schema=False)
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    lines = read(text.encode(), separator="\x1f", quote_char=None, new_columns=["line"]).with_row_index("number", 1)
+    lines = lines.filter(pl.col("line").str.strip_chars(" \t,;") != "")
+    unquoted = lines["line"].str.replace_all('"[^"]*"', "") if '"' in text else lines["line"]
+    separator = max(",;\t", key=unquoted[0].count)
+    header = next(csv.reader([lines["line"][0].removeprefix("#")], delimiter=separator))  # as numpy writes it
+    n_cells = unquoted.str.count_matches(separator, literal=True) + 1
+    misfits = unquoted.str.contains('"', literal=True) | (n_cells != len(header))
+    if misfits.any():
+        row = int(np.argmax(misfits))
+        place, n = f"{name}:{lines['number'][row]}", n_cells[row]
+        if '"' in unquoted[row]:
+            raise InputError(place, "a quote that is not closed", "whole cells in quotes, or none")
+        raise InputError(place, f"{n} cell{'s' * (n != 1)}", f"{len(header)} as in the header")
+    frame = read(lines["line"].str.join("\n").item().encode(), separator=separator).slice(1)
+    return Table(name, tuple(header), frame, separator, lines["number"].to_numpy()[1:])
 
 
 def _understood(
