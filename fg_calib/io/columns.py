@@ -76,6 +76,7 @@ def names_of(sets: Iterable[ColumnSet]) -> frozenset[str]:
 KNOWN = names_of(OF_CONFIGURATIONS.values())
 """Names of the columns of a table of configurations, besides the joint readings."""
 
+
 @dataclass(frozen=True)
 class Column:
     """A table's own name of a column, and how its values convert: (value - zero) * scale, as encoder counts do.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,7 +21,6 @@ from fg_calib.inputs import (
     Model,
     Options,
     Pairing,
-    Strategy,
     check_names,
     checked,
     did_you_mean,
@@ -29,7 +28,7 @@ from fg_calib.inputs import (
 from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.columns import Column
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
-from fg_calib.io.tables import read_measurements, read_points
+from fg_calib.io.tables import read_measurements
 from fg_calib.io.yaml import (
     Count,
     FilePath,
@@ -37,7 +36,6 @@ from fg_calib.io.yaml import (
     Number,
     Positive,
     Schema,
-    Seed,
     Units,
     UnitsOfFile,
     quantity,
@@ -67,15 +65,6 @@ _Noise = create_model("_Noise", __base__=Schema, joint=(Any, 0.0), estimate=(Str
 
 class _JointNoises(Schema):
     joint: tuple[NotNegative, ...]
-
-
-class _Fixed(Schema):
-    fixed: StrictBool
-
-
-class _RandomPairing(Schema):
-    random: Annotated[Count, Field(gt=0)]
-    seed: Seed = 0
 
 
 _Columns = dict[
@@ -182,13 +171,14 @@ def _read_job(path: Path) -> Job:
     folder, given = path.parent, read_yaml(path)
     file = validate(_Job, given, path.name)
     robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
-    tables = _tables(given, file, robot, path)
+    document = _with_cameras({key: value for key, value in given.items() if key not in _OF_THE_ROBOT}, folder)
+    tables = [_table(entry, place, file, robot, folder) for place, entry in _entries(document, file, path.name)]
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     with within(path.name):
         options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)
     alone = tables[0].measurements if isinstance(file.measurements, str) and tables[0].is_plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    return Job(path, robot, alone, options, truth, document=_document(given, folder))
+    return Job(path, robot, alone, options, truth, document=document)
 
 
 @checked
@@ -209,21 +199,15 @@ def units_of(job: Job) -> Units:
     return Units(**(own or job.document.get("units") or {}))
 
 
-def _document(given: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """A job's mapping, for reading tables like its own elsewhere: with its cameras in it, and without its robot."""
+def _with_cameras(given: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """A job's mapping with the keys of cameras' files in place of their paths."""
 
-    def with_camera(entry: Mapping[str, Any]) -> dict[str, Any]:
-        camera = entry.get("camera")
-        more = {key: camera[key] for key in camera if key == "fixed"} if isinstance(camera, dict) else {}
-        file = camera.get("file") if isinstance(camera, dict) else camera
-        if not isinstance(file, str) or file == "fixed":
-            return dict(entry)
-        return {**entry, "camera": {**read_yaml(folder / file), **more}}
+    def whole(entry: Any) -> Any:
+        has_camera = isinstance(entry, dict) and "camera" in entry
+        return {**entry, "camera": whole_camera(entry["camera"], folder)} if has_camera else entry
 
-    found = with_camera({key: value for key, value in given.items() if key not in _OF_THE_ROBOT})
-    if isinstance(found["measurements"], list):
-        found["measurements"] = [with_camera(entry) for entry in found["measurements"]]
-    return found
+    tables = given["measurements"]
+    return {**whole(given), "measurements": [whole(one) for one in tables] if isinstance(tables, list) else tables}
 
 
 def read_table_like(
@@ -241,79 +225,69 @@ def read_table_like(
     Raises:
         InputError: A file is missing or cannot be used, or it is not clear which table it is like.
     """
-    given = document.get("measurements")
-    entries = given if isinstance(given, list) else [{"table": given, "pairs": document.get("pairs")}]
-    if not all(isinstance(entry, dict) and isinstance(entry.get("table"), str) for entry in entries):
-        place, found = "result.json: carried: job", f"measurements {shown(given)}"
-        raise InputError(place, found, "those of the job, as it was saved")
-    names = [Path(str(entry["table"])).name for entry in entries]
+    place = "result.json: carried: job"
+    file = validate(_Job, {"robot": ".", "measurements": None, **document}, place)
+    entries = _entries(document, file, place)
+    names = [Path(entry.table).name for _, entry in entries]
     wanted = like or path.name
-    if like is not None and like not in names:
-        raise InputError("like", f"found {shown(like)}", f"one of {', '.join(names)}", did_you_mean(like, names))
-    if wanted not in names and len(entries) > 1:
-        raise InputError(path.name, "of none of the names that the job's tables have", ", ".join(names), "see --like")
-    entry = entries[names.index(wanted)] if wanted in names else entries[0]
-    if (pairs is None) != (entry.get("pairs") is None):
+    if wanted not in names and (like is not None or len(entries) > 1):
+        hint = "see --like" if like is None else did_you_mean(like, names)
+        raise InputError("like" if like else path.name, f"found {shown(wanted)}", f"one of {', '.join(names)}", hint)
+    where, entry = entries[names.index(wanted) if wanted in names else 0]
+    if (pairs is None) != (entry.pairs is None):
         found = "no table of pairs" if pairs is None else f"a table of pairs, {pairs.name}"
         raise InputError(path.name, found, "pairs, as its job has them" if pairs is None else "none, as in its job")
-    alone = {**entry, "table": str(path.absolute()), "pairs": None if pairs is None else str(pairs.absolute())}
-    job = {key: value for key, value in document.items() if key != "pairs"} | {"robot": ".", "measurements": [alone]}
-    (table,) = _tables(job, validate(_Job, job, path.name), robot, path)
-    return table
+    files = {"table": str(path.absolute()), "pairs": None if pairs is None else str(pairs.absolute())}
+    return _table(entry.model_copy(update=files), where, file, robot, Path())
 
 
-def _tables(given: Mapping[str, Any], file: Any, robot: Robot, path: Path) -> list[Table]:
-    """The tables of a job; what an entry leaves out is as the job says for all.
+def _entries(given: Mapping[str, Any], file: _JobKeys, place: str) -> list[tuple[str, _Entry]]:
+    """The tables of a job, each with its place: its keys, or what the job says for all; its noise is its own alone.
 
     Args:
         given: The job's mapping.
         file: The same, checked.
-        robot: The robot.
-        path: The job's file.
+        place: The job's file.
+
+    Raises:
+        InputError: There are none, or one cannot be used.
     """
-    entries, places = file.measurements, [path.name]
-    if not entries or not isinstance(entries, str | list):
-        raise InputError(f"{path.name}: measurements", f"found {shown(entries)}", "a path, or a list of tables")
-    if isinstance(entries, str):
-        entries = [{"table": entries}]
-    elif file.pairs is not None:
-        raise InputError(f"{path.name}: pairs", "next to a list of tables", "the key in the table's own entry")
-    else:
-        places = [f"{path.name}: measurement {i}" for i in range(1, len(entries) + 1)]
-    defaults = {key: given[key] for key in _TableKeys.model_fields if key in given}
-    whole = [defaults | one if isinstance(one, dict) else one for one in entries]
-    read = [validate(_Entry, one, place) for one, place in zip(whole, places, strict=True)]
-    points: list[str] = []  # of all tables, as pairs may name those of another
-    if len(read) > 1 and any(entry.pairs is not None for entry in read):
-        for entry in read:
-            points += read_points(path.parent / entry.table, entry.columns)
-    noise, _ = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    found = []
-    for one, entry, place in zip(entries, read, places, strict=True):
+    listed, entries = given.get("measurements"), list[tuple[str, _Entry]]()
+    if not listed or not isinstance(listed, str | list):
+        raise InputError(f"{place}: measurements", f"found {shown(listed)}", "a path, or a list of tables")
+    if isinstance(listed, list) and file.pairs is not None:
+        raise InputError(f"{place}: pairs", "next to a list of tables", "the key in the table's own entry")
+    defaults = {key: given[key] for key in _TableKeys.model_fields if key in given and key != "noise"}
+    for number, one in enumerate([{"table": listed}] if isinstance(listed, str) else listed, start=1):
+        where = place if isinstance(listed, str) else f"{place}: measurement {number}"
+        entry = validate(_Entry, defaults | one if isinstance(one, dict) else one, where)
         if entry.model is None:
-            raise InputError(place, "missing key 'model'")
-        own = noise
-        if "noise" in one:
-            given_noise, estimated = _noise(entry.noise, entry.units, robot, f"{place}: noise")
-            if estimated:
-                raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the job")
-            own = noise.updated(**{key: given_noise.get(key) for key in entry.noise or ()})
-        found.append(_table(entry, file, robot, path, place, own, points))
-    return found
+            raise InputError(where, "missing key 'model'")
+        entries.append((where, entry))
+    return entries
 
 
-def _table(
-    entry: _Entry, file: Any, robot: Robot, path: Path, place: str, noise: Noise, points: Sequence[str]
-) -> Table:
-    """The table of an entry."""
-    folder, model = path.parent, entry.model or ""
+def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path) -> Table:
+    """The table of an entry.
+
+    Args:
+        entry: Its keys.
+        place: File and entry, for messages.
+        file: The job.
+        robot: Its robot.
+        folder: Where paths start.
+    """
+    model, of_job = entry.model or "", place.partition(": measurement")[0]
+    noise, _ = _noise(file.noise, file.units, robot, f"{of_job}: noise")
+    own, estimated = _noise(entry.noise, entry.units, robot, f"{place}: noise")
+    if estimated:
+        raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the job")
     measurements = read_measurements(
         folder / entry.table,
         robot,
         pairs=None if entry.pairs is None else folder / entry.pairs,
         units=entry.units,
-        noise=noise,
-        points=points,
+        noise=noise.updated(**{key: own.get(key) for key in entry.noise or ()}),
         model=model,
         columns=entry.columns,
     )
@@ -323,7 +297,7 @@ def _table(
         model,
         pairing_of(entry.pairing, f"{place}: pairing"),
         entry.frame,
-        known=_known_points(file, model, path.name),
+        known=_known_points(file, model, of_job),
         offset=model == "anchor" and entry.offset == "estimate",
         camera=camera if model == "pixels" else None,
         fixed_camera=model == "pixels" and (fixed or "fixed" in (entry.camera, file.camera)),
@@ -344,25 +318,39 @@ def _known_points(file: Any, model: Model, place: str) -> dict[str, KnownPoint]:
     return found
 
 
-def camera_in(given: object, place: str, folder: Path) -> tuple[Camera | None, bool]:
+def whole_camera(given: Any, folder: Path) -> Any:
+    """A camera's mapping with the keys of its file in place of the file's path; anything else as it is.
+
+    Args:
+        given: A path, or the camera's mapping, or `file` with the path.
+        folder: Where the path starts.
+
+    Raises:
+        InputError: The file is missing, or is of no camera.
+    """
+    given = {"file": given} if isinstance(given, str) and given not in ("", "fixed") else given
+    if not isinstance(given, dict) or not isinstance(given.get("file"), str):
+        return given
+    path = folder / given["file"]
+    read_camera(path)
+    return {**read_yaml(path), **{key: value for key, value in given.items() if key != "file"}}
+
+
+def camera_in(given: Any, place: str, folder: Path) -> tuple[Camera | None, bool]:
     """A camera, and whether it stands in the room.
 
     Args:
-        given: A path, or the camera's mapping, or `file` with the path; a mapping may say `fixed`.
+        given: What `whole_camera` takes; a mapping may say `fixed: true`. Or `fixed` alone, or None.
         place: File and key, for messages.
-        folder: Where the path starts.
+        folder: Where a path starts.
 
     Raises:
         InputError: It is no camera.
     """
-    fixed = False
-    if isinstance(given, dict) and "fixed" in given:
-        fixed = validate(_Fixed, {"fixed": given["fixed"]}, place).fixed
-        given = {key: value for key, value in given.items() if key != "fixed"}
-        given = given["file"] if set(given) == {"file"} else given
+    given = whole_camera(given, folder)
     if given in (None, "fixed"):
-        return None, fixed
-    return (read_camera(folder / given) if isinstance(given, str) else _camera(given, place)), fixed
+        return None, given == "fixed"
+    return _camera(given, place), bool(given.get("fixed"))
 
 
 def _limits(given: object, units: Units) -> Limits:
@@ -418,60 +406,53 @@ def _truth(path: Path, robot: Robot) -> Robot:
     return truth
 
 
-def pairing_of(given: object, place: str = "pairing") -> Pairing:
+def pairing_of(given: Any, place: str = "pairing") -> Pairing:
     """A pairing: a strategy, or how many random pairs.
 
     Raises:
         InputError: It is neither.
     """
-    if isinstance(given, dict):
-        file = validate(_RandomPairing, given, place)
-        return Pairing("random", file.random, file.seed)
-    possible: tuple[Strategy, ...] = ("star", "chain", "all")
-    strategy = next((one for one in possible if one == given), None)
-    if strategy is None:
-        expected = f"one of {', '.join(possible)}, {{random: N, seed: S}}"
-        raise InputError(place, f"found {shown(given)}", expected, did_you_mean(given, possible))
-    return Pairing(strategy)
+    try:
+        if isinstance(given, dict) and given.keys() <= {"random", "seed"}:
+            return Pairing("random", given.get("random", 0), given.get("seed", 0))
+        return Pairing(given)
+    except InputError as error:
+        expected = error.expected.replace("all, random", "all, {random: N, seed: S}")
+        raise InputError(error.place.replace("pairing", place, 1), error.found, expected, error.hint) from None
 
 
-def _noise(given: object, units: Units, robot: Robot, place: str) -> tuple[Noise, bool]:
+def _noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[Noise, bool]:
     """The noise in [m] and [rad], that of the readings joint by joint, and whether it is only where to start."""
-    if given is not None and given != "estimate" and not isinstance(given, dict):
-        raise InputError(place, f"found {shown(given)}", "a mapping of sigmas, or estimate")
-    file: Any = validate(_Noise, {"estimate": True} if given == "estimate" else given or {}, place)
+    given = {"estimate": True} if given == "estimate" else {} if given is None else given
+    file: Any = validate(_Noise, given, place)
     specified = {key: sigma for key in NOISE_UNITS if (sigma := getattr(file, key)) is not None}
     sigmas = {key: units.sigma(one, NOISE_UNITS[key], f"{place}: {key}") for key, one in specified.items()}
-    noise = Noise(joint=joint_noise(file.joint, units, robot, place)).updated(**sigmas)
-    if file.estimate:
-        start = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1] if getattr(noise, f.name) is None}
-        noise = replace(noise, **start)
-    return noise, file.estimate
+    start = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1]} if file.estimate else {}
+    return Noise(**start).updated(**sigmas, joint=joint_noise(file.joint, units, robot, place)), file.estimate
 
 
-def joint_noise(given: object, units: Units, robot: Robot, place: str) -> tuple[float, ...]:
+def joint_noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[float, ...]:
     """Sigma of each joint's readings, [rad] (prismatic: [m]), from one number for all or one a joint.
 
     Raises:
         InputError: It is neither.
     """
-    listed = given if isinstance(given, list) else [given]
-    sigmas = validate(_JointNoises, {"joint": listed}, place).joint * (1 if listed is given else robot.n_joints)
-    if len(sigmas) != robot.n_joints:
-        raise InputError(f"{place}: joint", f"{len(sigmas)} values", f"one for all or {robot.n_joints}, one a joint")
+    listed, n = isinstance(given, list), robot.n_joints
+    sigmas = validate(_JointNoises, {"joint": given if listed else [given]}, place).joint * (1 if listed else n)
+    if len(sigmas) != n:
+        raise InputError(f"{place}: joint", f"{len(sigmas)} values", f"one for all or {n}, one a joint")
     return tuple(units.sigma(s, j.unit, f"{place}: joint") for s, j in zip(sigmas, robot.joints, strict=True))
 
 
-_PixelCount = Annotated[Count, Field(gt=0)] | None
 _INTRINSICS: dict[str, Any] = {f.name: (Number, ... if f.default is MISSING else f.default) for f in fields(Camera)}
-_CameraSigmas = Annotated[dict[str, NotNegative] | None, BeforeValidator(refuse_unknown_keys(*_INTRINSICS))]
 _Camera = create_model(
     "_Camera",
     __base__=Schema,
     **_INTRINSICS,
-    width=(_PixelCount, None),
-    height=(_PixelCount, None),
-    sigma=(_CameraSigmas, None),
+    width=(Count | None, None),
+    height=(Count | None, None),
+    sigma=(dict[str, NotNegative] | None, None),
+    fixed=(StrictBool, False),
 )
 """A camera's file: its intrinsics, the size of its images, and how well it is known."""
 
@@ -487,18 +468,14 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
         InputError: The file is missing or cannot be used, or says that it is of images of another size.
     """
     given = read_yaml(path)
-    camera = _camera(given, path.name)
-    for key, center, found in zip(("width", "height"), ("cx", "cy"), size or (), strict=False):
+    for key, found in zip(("width", "height"), size or (), strict=False):
         if given.get(key) not in (None, found):
             hint = "the intrinsics of other images would have to be scaled"
             raise InputError(f"{path.name}: {key}", f"found {given[key]}", f"{found} px as the images have", hint)
-        if not 0.0 <= getattr(camera, center) <= found:
-            words = "%s: %s = %g px is outside the images of %d px; is it the camera that took them?"
-            _log.warning(words, path.name, center, getattr(camera, center), found)
-    return camera
+    return _camera(given, path.name)
 
 
-def _camera(given: object, place: str) -> Camera:
+def _camera(given: Any, place: str) -> Camera:
     file = validate(_Camera, given, place)
     try:
         return Camera(**{key: getattr(file, key) for key in _INTRINSICS})

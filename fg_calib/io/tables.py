@@ -36,6 +36,7 @@ from fg_calib.measurements import (
     Measurements,
     Noise,
     Pairs,
+    checked_joint_sigma,
     covariances,
     limit_hint,
     no_pairs,
@@ -70,7 +71,6 @@ def read_measurements(
     pairs: Path | str | Any | None = None,
     units: Units | None = None,
     noise: Noise | None = None,
-    points: Sequence[str] = (),
     model: Model | None = None,
     columns: Mapping[str, Column] | None = None,
 ) -> Measurements:
@@ -82,7 +82,6 @@ def read_measurements(
         pairs: Table of pairs, likewise.
         units: Units of both tables; default m and rad.
         noise: Sigmas where the tables specify none, [m] and [rad]; also of what was not measured yet.
-        points: Names of contact points of other tables: pairs may say how far apart they are.
         model: The model whose columns are read; those of all models if None.
         columns: By known name, what the table of configurations calls a column.
 
@@ -106,16 +105,14 @@ def read_measurements(
     names, between, of_groups = ids.to_numpy().astype(np.str_), None, no_pairs(table.name)
     if pairs is not None:
         table.require(ids.is_first_distinct().to_numpy(), "id", "different ids where pairs name them")
-        every = replace(groups, names=tuple(dict.fromkeys((*groups.names, *points))))
-        between, of_groups = _read_pairs(pairs, (names, test, every), units, noise)
-        groups = every if of_groups.n_pairs else groups
+        between, of_groups = _read_pairs(pairs, (names, test, groups), units, noise)
     if not groups.names:
         measured["sigma_point"] = None
     return Measurements(
         readings=readings,
         ids=names,
         test=test,
-        sigma_joint=_joint_sigma(noise.joint, robot.n_joints),
+        sigma_joint=checked_joint_sigma(noise.joint, robot.n_joints),
         pairs=between,
         source=table.name,
         groups=Groups(groups.names, groups.index, of_groups) if groups.names else None,
@@ -199,34 +196,6 @@ def read_ids(table: Table, *, repeated: bool) -> pl.Series:
     if not repeated:
         table.require(ids.is_first_distinct().to_numpy(), "id", "different ids")
     return ids
-
-
-def read_joint_table(
-    path: Path | str | Any, robot: Robot, units: Units | None = None
-) -> tuple[tuple[str, ...], Floats]:
-    """Names of configurations, and their joint values, shape (n, n_joints), [rad] (prismatic: [m]).
-
-    Args:
-        path: The table: a file, or a frame of polars or pandas.
-        robot: Whose joints they are of: names, number and limits.
-        units: Of the table; default m and rad.
-
-    Raises:
-        InputError: The file is missing, is no table, lacks columns or holds a cell that cannot be used.
-    """
-    table = read_table(path, robot)
-    readings = read_readings(table, find_joint_columns(table, robot), robot, units or Units())
-    return tuple(read_ids(table, repeated=True).to_list()), readings
-
-
-def read_points(path: Path | str, columns: Mapping[str, Column] | None = None) -> tuple[str, ...]:
-    """The names of the contact points of a table of configurations; `columns` as in `read_measurements`.
-
-    Raises:
-        InputError: The file is missing, or is no table.
-    """
-    own = {name: column for name, column in (columns or {}).items() if name == "group"}
-    return _groups(Table.read(path, "frame", ["group"], columns=own)).names
 
 
 @dataclass(frozen=True)
@@ -379,14 +348,6 @@ def _groups(table: Table) -> Labels:
     return _labels(table, "group", optional=True)
 
 
-def _joint_sigma(joint: float | tuple[float, ...], n_joints: int) -> Floats:
-    """Sigma of the readings, shape (n_joints,), [rad] or [m]."""
-    sigma = np.atleast_1d(np.asarray(joint, dtype=np.float64))
-    if isinstance(joint, tuple) and len(joint) != n_joints:
-        raise InputError("noise: joint", f"{len(joint)} figures", f"one for all or {n_joints}, one a joint")
-    return np.broadcast_to(sigma, n_joints).copy()
-
-
 # --- pairs ------------------------------------------------------------------------------------------------------------
 
 
@@ -397,7 +358,7 @@ def _read_pairs(
 
     Args:
         path: The table.
-        of: Names of the configurations, which are test rows, and the contact points, with names of other tables too.
+        of: Names of the configurations, which are test rows, and the contact points.
         units: Of the table.
         noise: Sigmas where the table specifies none.
 

@@ -11,7 +11,15 @@ from .landmarks import Estimate, Landmark, LandmarkKind, Landmarks
 from .moments import Moments, angle_moments, length_moments
 from .residuals import Block, pack, squares_along, unit_whitening, unpack
 from .table import UNKNOWN, CustomMeasurements, KnownPoint, MeasurementBlock, Table, by_station
-from .validation import ANGLE_SLACK, LIMIT_SLACK, check_readings, covariances, limit_hint, outside_limits
+from .validation import (
+    ANGLE_SLACK,
+    LIMIT_SLACK,
+    check_readings,
+    checked_joint_sigma,
+    covariances,
+    limit_hint,
+    outside_limits,
+)
 
 __all__ = [
     "ANGLE_SLACK",
@@ -54,6 +62,7 @@ __all__ = [
     "by_station",
     "check_readings",
     "check_rows",
+    "checked_joint_sigma",
     "covariances",
     "directions",
     "find_copies",

@@ -130,7 +130,7 @@ MISTAKES = [
     (JOB + "noise: {joint: -1}\n", "calibration.yaml: noise: joint 1: found -1, expected a number not below 0"),
     (JOB + "noise: {joint: [0, 0, 0]}\n",
      "calibration.yaml: noise: joint: 3 values, expected one for all or 2, one a joint"),
-    (JOB + "noise: 1\n", "calibration.yaml: noise: found 1, expected a mapping of sigmas, or estimate"),
+    (JOB + "noise: 1\n", "calibration.yaml: noise: found 1, expected a mapping"),
 ]  # fmt: skip
 
 
