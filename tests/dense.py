@@ -189,6 +189,10 @@ def dense(problem, parameters):
         if shared and is_pairs(rows.series.kind):
             diagonal = np.einsum("nii->ni", own)
             least = PRIVATE_SHARE * np.einsum("nii->ni", rows.total)
+            if rows.series.formed:  # second-order terms of pairs that share a pose have correlations up to 1/4
+                of_pose = np.sum(rows.series.ends[train][:, :, None] == np.arange(len(rows.q)), axis=(0, 1))
+                fewest = of_pose[rows.series.ends].min(axis=1)
+                least = np.maximum(least, diagonal * fewest[:, None] / 2.0)
             own += rows._diagonal(np.maximum(least - diagonal, 0.0))
         private_alone = [name for name in rows.sources if not sharing and name not in shared]
         own += sum((rows._variance(rows.sources[name]) for name in private_alone), 0.0)

@@ -9,6 +9,12 @@ mean of z for rows y is `Z = S^-1 L^T y`, and
 so [y - L Z; Z] are rows of unit covariance that say the same. S is factored in the quickest of four ways: a dense
 Cholesky factor of 1 + L L^T or of S, whichever is smaller; or a sparse factor, configurations ordered so that trees do
 not fill and reference poses come last, or by minimum degree. Errors that reach one measurement only are private noise.
+
+The second-order term of a pair formed from poses, `(e_j - e_i)^T H (e_j - e_i) / 2`, counts as private, of variance q.
+For equal noise its correlation is at most 1/4 with that of a pair that shares a pose, and 0 with others: together all
+have at most the variance of independent terms of `q (1 + (m_i + m_j - 2) / 4)` (Gershgorin), m_i the pairs of pose i.
+This matters where pairs are more than the errors, so that second-order terms are all that they have left to say: there
+`q m / 2`, m the smaller number, is about as much; pairs of a star or chain, which are fewer, have m <= 2.
 """
 
 from __future__ import annotations
@@ -419,7 +425,11 @@ def _whiten(
     carried = bool(is_state.any())
     W, artificial = np.empty((n * carried, h, h)), np.zeros((n * carried, h))
     if carried and noise.slope is not None:
-        artificial = np.maximum(PRIVATE_SHARE * noise.sigma[rows] ** 2 - noise.variance[rows], 0.0)
+        least = PRIVATE_SHARE * noise.sigma[rows] ** 2
+        if series.formed:  # see the module's head
+            n_pairs = np.bincount(series.ends[rows].ravel())[series.ends[rows]].min(axis=1, keepdims=True)
+            least = np.maximum(least, 0.5 * n_pairs * noise.variance[rows])
+        artificial = np.maximum(least - noise.variance[rows], 0.0)
 
     def whiten(start: int, stop: int) -> None:
         span = slice(start, stop)

@@ -1,8 +1,9 @@
 """GTSAM factors: one a measurement, as in `problem.graph`.
 
-A pair has one `DistanceFactor` and one `RotationAngleFactor`, any other measurement one factor; so has a pair whose
-distance and angle are correlated by a robust weight. What measurements share are variables `E(k)`, the errors of
-configuration k in units of their sigma, each with a prior.
+A pair has one `DistanceFactor` and one `RotationAngleFactor`, any other measurement one factor. What measurements share
+are variables `E(k)`, the errors of configuration k in units of their sigma, each with a prior. Where private noise of a
+pair has a correlation c of distance and angle (errors that count as its own, a robust weight), so is the one error
+`e(i)` of pair i: both follow from it with sqrt(|c|) of their sigma, and what is left is uncorrelated.
 
 GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or gets its rows wrong, and returns the
 initial values without a word when it gets the columns wrong. So `CheckedFactor` alone fills its lists, after checks.
@@ -10,7 +11,7 @@ initial values without a word when it gets the columns wrong. So `CheckedFactor`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain
 from numbers import Real
@@ -80,27 +81,29 @@ class MeasurementFactor(CheckedFactor):
         variables: The problem's variables.
         series: The measurement's whitened rows.
         errors: The error variables that it depends on, and the rows' derivatives in them, shape (n_rows, width) each.
+        k: Which measurement of the series.
     """
 
     def __init__(
-        self, variables: Variables, series: WhitenedSeries, errors: Sequence[tuple[int, str, Floats]] = ()
+        self, variables: Variables, series: WhitenedSeries, errors: Sequence[tuple[Variable, Floats]] = (), k: int = 0
     ) -> None:
-        places = set(variables.coordinates[series.nuisances.ravel()].tolist())
+        places, h = set(variables.coordinates[series.nuisances[k]].tolist()), series.block.residual_dim
         ours = [*(variables.items if series.block.kind.ends else ())]
         ours += [v for v in variables.nuisance if places.intersection(v.parameters)]
         chosen = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v in ours)])
-        widths = [v.columns.stop - v.columns.start for v in ours] + [loading.shape[1] for _, _, loading in errors]
-        shared = [Variable(key, symbol, "own", (), slice(0)) for key, symbol, _ in errors]
-        ends = np.cumsum([0, *widths]).tolist()
+        G = np.hstack([np.zeros((h, 0)), *(loading for _, loading in errors)])
+        widths = [v.columns.stop - v.columns.start for v in ours] + [loading.shape[1] for _, loading in errors]
+        ends, shared = np.cumsum([0, *widths]).tolist(), [v for v, _ in errors]
         local = [replace(v, columns=slice(*ends[i : i + 2])) for i, v in enumerate([*ours, *shared])]
-        G = np.hstack([np.zeros((series.n_rows, 0)), *(loading for _, _, loading in errors)])
 
         def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-            found = np.concatenate(list(series.linearise(variables.at(variables.parameters(values, ours)))))
+            found = np.concatenate(list(series.linearise(variables.at(variables.parameters(values, ours)))))[k * h :][
+                :h
+            ]
             z = np.concatenate([np.zeros(0), *(values.atVector(v.key) for v in shared)])
             return found[:, -1] - G @ z, np.hstack([found[:, chosen], -G])
 
-        super().__init__(local, series.n_rows, linearise)
+        super().__init__(local, h, linearise)
 
 
 class DistanceFactor(MeasurementFactor):
@@ -155,36 +158,63 @@ def measurement_factors(
         variables: The problem's variables.
         at: Where the error variables are estimated.
     """
-    factors, values, first, n = list[gtsam.NonlinearFactor](), gtsam.Values(), 0, len(rows.slots)
-    for part in rows.parts:
-        h = part.block.residual_dim
-        for one, L in ((part.only(k), rows.states.loadings[first + k * h :][:h]) for k in range(part.block.n)):
-            used = np.unique(L.indices // max(n, 1))
-            keys = [(gtsam.symbol("E", k), f"E({k})") for k in rows.configurations[used].tolist()]
-            G = [L[:, i * n : (i + 1) * n].toarray() for i in used.tolist()]
-            if variables.items or np.any(variables.coordinates[one.nuisances] >= 0):  # else nothing of it is estimated
-                factors += _factors_of(one, variables, [(*key, of_key) for key, of_key in zip(keys, G, strict=True)])
-        first += part.n_rows
-    for k, z in zip(rows.configurations.tolist(), rows.posterior_mean(at), strict=True):
-        factors.append(gtsam.PriorFactorVector(gtsam.symbol("E", k), np.zeros(n), gtsam.noiseModel.Unit.Create(n)))
-        values.insert(gtsam.symbol("E", k), z)
+    z, factors, values = rows.posterior_mean(at), list[gtsam.NonlinearFactor](), gtsam.Values()
+    private = rows.private(at.without_columns())[:, -1] - rows.states.loadings @ z.ravel()
+    estimates = [(_error("E", k), of_k) for k, of_k in zip(rows.configurations.tolist(), z, strict=True)]
+    first, n, measurements = 0, max(len(rows.slots), 1), ((part, k) for part in rows.parts for k in range(part.block.n))
+    for number, (part, k) in enumerate(measurements):
+        kind, these = part.block.kind, slice(first, first + part.block.residual_dim)
+        L, first = rows.states.loadings[these], these.stop
+        shared = np.unique(L.indices // n).tolist()
+        errors = [(estimates[i][0], L[:, i * n : (i + 1) * n].toarray()) for i in shared]
+        if not variables.items and np.all(variables.coordinates[part.nuisances[k]] < 0):
+            continue  # nothing of it is estimated
+        if all(type(each) in _PAIR_FACTORS for each in kind.parts):
+            found, common = _pair_factors(part.only(k), variables, errors, private[these], _error("e", number))
+            factors += found
+            estimates += common
+        elif kind.turned_back:  # by a rotation of all together
+            factors.append(MeasurementFactor(variables, part, errors, k))
+        else:
+            factors.append(MeasurementFactor(variables, part.only(k), errors))
+    for v, value in estimates:
+        factors.append(gtsam.PriorFactorVector(v.key, np.zeros(len(value)), gtsam.noiseModel.Unit.Create(len(value))))
+        values.insert(v.key, value)
     return factors, values
 
 
-def _factors_of(
-    one: WhitenedSeries, variables: Variables, errors: list[tuple[int, str, Floats]]
-) -> Iterator[MeasurementFactor]:
-    """The factor of a measurement; of a pair with an uncorrelated distance and angle one of each."""
-    kinds, W = one.block.kind.parts, unpack(one.block.whitening, one.block.residual_dim)[0]
-    if any(type(kind) not in _PAIR_FACTORS for kind in kinds) or np.any(np.diag(np.diag(W)) != W):
-        yield MeasurementFactor(variables, one, errors)
-        return
-    for k in np.flatnonzero(np.diag(W)).tolist():
-        block = replace(one.block, kind=kinds[k], data=one.block.data[:, [k]], whitening=W[[k]][:, [k]])
-        factor = _PAIR_FACTORS[type(kinds[k])]
+def _error(letter: str, number: int) -> Variable:
+    return Variable(gtsam.symbol(letter, number), f"{letter}({number})", "own", (), slice(0))
+
+
+def _pair_factors(
+    one: WhitenedSeries, variables: Variables, errors: list[tuple[Variable, Floats]], private: Floats, own: Variable
+) -> tuple[list[MeasurementFactor], list[tuple[Variable, Floats]]]:
+    """A factor of each row of a pair that is in use, and the estimate of the error `own` where they have it in common.
+
+    Args:
+        one: The pair's whitened rows.
+        variables: The problem's variables.
+        errors: As of `MeasurementFactor`.
+        private: Estimates of the private errors, shape (n_rows,), [sigma].
+        own: The variable of the error that the rows have in common.
+    """
+    W, estimates, factors = unpack(one.block.whitening, one.block.residual_dim)[0], [], list[MeasurementFactor]()
+    white = np.diag(W)
+    if np.any(np.diag(white) != W):
+        C = np.linalg.inv(W.T @ W)
+        c = C[0, 1] / np.sqrt(C[0, 0] * C[1, 1])
+        white, G = 1.0 / np.sqrt(np.diag(C) * (1.0 - abs(c))), np.sqrt(abs(c) / (1.0 - abs(c))) * np.sign([[1.0], [c]])
+        errors = [*((v, white[:, None] * np.linalg.solve(W, of_v)) for v, of_v in errors), (own, G)]
+        estimates = [(own, (G[:, 0] / white) @ W.T @ private[:, None])]
+    for k in np.flatnonzero(white).tolist():
+        part = one.block.kind.parts[k]
+        block = replace(one.block, kind=part, data=one.block.data[:, [k]], whitening=white[None, [k]])
+        factor = _PAIR_FACTORS[type(part)]
         made = factor.__new__(factor)
-        MeasurementFactor.__init__(made, variables, replace(one, block=block), [(*e[:2], e[2][[k]]) for e in errors])
-        yield made
+        MeasurementFactor.__init__(made, variables, replace(one, block=block), [(v, of_v[[k]]) for v, of_v in errors])
+        factors.append(made)
+    return factors, estimates
 
 
 _PAIR_FACTORS: dict[type, type[MeasurementFactor]] = {Distance: DistanceFactor, RotationAngle: RotationAngleFactor}

@@ -102,10 +102,8 @@ class Problem(FrozenArrays):
 
     @cached_property
     def _measured(self) -> tuple[list[gtsam.NonlinearFactor], gtsam.Values]:
-        """Factors of the measurements; joint readings' errors are variables, so that rows of a pair are independent."""
-        joints = self.joints_estimated or self.options.pair_errors == "shared"
-        rows = whiten(self, noises_at(self, self.start, fitted=True), joints=joints)
-        return measurement_factors(rows, self.variables, self.variables.at(self.start))
+        """Factors of the measurements, and the errors that they have in common."""
+        return measurement_factors(self.rows, self.variables, self.variables.at(self.start))
 
     @property
     def _more_factors(self) -> tuple[gtsam.NonlinearFactor, ...]:
@@ -288,7 +286,11 @@ def with_factors(problem: Problem, start: Floats, state: NoiseState | None = Non
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    return replace(p, rows=whiten(p, noises_at(p, start, fitted=True), joints=p.joints_estimated))
+    weights = p.state.weights
+    if weights is not None:
+        weights = tuple(w[s.train] for w, s in zip(weights, p.data.blocks, strict=True))
+    noises, sharing = noises_at(p, start, fitted=True), p.options.pair_errors == "shared"
+    return replace(p, rows=whitened_rows(noises, sharing=sharing, joints=p.joints_estimated, weights=weights))
 
 
 def with_user_factors(problem: Problem) -> Problem:
@@ -318,14 +320,6 @@ def check_graph(problem: Problem) -> None:
     n = len(problem._more_factors)
     if n:
         raise ProblemError("solution.problem.graph", f"{n} factors added since it was solved", "to be solved again")
-
-
-def whiten(problem: Problem, noises: Sequence[RowNoise], *, joints: bool) -> WhitenedRows:
-    """The train rows whitened by their noise; `joints` makes all errors of joint readings states."""
-    weights, sharing = None, problem.options.pair_errors == "shared"
-    if problem.state.weights is not None:
-        weights = [w[s.train] for w, s in zip(problem.state.weights, problem.data.blocks, strict=True)]
-    return whitened_rows(noises, sharing=sharing, joints=joints, weights=weights)
 
 
 def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> tuple[RowNoise, ...]:
