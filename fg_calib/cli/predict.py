@@ -22,15 +22,14 @@ def predict(
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
     from fg_calib.calibration import Calibration
     from fg_calib.calibration import predict as predict_tool
-    from fg_calib.io import Units, read_measurements, require_writable
+    from fg_calib.io import Units, read_joint_table, require_writable
     from fg_calib.report import build_prediction_report, prediction_document, write_prediction
 
     most, units = read_quantity(limit, "m", "--limit"), Units(length, angle)
     if out is not None:
         require_writable(out)
     arm = Calibration.load(result)
-    table = None if at is None else read_measurements(at, arm.robot, units=units)
-    ids, readings = ((), None) if table is None else (tuple(table.ids.tolist()), table.readings)
+    ids, readings = ((), None) if at is None else read_joint_table(at, arm.robot, units)
     found = predict_tool(arm, readings, limit=most)
     if out is not None:
         write_prediction(out, found, arm.result, arm.robot, ids, units)

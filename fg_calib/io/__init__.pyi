@@ -39,7 +39,7 @@ from .saved import (
     residual_frame,
     write_calibration,
 )
-from .tables import Targets, joint_columns, read_measurements, read_targets
+from .tables import Targets, joint_columns, read_joint_table, read_measurements, read_targets
 from .urdf import ROUNDING, encoding_of, read_urdf, urdf_text, write_urdf
 from .yaml import (
     ANGLES,
@@ -111,6 +111,7 @@ __all__ = [
     "read_calibrated_robot",
     "read_camera",
     "read_job",
+    "read_joint_table",
     "read_measurements",
     "read_result",
     "read_robot",

@@ -198,6 +198,24 @@ def read_ids(table: Table, *, repeated: bool) -> pl.Series:
     return ids
 
 
+def read_joint_table(
+    path: Path | str | Any, robot: Robot, units: Units | None = None
+) -> tuple[tuple[str, ...], Floats]:
+    """Names of configurations, and their joint values, shape (n, n_joints), [rad] (prismatic: [m]).
+
+    Args:
+        path: The table: a file, or a frame of polars or pandas.
+        robot: Whose joints they are of: names, number and limits.
+        units: Of the table; default m and rad.
+
+    Raises:
+        InputError: The file is missing, is no table, lacks columns or holds a cell that cannot be used.
+    """
+    table = read_table(path, robot)
+    readings = read_readings(table, find_joint_columns(table, robot), robot, units or Units())
+    return tuple(read_ids(table, repeated=True).to_list()), readings
+
+
 @dataclass(frozen=True)
 class Targets(FrozenArrays):
     """What the tool is to reach.
