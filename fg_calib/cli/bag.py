@@ -96,6 +96,6 @@ def _clocks(stops: Stops) -> list[str]:
     if offset is None:
         return [f"offset {stops.applied:.6g} s as specified"]
     return [
-        f"poses are stamped {offset.seconds:+.6f} +- {offset.sigma:.6f} s against the joints, which is taken out",
-        f"from {offset.n_moves} moves; speeds by joints and by poses correlate by {offset.correlation:.3f}",
+        f"poses are stamped {offset.seconds:+.2f} s against the joints, which is taken out",
+        f"speeds by joints and by poses correlate by {offset.correlation:.3f}",
     ]

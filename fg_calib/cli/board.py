@@ -34,12 +34,12 @@ def board(
         say("error: one of --camera and --estimate-camera is needed, and only one")
         raise typer.Exit(2)
     from fg_calib import importers
-    from fg_calib.io import Units, read_bytes, read_camera, require_writable
+    from fg_calib.io import Units, read_bytes, read_camera, require_own, require_writable
 
     importers.load_opencv()
     require_writable(out)
     target, files = importers.read_calibration_board(board), importers.image_files(images)
-    importers.require_no_input_of_board(out, [board, *files, *filter(None, [configurations])])
+    require_own(out, importers.BOARD_FILES)
     readings = None if configurations is None else importers.read_readings(configurations)
     if camera is not None:
         read_camera(camera)  # before the images, which take their time
@@ -101,9 +101,8 @@ def _notes(tables: BoardTables) -> Iterator[str]:
     ):
         if names:
             yield f"{words} {shortened(list(names), 20)}."
-    if fit.camera_covariance is not None:
-        shift = f"{1e3 * fit.moved_by_camera:.3f} mm (1 sigma)"
-        yield f"The covariances of poses assume an exact camera. Its error moves all boards together, by up to {shift}."
+    if fit.camera_sigma is not None:
+        yield "The covariances of poses assume an exact camera; its error moves all boards together."
     if tables.readings is None:
         yield "The tables have no joint readings: add q1, q2 ... to each row, or give --configurations a table of ids."
     one = "{table: board.csv, model: board}, or {table: pixels.csv, model: pixels, camera: camera.yaml}"

@@ -1,5 +1,6 @@
 from .bag import TABLE_BEGINNING, JointStream, PoseStream, Stops, average_stops, period, read_bag, write_stops
 from .board import (
+    BOARD_FILES,
     INTRINSICS,
     BoardTables,
     fit_board,
@@ -8,12 +9,12 @@ from .board import (
     read_calibration_board,
     read_corners,
     read_readings,
-    require_no_input_of_board,
     write_board_tables,
 )
 from .draft import draft_job
 
 __all__ = [
+    "BOARD_FILES",
     "INTRINSICS",
     "TABLE_BEGINNING",
     "BoardTables",
@@ -30,7 +31,6 @@ __all__ = [
     "read_calibration_board",
     "read_corners",
     "read_readings",
-    "require_no_input_of_board",
     "write_board_tables",
     "write_stops",
 ]

@@ -16,33 +16,28 @@ Of n samples with autocorrelation rho_k the mean of samples of variance s^2 has 
     s^2 tau / n,    tau = 1 + 2 sum_k (1 - k / n) rho_k
 
 (integrated autocorrelation time, in samples; Sokal 1997, *Monte Carlo Methods in Statistical Mechanics*, Sec. 3). tau
-is estimated from all standstills together, as one is too short. As s is estimated too, the variance is Student's.
+is estimated from all standstills together, as one is too short. As s is estimated too, the variance is Student's. Where
+tau is more than an eighth of a stop, averaging is taken to gain nothing, with a warning.
 
 Note:
     Errors that are constant during a stop do not scatter: those of the instrument in one place, and noise that is
     slower than several stops.
 
-The nominal arm gives the tool's motion at each joint reading. Its speed and angular speed depend on no frame and are
-correlated with those of the measured poses: the offset of the highest correlation is right to a few milliseconds. Each
-move between two stops then gives an offset, by least squares on the distances from the places where the move began and
-ends. The scatter of these offsets is the sigma of their mean, so that noise of poses and stamps, and errors of the
-nominal arm, are counted.
+The nominal arm gives the tool's motion at each joint reading. Its speed depends on no frame: the offset of the clocks
+is that at which it correlates most with the speed of the measured positions, to a hundredth of a second. Stops are cut
+by more than that at both ends.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import toeplitz
-from scipy.optimize import brute, least_squares
-from scipy.signal import correlate, correlation_lags, find_peaks
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtr, stdtrit
 
 from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, FrozenArrays, InputError, check_number, checked
 from fg_calib.io import joint_columns, require_own_csv, write_csv
@@ -111,15 +106,14 @@ def period(time: Floats) -> float:
 MIN_CORRELATION = 0.7
 """Below it the poses are not those of the arm's tool."""
 
-MIN_MOVES = 2
-MIN_MOVE = 5e-3
-"""Smaller moves, [m] or [rad], give no offset."""
+MAX_LAG_S = 2.0
+"""The offset of the clocks is looked for within so much of that by times of receipt, [s]."""
 
-MARGIN_S = 0.2
-"""Part of the stops before and after a move that belongs to it, [s]."""
+LAG_STEP_S = 0.01
+"""Step of the search, [s]."""
 
-MAX_GRID = 2**20
-"""Samples at most of the speeds that are correlated."""
+SPEED_WIDTH_S = 0.1
+"""Time over which speeds are taken, [s]."""
 
 
 @dataclass(frozen=True)
@@ -128,163 +122,50 @@ class ClockOffset:
 
     Attributes:
         seconds: The offset, [s].
-        sigma: Its 1 sigma, from the scatter from move to move, [s].
-        n_moves: Moves that it is the mean of.
         correlation: Of the tool's speed by the joints with that by the poses.
     """
 
     seconds: float
-    sigma: float
-    n_moves: int
     correlation: float
 
 
-def estimate_offset(tool: PoseStream, poses: PoseStream, stops: Sequence[tuple[float, float]]) -> ClockOffset:
-    """The offset of the poses' clock, [s].
+def estimate_offset(tool: PoseStream, poses: PoseStream) -> ClockOffset:
+    """The offset of the poses' clock at which speeds correlate most, near that by times of receipt.
 
     Args:
         tool: The nominal arm's tool at the joint readings.
         poses: The measured poses, in any frame.
-        stops: Beginning and end of each standstill by the joints' clock, [s], in order of time.
 
     Raises:
-        InputError: The poses do not follow the joints, or there are not enough moves between stops.
+        InputError: The poses do not follow the joints.
     """
-    place = f"topics {tool.source.topic} and {poses.source.topic}"
-    coarse, correlation = _align_speeds(tool, poses)
-    if correlation < MIN_CORRELATION:
-        found = f"the poses do not move as the joints do (correlation {correlation:.2f})"
+    first = tool.source.lag - poses.source.lag - MAX_LAG_S
+    begin = max(tool.time[0], poses.time[0] - first)
+    end = min(tool.time[-1], poses.time[-1] - first - 2.0 * MAX_LAG_S)
+    n, n_lags = max(2, int((end - begin) / LAG_STEP_S)), round(2.0 * MAX_LAG_S / LAG_STEP_S)
+    by_joints = _speed(tool, begin + LAG_STEP_S * np.arange(n))
+    by_poses = _speed(poses, begin + first + LAG_STEP_S * np.arange(n + n_lags))
+    lagged = sliding_window_view(by_poses, n)
+    with np.errstate(invalid="ignore"):  # of what does not move
+        correlation = np.nan_to_num([np.corrcoef(by_joints, one)[0, 1] for one in lagged])
+    best = int(np.argmax(correlation))
+    if correlation[best] < MIN_CORRELATION:
+        place = f"topics {tool.source.topic} and {poses.source.topic}"
+        found = f"the poses do not move as the joints do (correlation {correlation[best]:.2f})"
         hint = "or specify the offset of the clocks: --offset 0"
         raise InputError(place, found, "poses of this robot's tool", hint)
-    moves = [_fit_move(tool, poses, before, after, coarse) for before, after in pairwise(stops)]
-    offsets, weights = np.reshape([move for move in moves if move is not None], (-1, 2)).T
-    if len(offsets):
-        off = np.abs(offsets - np.median(offsets))
-        good = off <= 5.0 * 1.4826 * np.median(off) + 1e-6  # without moves that are far off all others
-        offsets, weights = offsets[good], weights[good]
-    n = len(offsets)
-    if n < MIN_MOVES:
-        found = f"{n} moves between stops that show the offset"
-        raise InputError(place, found, f"at least {MIN_MOVES}", "see --offset")
-    mean = float(np.average(offsets, weights=weights))
-    variance = n / (n - 1) * np.sum((weights * (offsets - mean)) ** 2) / np.sum(weights) ** 2  # for any weights
-    student = stdtrit(n - 1, ndtr(1.0))  # half the interval of 68 %: of few moves the scatter is hardly known
-    return ClockOffset(mean, float(np.sqrt(variance) * student), n, correlation)
+    return ClockOffset(float(first + best * LAG_STEP_S), float(correlation[best]))
 
 
-# --- the coarse offset ------------------------------------------------------------------------------------------------
-
-
-def _align_speeds(tool: PoseStream, poses: PoseStream) -> tuple[float, float]:
-    """Offset at which the speeds correlate best, [s], and their correlation.
-
-    Of several that fit, as where motions repeat, the one nearest to the offset by times of receipt is taken.
-    """
-    span = max(np.ptp(tool.time), np.ptp(poses.time))
-    step = max(period(tool.time), period(poses.time), 0.01, float(span) / MAX_GRID)
-    found = [_correlate(*(_speed(stream, values, step) for stream, values in zip((tool, poses), pair, strict=True)))
-             for pair in _quantities(tool, poses)]  # fmt: skip
-    lags, correlation = max(found, key=lambda of: float(of[1].max()))
-    lags = lags * step + (poses.time[0] - tool.time[0])
-    top = float(correlation.max())
-    peaks, _ = find_peaks(np.concatenate([[-2.0], correlation, [-2.0]]), height=top - 0.5 * (1.0 - top) - 0.01)
-    peaks -= 1
-    chosen = peaks[np.argmin(np.abs(lags[peaks] - (tool.source.lag - poses.source.lag)))]
-    same = np.abs(lags[peaks] - lags[chosen]) < 0.5  # ripples of one peak
-    chosen = peaks[same][np.argmax(correlation[peaks[same]])]
-    return float(lags[chosen]), float(correlation[chosen])
-
-
-def _quantities(tool: PoseStream, poses: PoseStream) -> list[tuple[Floats, Floats]]:
-    """Positions, and rotation matrices over sqrt(2), whose distances are small angles: of the tool and as measured."""
-    both = [(tool.position, poses.position)]
-    if tool.rotation is not None and poses.rotation is not None:
-        both.append((tool.rotation.reshape(-1, 9) / np.sqrt(2.0), poses.rotation.reshape(-1, 9) / np.sqrt(2.0)))
-    return both
-
-
-def _speed(stream: PoseStream, values: Floats, step: float) -> Floats:
-    """Speed on a grid of this step that begins with the stream, shape (n,), [m/s] or [rad/s]."""
-    width = max(0.1, 4.0 * step)
-    grid = np.arange(stream.time[0], stream.time[-1], step)
-    moved = _interpolate(grid + width / 2, stream.time, values) - _interpolate(grid - width / 2, stream.time, values)
-    speed: Floats = np.linalg.norm(moved, axis=1) / width
+def _speed(stream: PoseStream, time: Floats) -> Floats:
+    """Speed of the position, shape (n,), [m/s]."""
+    ends = [time - SPEED_WIDTH_S / 2.0, time + SPEED_WIDTH_S / 2.0]
+    before, after = (np.array([np.interp(at, stream.time, axis) for axis in stream.position.T]) for at in ends)
+    speed: Floats = np.linalg.norm(after - before, axis=0) / SPEED_WIDTH_S
     return speed
 
 
-def _correlate(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    """Lags of b behind a in samples, and the correlation of what overlaps at each; -1 where little does."""
-    a, b = a - a.mean(), b - b.mean()
-    one_a, one_b = np.ones_like(a), np.ones_like(b)
-    overlap = correlate(one_b, one_a, method="fft")
-    energy = correlate(one_b, a * a, method="fft") * correlate(b * b, one_a, method="fft")
-    enough = (overlap >= 0.5 * min(len(a), len(b))) & (energy > 1e-6 * np.sum(a * a) * np.sum(b * b))
-    correlation = np.where(enough, correlate(b, a, method="fft") / np.sqrt(np.where(enough, energy, 1.0)), -1.0)
-    return correlation_lags(len(b), len(a)).astype(np.float64), correlation
-
-
-# --- moves ------------------------------------------------------------------------------------------------------------
-
-
-def _fit_move(
-    tool: PoseStream, poses: PoseStream, before: tuple[float, float], after: tuple[float, float], coarse: float
-) -> tuple[float, float] | None:
-    """Offset by positions and by orientations on one move, and its weight; None where neither shows the move."""
-    time = poses.time - coarse
-    found = [_fit(tool.time, a, time, b, before, after) for a, b in _quantities(tool, poses)]
-    fits = [fit for fit in found if fit is not None]
-    if not fits:
-        return None
-    offsets, weights = np.transpose(fits)
-    return coarse + float(np.average(offsets, weights=weights)), float(weights.sum())
-
-
-def _fit(
-    tool_time: Floats, tool: Floats, time: Floats, values: Floats, before: tuple[float, float],
-    after: tuple[float, float],
-) -> tuple[float, float] | None:  # fmt: skip
-    """Least squares of the offset on one move by one quantity, and its weight: information over the mean square.
-
-    Compared are the distances from where the move began and from where it ends, over its length. None where the tool
-    moves too little or was not seen.
-    """
-    begin, end = before[1] - MARGIN_S, after[0] + MARGIN_S
-    inside = slice(*np.searchsorted(time, (begin, end)))
-    seen, measured = time[inside], values[inside]
-    tool_ends, ends = _ends(tool_time, tool, before, after), _ends(time, values, before, after)
-    if tool_ends is None or ends is None or len(seen) < 10 or np.diff(seen).max() > 0.25 * (end - begin):
-        return None
-
-    def residual(offset: Floats) -> Floats:
-        predicted = _interpolate(seen - offset, tool_time, tool)
-        return (_progress(predicted, tool_ends) - _progress(measured, ends)).ravel()
-
-    found: Any = least_squares(residual, 0.0, method="lm", x_scale=1e-3)
-    if not found.success or abs(found.x[0]) > 0.5 * (end - begin):
-        return None
-    return float(found.x[0]), float(np.sum(found.jac**2)) / max(float(np.mean(found.fun**2)), 1e-18)
-
-
-def _ends(time: Floats, values: Floats, before: tuple[float, float], after: tuple[float, float]) -> Floats | None:
-    """Means at the stops before and after a move, shape (2, k); None where they were not seen, or are one place."""
-    stops = [values[slice(*np.searchsorted(time, stop))] for stop in (before, after)]
-    if min(map(len, stops)) < 3:
-        return None
-    ends = np.stack([stop.mean(axis=0) for stop in stops])
-    return ends if np.linalg.norm(ends[1] - ends[0]) >= MIN_MOVE else None
-
-
-def _progress(values: Floats, ends: Floats) -> Floats:
-    """Distances from both ends of a move over its length, shape (n, 2)."""
-    far: Floats = np.linalg.norm(values[:, None] - ends, axis=2) / np.linalg.norm(ends[1] - ends[0])
-    return far
-
-
-def _interpolate(at: Floats, time: Floats, values: Floats) -> Floats:
-    return np.stack([np.interp(at, time, column) for column in values.T], axis=-1)
-
-
-MIN_SAMPLES = 8
+MIN_SAMPLES = 12
 """Poses, and joint readings, of which a mean is taken."""
 
 STILL_SCATTERS = 3.0
@@ -300,14 +181,8 @@ MAX_SCATTER_RATIO = 10.0
 MIN_SIGMA = 1e-6
 """1 sigma of a mean, at least, [m] or [rad]: poses without any scatter are not exact either."""
 
-MAX_BLOCKS = 64
-"""Blocks at most in which the samples of a stop are averaged before their correlation is estimated."""
-
-MIN_GAIN = 12.0
-"""Gain in twice the log-likelihood from which noise counts as correlated: white noise reaches it once in 400 times."""
-
-MAX_TIME_SHARE = 1.0 / 6.0
-"""Share of a stop that the correlation time may have: averaging slower noise reduces it too little to be relied on."""
+WINDOW = 4.0
+"""Correlation times at which the sum over the lags ends (Sokal)."""
 
 
 class Skipped(NamedTuple):
@@ -326,7 +201,7 @@ class Scatter:
         single: Of single measurements, the median over stops of the largest component, [m] or [rad].
         mean: Sigma of a stop's mean, likewise.
         correlation_samples: Integrated autocorrelation time in samples, 1 for white noise.
-        slow: Whether that is so much of a stop that averaging says little.
+        slow: Whether it is too long to be estimated, and averaging is taken to gain nothing.
     """
 
     single: float
@@ -407,9 +282,9 @@ def average_stops(
         hint = f"the longest pause is {max(b - a for a, b in pauses):.2g} s" if pauses else ""
         expected = "the arm at rest for a while, several times"
         raise InputError(f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
-    estimate = None if offset is not None else estimate_offset(joints.tool_path(robot), poses, spans)
+    estimate = None if offset is not None else estimate_offset(joints.tool_path(robot), poses)
     if estimate is not None and most_offset is not None and abs(estimate.seconds) > most_offset:
-        found = f"an offset of {estimate.seconds:.4g} +- {estimate.sigma:.2g} s against the joints' clock"
+        found = f"an offset of {estimate.seconds:.4g} s against the joints' clock"
         raise InputError(f"topic {poses.source.topic}", found, f"at most {most_offset:g} s")
     applied = offset if estimate is None else estimate.seconds
     assert applied is not None
@@ -509,7 +384,7 @@ def _scatter(stops: Sequence[_Stop]) -> tuple[dict[str, Scatter], dict[str, Floa
         tau = correlation_time(of)
         sigma[kind] = sigmas_of_means(of, tau)
         single, mean = np.median([r.std(axis=0) for r in of], axis=0), np.median(sigma[kind], axis=0)
-        slow = bool(tau > MAX_TIME_SHARE * np.median([len(r) for r in of]))
+        slow = tau >= int(np.median([len(r) for r in of]))
         scatter[kind] = Scatter(float(single.max()), float(mean.max()), tau, slow)
     return scatter, sigma
 
@@ -518,69 +393,43 @@ def _scatter(stops: Sequence[_Stop]) -> tuple[dict[str, Scatter], dict[str, Floa
 
 
 def correlation_time(residuals: Sequence[Floats]) -> float:
-    """Integrated autocorrelation time of noise over a stop, in samples, at least 1.
+    """Integrated autocorrelation time of noise over a stop, in samples, at least 1; that of a stop for slow noise.
 
-    Noise is white and AR(1) together, by maximum likelihood of the steps from sample to sample, which do not depend on
-    a stop's mean. It is white where correlation gains too little likelihood (`MIN_GAIN`).
+    The variance v of a stop's mean is missing in the autocovariances c_k of residuals: c_k = C_k - v, and
+    n v = C_0 + 2 sum_k (1 - k / n) C_k, which give v. The sum ends at `WINDOW` correlation times,
+    which for slow noise are more than half of a stop.
 
     Args:
         residuals: Of each stop, minus its mean, shape (n, k).
     """
-    scales = [np.sqrt(np.mean(np.diff(r, axis=0) ** 2, axis=0)) for r in residuals]
-    scaled = [r / np.where(s > 0.0, s, 1.0) for r, s in zip(residuals, scales, strict=True)]  # stops count alike
+    scaled = [r / np.maximum(r.std(axis=0), np.finfo(np.float64).tiny) for r in residuals]  # stops count alike
     n = int(np.median([len(r) for r in scaled]))
-    size = -(-n // MAX_BLOCKS)
-    n_blocks = n // size
-    whole = [r[: n_blocks * size].reshape(n_blocks, size, -1).mean(axis=1) for r in scaled if len(r) >= n_blocks * size]
-    steps = np.diff(np.concatenate(whole, axis=1), axis=0)  # (n_blocks - 1, n_series)
-    if n_blocks < 3 or not steps.any():
-        return 1.0
-    within = np.arange(1 - size, size)
-    lags = np.abs(size * np.arange(n_blocks)[:, None] + within)  # between samples of two blocks, (n_blocks, 2 size - 1)
-
-    most = float(np.log(20.0 * n))  # slower noise is indistinguishable from a walk
-
-    def fit(log_time: float, logit: float) -> tuple[float, float]:
-        """Twice the negative log-likelihood, and the variance of a stop's mean."""
-        white, time = 1.0 / (1.0 + np.exp(-logit)), 1.0 + np.exp(min(log_time, most))
-        rho = np.where(lags == 0, 1.0, (1.0 - white) * ((time - 1.0) / (time + 1.0)) ** lags)
-        V = toeplitz(rho @ (size - np.abs(within)) / size**2)
-        L = np.linalg.cholesky(np.diff(np.diff(V, axis=0), axis=1))
-        misfit = float(np.sum(np.linalg.solve(L, steps) ** 2))
-        cost = 2.0 * steps.shape[1] * np.log(np.diag(L)).sum() + steps.size * np.log(misfit)
-        return cost, float(V.mean()) * misfit / steps.size
-
-    def cost(x: Floats) -> float:
-        return fit(*x)[0]
-
-    (least, of_mean), white = fit(*brute(cost, ((-2.0, most), (-6.0, 4.0)), Ns=8)), fit(0.0, 50.0)
-    if white[0] - least < MIN_GAIN:
-        of_mean = white[1]
-    square = float(np.mean(np.concatenate(scaled) ** 2))  # of residuals: the variance of the mean is missing in it
-    return max(1.0, n * of_mean / (square + of_mean))
+    lags = np.arange(max(n // 2, 1))
+    size = 2 * max(len(r) for r in scaled)
+    power = [np.mean(np.abs(np.fft.rfft(r, size, axis=0)) ** 2, axis=1) for r in scaled]
+    c = np.fft.irfft(np.sum(power, axis=0), size)[: len(lags)] / sum(np.maximum(len(r) - lags, 0) for r in scaled)
+    weights = np.where(lags == 0, 1.0, 2.0 * (1.0 - lags / n))
+    of_mean = np.cumsum(weights * c) / (n - np.cumsum(weights))
+    times = np.maximum(n * of_mean / np.maximum(c[0] + of_mean, np.finfo(np.float64).tiny), 1.0)
+    ended = np.flatnonzero(lags >= WINDOW * times)
+    return float(times[ended[0]]) if len(ended) else float(n)
 
 
 def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
     """Sigma of each stop's mean of correlated samples, shape (n_stops, k).
 
     The variance of Student's t, for the scatter is estimated from the same samples: with 2 n tau / (tau^2 + 1) - 1
-    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise. The scatter of slow
-    noise is that of all stops together, as one stop hardly shows it.
+    degrees of freedom, those of the mean square of AR(1) noise (Bartlett), n - 1 of white noise.
 
     Args:
         residuals: Of each stop, minus its mean, shape (n, k).
         tau: Integrated autocorrelation time, in samples.
     """
-    each = np.array([len(r) for r in residuals], dtype=np.float64)[:, None]
+    n = np.array([len(r) for r in residuals], dtype=np.float64)[:, None]
     square = np.array([np.mean(r**2, axis=0) for r in residuals])
-    middle = float(np.median(each))
-    if tau > MAX_TIME_SHARE * middle:
-        variance = square.mean(axis=0) * np.minimum(tau / each, 1.0) / (1.0 - min(tau / middle, 0.99))
-    else:
-        part = np.minimum(tau / each, 0.5)
-        freedom = np.maximum(2.0 * each * tau / (tau**2 + 1.0) - 1.0, 3.0)
-        variance = square * part / (1.0 - part) * (freedom / (freedom - 2.0))
-    sigma: Floats = np.maximum(np.sqrt(variance), MIN_SIGMA)
+    part = np.minimum(tau / n, 0.5)
+    freedom = np.maximum(2.0 * n * tau / (tau**2 + 1.0) - 1.0, 3.0)
+    sigma: Floats = np.maximum(np.sqrt(square * part / (1.0 - part) * freedom / (freedom - 2.0)), MIN_SIGMA)
     return sigma
 
 

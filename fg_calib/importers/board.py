@@ -21,7 +21,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -39,6 +39,7 @@ from fg_calib.inputs import Floats, InputError, Integers, check
 from fg_calib.io import (
     KNOWN,
     Count,
+    NotNegative,
     Positive,
     Schema,
     Table,
@@ -47,7 +48,6 @@ from fg_calib.io import (
     fill_folder,
     read_bytes,
     read_yaml,
-    require_own,
     shown,
     validate,
     write_csv,
@@ -63,7 +63,11 @@ _SEARCHED = 1600
 board the search takes seconds, or minutes where there is much texture."""
 
 
-UNDETERMINED = ("images", "no camera that they determine", "boards tilted by 30 degrees or so in several ways")
+MAX_COUNT = 1000
+"""Columns or rows."""
+
+MAX_SQUARE_M = 2.0
+"""Side of a square, [m]: larger ones are in another unit."""
 
 MIN_IMAGES = 3
 """From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
@@ -73,8 +77,7 @@ MIN_CORNERS = 6
 """Of a ChArUco board: four determine its pose, and more its accuracy."""
 
 
-@dataclass(frozen=True)
-class CalibrationBoard:
+class CalibrationBoard(Schema):
     """A checkerboard, or a ChArUco board, whose white squares hold markers that say which ones they are.
 
     The board's frame has its origin at the first corner of a checkerboard, between whose first four corners is a
@@ -93,17 +96,19 @@ class CalibrationBoard:
         upright: Whether the camera never turned more than a quarter turn about its axis between images, seen from the
             first one: this orients a checkerboard that looks the same after half a turn.
         name: What the board is called in a column `board`; without a name there is no such column.
+        units: Of its file.
     """
 
     type: Literal["checkerboard", "charuco"]
-    columns: int
-    rows: int
-    square: float
-    marker: float = 0.0
+    columns: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
+    rows: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
+    square: Positive
+    marker: NotNegative = 0.0
     dictionary: str = ""
-    legacy: bool = False
-    upright: bool = False
+    legacy: StrictBool = False
+    upright: StrictBool = False
     name: str = ""
+    units: UnitsOfFile = Field(Units(), exclude=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -288,7 +293,7 @@ def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats,
     return found
 
 
-def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
+def estimate_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
     """The camera that explains views of a plane best (Zhang 2000, *A flexible new technique for camera calibration*).
 
     Args:
@@ -310,7 +315,8 @@ def first_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int
         _, K, lens, _, _ = cv2.calibrateCamera(places, seen, size, None, None, criteria=criteria)
         return Camera(*map(float, [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]))
     except (cv2.error, InputError):
-        raise InputError(*UNDETERMINED) from None
+        hint = "boards tilted by 30 degrees or so in several ways"
+        raise InputError("images", "no camera that they determine", hint) from None
 
 
 def _matrices(camera: Camera) -> tuple[Floats, Floats]:
@@ -319,20 +325,8 @@ def _matrices(camera: Camera) -> tuple[Floats, Floats]:
     return K, np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
 
 
-def camera_derivatives(camera: Camera, points: Floats) -> Floats:
-    """Derivatives of image points in the camera's parameters, in the order of its fields, shape (n, 2, 9).
-
-    Args:
-        camera: The camera.
-        points: Points in its frame, in front of it, shape (n, 3), [m].
-    """
-    K, lens = _matrices(camera)
-    J = load_opencv().projectPoints(points, np.zeros(3), np.zeros(3), K, lens)[1]
-    return np.asarray(J[:, 6:15].reshape(len(points), 2, 9), dtype=np.float64)
-
-
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""A camera's parameters, in the order of its covariance."""
+"""A camera's parameters, in OpenCV's order."""
 
 PRIOR_RESIDUALS = 10
 """How many residuals of its own weigh as much in an image's sigma as those of all images."""
@@ -375,7 +369,6 @@ class View:
         sigma: Of a corner along each axis of the image, [px].
         covariance: Of its pose along and about the camera's axes, orientation first, shape (6, 6), [rad] and [m], with
             the camera taken as known.
-        by_camera: What the camera's own covariance adds to it, in all images together; 0 for a camera that was given.
         ambiguous: Whether a second pose, tilted the other way, explains its corners nearly as well.
     """
 
@@ -387,7 +380,6 @@ class View:
     rms: float
     sigma: float
     covariance: Floats
-    by_camera: Floats
     ambiguous: bool
 
     @property
@@ -404,7 +396,7 @@ class BoardFit:
         board: The board.
         size: Width and height of the images, [px].
         camera: The camera.
-        camera_covariance: Of its `INTRINSICS`, shape (9, 9); None for a camera that was given.
+        camera_sigma: 1 sigma of each of its `INTRINSICS`; None for a camera that was given.
         views: The board in each image.
         without_pose: Names of images that no pose explains.
         rms: Of all residuals, [px].
@@ -414,22 +406,11 @@ class BoardFit:
     board: CalibrationBoard
     size: tuple[int, int]
     camera: Camera
-    camera_covariance: Floats | None
+    camera_sigma: Mapping[str, float] | None
     views: tuple[View, ...]
     without_pose: tuple[str, ...]
     rms: float
     sigma: float
-
-    @property
-    def camera_sigma(self) -> dict[str, float] | None:
-        """1 sigma of each of the camera's parameters; None for a camera that was given."""
-        C = self.camera_covariance
-        return None if C is None else dict(zip(INTRINSICS, np.sqrt(np.diag(C)).tolist(), strict=True))
-
-    @property
-    def moved_by_camera(self) -> float:
-        """Largest 1 sigma by which the error of the camera moves boards, [m]."""
-        return float(np.sqrt(max(np.linalg.eigvalsh(view.by_camera[3:, 3:])[-1] for view in self.views)))
 
     @property
     def findings(self) -> tuple[str, ...]:
@@ -446,32 +427,13 @@ class BoardFit:
         return tuple(found)
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Least squares of one image: squared residuals, and derivatives by pose, (2 n, 6), and by the camera, (2 n, 9)."""
+class _Fit(NamedTuple):
+    """Least squares of one image: pose, squares of residuals, derivatives by the pose, (2 n, 6); squares of another."""
 
     pose: tuple[Floats, Floats]
     squares: float
     J: Floats
-    K: Floats
     second: float = np.inf
-
-    @property
-    def information(self) -> Floats:
-        """Of the pose, for corners of sigma 1 px, shape (6, 6)."""
-        A: Floats = self.J.T @ self.J
-        return A
-
-    @property
-    def shift(self) -> Floats:
-        """What an error of the camera's parameters does to the pose, shape (6, 9)."""
-        return np.asarray(np.linalg.solve(self.information, -self.J.T @ self.K), dtype=np.float64)
-
-    @property
-    def camera_information(self) -> Floats:
-        """Of the camera's parameters, for corners of sigma 1 px and an unknown pose, shape (9, 9)."""
-        rest = self.K + self.J @ self.shift
-        return rest.T @ rest
 
 
 def fit_board(
@@ -491,42 +453,52 @@ def fit_board(
     Raises:
         InputError: There are too few images for a camera, or none that a pose explains.
     """
-    given = camera is not None
-    points = {one.name: board.corners[one.corners] for one in found}
+    given, points = camera is not None, {one.name: board.corners[one.corners] for one in found}
     if camera is None:
-        camera = first_camera(list(points.values()), [one.uv for one in found], size)
+        camera = estimate_camera(list(points.values()), [one.uv for one in found], size)
     fits = {one.name: fit for one in found if (fit := _fit(camera, points[one.name], one.uv)) is not None}
     if not fits:
         raise InputError("images", "corners that no pose of the board explains", "images of this board by this camera")
-    seen = np.array([fit.camera_information for fit in fits.values()])  # (n_images, 9, 9)
-    C = np.zeros((9, 9)) if given else _scaled_inverse(seen.sum(axis=0))
-    taken = {name: 6.0 + float(np.sum(fit.camera_information * C)) for name, fit in fits.items()}
-    squares = sum(fit.squares for fit in fits.values())
-    variance = squares / sum(len(fit.J) - taken[name] for name, fit in fits.items())
-    own = {name: (fit.squares + PRIOR_RESIDUALS * variance) / (len(fit.J) - taken[name] + PRIOR_RESIDUALS)
-           for name, fit in fits.items()}  # fmt: skip
-    C = C @ sum(own[name] * fit.camera_information for name, fit in fits.items()) @ C
-    kept = [one for one in found if one.name in fits]
+    taken = 6.0 + (0.0 if given else len(INTRINSICS) / len(fits))
+    squares, n = (sum(of) for of in zip(*((fit.squares, len(fit.J)) for fit in fits.values()), strict=True))
+    variance = squares / (n - taken * len(fits))
     return BoardFit(
         board=board,
         size=size,
         camera=camera,
-        camera_covariance=None if given else C,
-        views=tuple(_view(one, fits[one.name], own[one.name], C) for one in kept),
+        camera_sigma=None if given else _camera_sigmas(camera, points, fits, variance),
+        views=tuple(_view(one, fits[one.name], variance, taken) for one in found if one.name in fits),
         without_pose=tuple(one.name for one in found if one.name not in fits),
-        rms=float(np.sqrt(squares / sum(len(fit.J) for fit in fits.values()))),
+        rms=float(np.sqrt(squares / n)),
         sigma=float(np.sqrt(variance)),
     )
 
 
-def _view(one: Corners, fit: _Fit, variance: float, C: Floats) -> View:
+def _camera_sigmas(
+    camera: Camera, points: Mapping[str, Floats], fits: Mapping[str, _Fit], variance: float
+) -> dict[str, float]:
+    """1 sigma of each of the camera's parameters, for corners of a variance and unknown poses."""
+    rest = []
+    for name, (pose, _, J, _) in fits.items():
+        in_camera = pose[1] + points[name] @ pose[0][:, :2].T
+        K = load_opencv().projectPoints(in_camera, np.zeros(3), np.zeros(3), *_matrices(camera))[1][:, 6:15]
+        rest.append(K - J @ np.linalg.lstsq(J, K, rcond=None)[0])
+    A = np.vstack(rest)
+    size = np.linalg.norm(A, axis=0)
+    _, s, Vt = np.linalg.svd(A / size, full_matrices=False)
+    sigmas = np.sqrt(variance) * np.linalg.norm(Vt.T / np.maximum(s, 1e-12), axis=1) / size
+    return dict(zip(INTRINSICS, sigmas.tolist(), strict=True))
+
+
+def _view(one: Corners, fit: _Fit, of_all: float, taken: float) -> View:
+    """The board in an image, by its own variance with the weight of some residuals of all images'."""
+    variance = (fit.squares + PRIOR_RESIDUALS * of_all) / (len(fit.J) - taken + PRIOR_RESIDUALS)
     return View(
         *one,
         *fit.pose,
         rms=float(np.sqrt(fit.squares / len(fit.J))),
         sigma=float(np.sqrt(variance)),
-        covariance=variance * _scaled_inverse(fit.information),
-        by_camera=fit.shift @ C @ fit.shift.T,
+        covariance=np.asarray(variance * np.linalg.inv(fit.J.T @ fit.J), dtype=np.float64),
         ambiguous=fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance,
     )
 
@@ -539,7 +511,7 @@ def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:
         return None
     best, *others = sorted(fits, key=lambda fit: fit.squares)
     apart = (fit for fit in others if not np.allclose(fit.pose[0], best.pose[0], rtol=0.0, atol=1e-4))
-    return replace(best, second=min((fit.squares for fit in apart), default=np.inf))
+    return best._replace(second=min((fit.squares for fit in apart), default=np.inf))
 
 
 def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _Fit:
@@ -547,48 +519,13 @@ def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _
     n = len(points)
     at = Frames(np.broadcast_to(R, (n, 1, 3, 3)), np.broadcast_to(t, (n, 1, 3)))
     rows = RoomPixel(camera).rows(at, np.column_stack([uv, points]), np.empty((n, 0)))
-    K = camera_derivatives(camera, t + points @ R[:, :2].T)
-    return _Fit((R, t), float(np.sum(rows.residual**2)), rows.wrenches.reshape(2 * n, 6), K.reshape(2 * n, 9))
+    return _Fit((R, t), float(np.sum(rows.residual**2)), rows.wrenches.reshape(2 * n, 6))
 
-
-def _scaled_inverse(A: Floats) -> Floats:
-    """The inverse of an information matrix whose unknowns have different units.
-
-    Raises:
-        InputError: It has none.
-    """
-    size = np.sqrt(np.diag(A))
-    try:
-        L = np.linalg.inv(np.linalg.cholesky(A / np.outer(size, size))) / size
-    except np.linalg.LinAlgError:
-        raise InputError(*UNDETERMINED) from None
-    C: Floats = L.T @ L
-    return C
-
-
-MAX_COUNT = 1000
-"""Columns or rows."""
-
-MAX_SQUARE_M = 2.0
-"""Side of a square, [m]: larger ones are in another unit."""
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp", ".jp2")
 
 
 # --- the file of a board ----------------------------------------------------------------------------------------------
-
-
-class _Board(Schema):
-    type: Literal["checkerboard", "charuco"]
-    columns: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
-    rows: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
-    square: Positive
-    marker: Positive | None = None
-    dictionary: str | None = None
-    legacy: StrictBool = False
-    upright: StrictBool = False
-    name: str = ""
-    units: UnitsOfFile = Units()
 
 
 def read_calibration_board(path: Path) -> CalibrationBoard:
@@ -599,15 +536,15 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
             does not say `upright: true`.
     """
     place = path.name
-    file = validate(_Board, read_yaml(path), place)
-    scaled = {key: (getattr(file, key) or 0.0) * file.units.factor("m") for key in ("square", "marker")}
-    board = CalibrationBoard(**file.model_dump(exclude={"units"}) | scaled)
+    file = validate(CalibrationBoard, read_yaml(path), place)
+    scaled = {key: getattr(file, key) * file.units.factor("m") for key in ("square", "marker")}
+    board = file.model_copy(update=scaled)
     if board.square > MAX_SQUARE_M:
         found = f"found {shown(file.square)} {file.units.length}"
         raise InputError(f"{place}: square", found, f"at most {MAX_SQUARE_M:g} m", "is it in mm? units: {length: mm}")
     if file.type == "charuco":
         for key in ("marker", "dictionary"):
-            if getattr(file, key) is None:
+            if not getattr(file, key):
                 raise InputError(place, f"missing key {key!r}")
         if board.marker >= board.square:
             expected = f"a side shorter than a square's, {shown(file.square)}"
@@ -786,44 +723,30 @@ class BoardTables:
 
         { "schema": "fg-calib/board/1", "version", "board": {keys of its file, in m}, "image_size": [width, height],
           "rms_pixel", "sigma_pixel", "images": [{"id", "n_corners", "rms_pixel", "sigma_pixel", "position",
-          "rotation_vector", "covariance", "covariance_by_camera" | null, "ambiguous"}], "camera": {parameters},
+          "rotation_vector", "covariance", "ambiguous"}], "camera": {parameters},
           "camera_sigma": {parameters} | null, "without_board": {file: reason}, "without_pose": [ids],
           "without_readings": [ids], "without_image": [ids], "findings": [text] }
 
         """
         fit = self.fit
         return {
-            **{"schema": "fg-calib/board/1", "version": __version__, "board": asdict(fit.board)},
+            **{"schema": "fg-calib/board/1", "version": __version__, "board": fit.board.model_dump()},
             **{"image_size": list(fit.size), "rms_pixel": fit.rms, "sigma_pixel": fit.sigma},
-            "images": [_image_document(view, fit) for view in fit.views],
+            "images": [_image_document(view) for view in fit.views],
             **{"camera": asdict(fit.camera), "camera_sigma": fit.camera_sigma, "without_board": dict(self.without)},
             **{"without_pose": list(fit.without_pose), "without_readings": list(self.without_row)},
             **{"without_image": list(self.without_image), "findings": list(fit.findings)},
         }
 
 
-def _image_document(view: View, fit: BoardFit) -> dict[str, Any]:
+def _image_document(view: View) -> dict[str, Any]:
     """A board in an image, as in `board.json`."""
     arrays = ("position", "rotation_vector", "covariance")
     return {
         **{"id": view.name, "n_corners": len(view.corners), "rms_pixel": view.rms, "sigma_pixel": view.sigma},
         **{key: getattr(view, key).tolist() for key in arrays},
-        "covariance_by_camera": None if fit.camera_covariance is None else view.by_camera.tolist(),
         "ambiguous": bool(view.ambiguous),
     }
-
-
-def require_no_input_of_board(folder: Path, inputs: Sequence[Path]) -> None:
-    """Check that tables written to a folder would not replace what they are made of, nor a file that no board wrote.
-
-    Raises:
-        InputError: They would.
-    """
-    given = {path.resolve() for path in inputs}
-    for name in BOARD_FILES:
-        if (folder / name).resolve() in given:
-            raise InputError(str(folder / name), "would be replaced by what is made of it", "another folder")
-    require_own(folder, BOARD_FILES)
 
 
 def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
@@ -847,10 +770,8 @@ def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
         if tables.camera_file is not None:
             (into / "camera.yaml").write_bytes(tables.camera_file)
         else:
-            fit, words = (
-                tables.fit,
-                f"# fg-calib board: estimated from {len(tables.fit.views)} images, in px; 1 sigma\n",
-            )
+            fit = tables.fit
+            words = f"# fg-calib board: estimated from {len(fit.views)} images, in px; 1 sigma\n"
             values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
             write_text(into / "camera.yaml", words + yaml.safe_dump(values, sort_keys=False))
         names.extend(sorted(file.name for file in into.iterdir()))

@@ -19,7 +19,7 @@ cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera
 
 CHECKERBOARD = {"type": "checkerboard", "columns": 9, "rows": 6, "square": 20, "units": {"length": "mm"}}
 CHARUCO = CHECKERBOARD | {"type": "charuco", "rows": 7, "marker": 14, "dictionary": "DICT_5X5_100"}
-EVEN = CHECKERBOARD | {"columns": 8, "upright": True}
+BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 TABLES = {"board.csv", "board.json", "camera.yaml", "pixels.csv"}
 N = 4
 
@@ -39,7 +39,11 @@ def drawing(tmp_path_factory):
     folder = tmp_path_factory.mktemp("board")
     (folder / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD))
     (folder / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA)))
-    true = drawn(folder / "images", CalibrationBoard("checkerboard", 9, 6, 0.02), np.random.default_rng(0))
+    true = drawn(
+        folder / "images",
+        BOARD,
+        np.random.default_rng(0),
+    )
     rows = "".join(f"view{k},{10 * k},0.50,,{1 + k}\n" for k in range(N))
     (folder / "poses.csv").write_text(f"id,q1,q2,split,x\n{rows}absent,1,2,test,3\n")
     return folder, true
@@ -137,8 +141,7 @@ def test_the_camera_is_estimated_from_the_same_images(job, fg_calib):
 @pytest.mark.slow
 def test_images_that_do_not_determine_the_camera_end_with_3(job, fg_calib):
     shutil.rmtree(job / "images")
-    board = CalibrationBoard("checkerboard", 9, 6, 0.02)
-    drawn(job / "images", board, np.random.default_rng(1), n=3, tilt=4.0, off=0.02, distance=(0.5, 0.52))
+    drawn(job / "images", BOARD, np.random.default_rng(1), n=3, tilt=4.0, off=0.02, distance=(0.5, 0.52))
     ended = run(fg_calib, job, "--estimate-camera", camera=False)
     assert ended.code == 3
     assert ended.err.splitlines()[-1].startswith("not to be trusted: the images do not determine the camera: f")
@@ -148,8 +151,7 @@ def test_images_that_do_not_determine_the_camera_end_with_3(job, fg_calib):
 def test_a_board_with_two_poses_is_in_the_table_of_corners_alone(job, fg_calib, monkeypatch):
     """One is far away, hardly tilted, and its corners are noisy; where all are, there is no table of poses."""
     R = Rotation.from_euler("x", 10.0, degrees=True).as_matrix()
-    corners = CalibrationBoard("checkerboard", 9, 6, 0.02).corners
-    uv = CAMERA.image(np.array([-0.08, -0.05, 3.0]) + corners @ R[:, :2].T)[0]
+    uv = CAMERA.image(np.array([-0.08, -0.05, 3.0]) + BOARD.corners @ R[:, :2].T)[0]
     uv += np.random.default_rng(10).normal(scale=0.3, size=uv.shape)
     search, pick = images.find_corners, iter([1, 0, 0, 0] + [1] * N)
     monkeypatch.setattr(images, "find_corners", lambda *a: (np.arange(54), uv) if next(pick) else search(*a))

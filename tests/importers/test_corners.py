@@ -10,9 +10,9 @@ from fg_calib.inputs import InputError
 
 pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
-CHECKERBOARD = CalibrationBoard("checkerboard", 9, 6, 0.02)
-CHARUCO = CalibrationBoard("charuco", 9, 7, 0.02, 0.014, "DICT_5X5_100")
-BOARDS = [CHECKERBOARD, CalibrationBoard("checkerboard", 6, 9, 0.02), CHARUCO]
+CHECKERBOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
+CHARUCO = CalibrationBoard(type="charuco", columns=9, rows=7, square=0.02, marker=0.014, dictionary="DICT_5X5_100")
+BOARDS = [CHECKERBOARD, CalibrationBoard(type="checkerboard", columns=6, rows=9, square=0.02), CHARUCO]
 EVERY = pytest.mark.parametrize("board", BOARDS, ids=["9 x 6", "6 x 9", "charuco"])
 
 
@@ -67,5 +67,8 @@ def test_an_image_without_the_board_has_none(board):
 
 def test_a_dictionary_with_too_few_markers_is_refused():
     with pytest.raises(InputError) as error:
-        charuco_board(CalibrationBoard("charuco", 15, 11, 0.02, 0.014, "DICT_4X4_50"), "board.yaml")
+        charuco_board(
+            CalibrationBoard(type="charuco", columns=15, rows=11, square=0.02, marker=0.014, dictionary="DICT_4X4_50"),
+            "board.yaml",
+        )
     assert str(error.value) == "board.yaml: dictionary: DICT_4X4_50 has 50 markers, expected 82 or more"

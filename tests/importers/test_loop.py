@@ -18,7 +18,7 @@ from fg_calib.robot.inverse import solve_inverse
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
-BOARD = CalibrationBoard("checkerboard", 9, 6, 0.02)
+BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 TOOL = ["tool.x", "tool.y", "tool.z", "tool.roll", "tool.pitch", "tool.yaw"]
 TOLERANCE = {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.1, "beta": 0.05, "tool": 0.005}
 

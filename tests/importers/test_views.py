@@ -1,6 +1,6 @@
 """Poses of a board and cameras are known as well as is said, in the axes of `BoardPose`."""
 
-from dataclasses import astuple, replace
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -8,15 +8,14 @@ from boards import CAMERA, SIZE, views
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
 
-from fg_calib.importers.board import INTRINSICS, CalibrationBoard, Corners, camera_derivatives, fit_board
-from fg_calib.initialization import Camera
+from fg_calib.importers.board import INTRINSICS, CalibrationBoard, Corners, fit_board
 from fg_calib.inputs import InputError
 from fg_calib.measurements.kind import Frames
 from fg_calib.measurements.kinds.board import BoardPose
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
-BOARD = CalibrationBoard("checkerboard", 9, 6, 0.02)
+BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 SIGMA = 0.05
 """Of a corner, [px]."""
 
@@ -41,17 +40,6 @@ def nees(fit, truth):
     """Squared errors of the poses over their covariances, shape (n,)."""
     errors = [residual_of(view, *truth[view.name]) for view in fit.views]
     return np.array([e @ np.linalg.solve(v.covariance, e) for e, v in zip(errors, fit.views, strict=True)])
-
-
-def test_derivatives_by_the_camera_are_those_of_differences():
-    """Of a camera with all of its distortion; 1e-6 is what differences of 1e-6 leave."""
-    points = np.random.default_rng(0).normal([0, 0, 1.5], 0.2, (20, 3))
-    values = np.array(astuple(CAMERA))
-    K = camera_derivatives(CAMERA, points)
-    for i in range(9):
-        step = 1e-6 * np.eye(9)[i] * max(1.0, abs(values[i]))
-        ahead, behind = (Camera(*(values + s)).image(points)[0] for s in (step, -step))
-        assert K[:, :, i] == pytest.approx((ahead - behind) / (2.0 * step[i]), rel=1e-6, abs=1e-6)
 
 
 def test_a_pose_is_the_optimum_of_its_corners_and_the_covariance_that_of_opencvs_projection():
@@ -86,30 +74,21 @@ def test_errors_of_poses_are_what_their_covariances_say():
 
 def test_the_sigma_of_corners_allows_for_what_the_poses_take_up():
     """Of 24 residuals an image a pose takes up 6: without them sigma would be 13 % too small."""
-    board = CalibrationBoard("checkerboard", 4, 3, 0.04)
+    board = CalibrationBoard(type="checkerboard", columns=4, rows=3, square=0.04)
     found, _ = drawn(40, np.random.default_rng(12), board=board)
     fit = fit_board(board, found, SIZE, CAMERA)
     assert abs(fit.sigma / SIGMA - 1.0) < 3.0 / np.sqrt(2.0 * 40 * 18)
     assert fit.rms == pytest.approx(fit.sigma * np.sqrt(18 / 24))
 
 
-def test_what_the_camera_adds_is_how_poses_move_with_it():
-    """Against poses fitted with a camera that is off by a part of each of its sigmas."""
-    found, _ = drawn(4, np.random.default_rng(7))
-    fit = fit_board(BOARD, found, SIZE)
-    G = np.empty((len(found), 6, 9))
-    for i, name in enumerate(INTRINSICS):
-        off = 0.1 * fit.camera_sigma[name]
-        moved = [
-            fit_board(BOARD, found, SIZE, replace(fit.camera, **{name: getattr(fit.camera, name) + s}))
-            for s in (off, -off)
-        ]
-        for k, (a, b) in enumerate(zip(moved[0].views, moved[1].views, strict=True)):
-            G[k, :, i] = -residual_of(b, a.rotation, a.position) / (-2.0 * off)
-    for k, view in enumerate(fit.views):
-        expected = G[k] @ fit.camera_covariance @ G[k].T
-        size = np.sqrt(np.diag(expected))
-        assert view.by_camera / np.outer(size, size) == pytest.approx(expected / np.outer(size, size), abs=0.02)
+@pytest.mark.slow
+def test_errors_of_the_camera_are_what_its_sigmas_say():
+    """20 cameras of 10 images each: mean squared error over the variance, within 4 of its own sigma."""
+    squares = []
+    for seed in range(20):
+        fit = fit_board(BOARD, drawn(10, np.random.default_rng(seed))[0], SIZE)
+        squares.append([((getattr(fit.camera, k) - getattr(CAMERA, k)) / fit.camera_sigma[k]) ** 2 for k in INTRINSICS])
+    assert np.mean(squares, axis=0) == pytest.approx(np.ones(9), abs=4.0 * np.sqrt(2.0 / 20))
 
 
 def test_two_images_are_too_few_for_a_camera():
