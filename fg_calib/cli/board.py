@@ -19,7 +19,7 @@ _READINGS = "Joint readings; id is an image's name without its ending."
 
 
 def board(
-    images: Annotated[list[Path], argument("IMAGES...", "Images, a folder of them, or a pattern in quotes.")],
+    images: Annotated[list[Path], argument("IMAGES...", "Images, or a folder of them.")],
     board: Annotated[Path, option("--board", "BOARD", "The board, such as charuco.yaml.")],
     out: Annotated[Path, option("--out", "DIR", "Write board.csv, pixels.csv and camera.yaml there.")],
     camera: Annotated[Path | None, option("--camera", "CAMERA", "The camera, such as camera.yaml.")] = None,

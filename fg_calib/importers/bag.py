@@ -30,13 +30,15 @@ by more than that at both ends.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, FrozenArrays, InputError, check_number, checked
@@ -74,11 +76,6 @@ class JointStream(FrozenArrays):
     time: Floats
     readings: Floats
     source: Source
-
-    def tool_path(self, robot: Robot) -> PoseStream:
-        """The tool's poses at the readings, of the nominal robot in its base frame."""
-        poses = forward(build_chain(robot, {}), robot.trig(self.readings))
-        return PoseStream(self.time, poses.position, poses.rotation, self.source)
 
 
 @dataclass(frozen=True)
@@ -129,38 +126,40 @@ class ClockOffset:
     correlation: float
 
 
-def estimate_offset(tool: PoseStream, poses: PoseStream) -> ClockOffset:
+def estimate_offset(joints: JointStream, poses: PoseStream, robot: Robot) -> ClockOffset:
     """The offset of the poses' clock at which speeds correlate most, near that by times of receipt.
 
     Args:
-        tool: The nominal arm's tool at the joint readings.
+        joints: Joint readings.
         poses: The measured poses, in any frame.
+        robot: The nominal robot.
 
     Raises:
         InputError: The poses do not follow the joints.
     """
-    first = tool.source.lag - poses.source.lag - MAX_LAG_S
-    begin = max(tool.time[0], poses.time[0] - first)
-    end = min(tool.time[-1], poses.time[-1] - first - 2.0 * MAX_LAG_S)
+    first = joints.source.lag - poses.source.lag - MAX_LAG_S
+    begin = max(joints.time[0], poses.time[0] - first)
+    end = min(joints.time[-1], poses.time[-1] - first - 2.0 * MAX_LAG_S)
     n, n_lags = max(2, int((end - begin) / LAG_STEP_S)), round(2.0 * MAX_LAG_S / LAG_STEP_S)
-    by_joints = _speed(tool, begin + LAG_STEP_S * np.arange(n))
-    by_poses = _speed(poses, begin + first + LAG_STEP_S * np.arange(n + n_lags))
+    path = forward(build_chain(robot, {}), robot.trig(joints.readings)).position
+    by_joints = _speed(joints.time, path, begin + LAG_STEP_S * np.arange(n))
+    by_poses = _speed(poses.time, poses.position, begin + first + LAG_STEP_S * np.arange(n + n_lags))
     lagged = sliding_window_view(by_poses, n)
     with np.errstate(invalid="ignore"):  # of what does not move
         correlation = np.nan_to_num([np.corrcoef(by_joints, one)[0, 1] for one in lagged])
     best = int(np.argmax(correlation))
     if correlation[best] < MIN_CORRELATION:
-        place = f"topics {tool.source.topic} and {poses.source.topic}"
+        place = f"topics {joints.source.topic} and {poses.source.topic}"
         found = f"the poses do not move as the joints do (correlation {correlation[best]:.2f})"
         hint = "or specify the offset of the clocks: --offset 0"
         raise InputError(place, found, "poses of this robot's tool", hint)
     return ClockOffset(float(first + best * LAG_STEP_S), float(correlation[best]))
 
 
-def _speed(stream: PoseStream, time: Floats) -> Floats:
-    """Speed of the position, shape (n,), [m/s]."""
-    ends = [time - SPEED_WIDTH_S / 2.0, time + SPEED_WIDTH_S / 2.0]
-    before, after = (np.array([np.interp(at, stream.time, axis) for axis in stream.position.T]) for at in ends)
+def _speed(time: Floats, position: Floats, at: Floats) -> Floats:
+    """Speed along a path at some times, shape (n,), [m/s]."""
+    ends = [at - SPEED_WIDTH_S / 2.0, at + SPEED_WIDTH_S / 2.0]
+    before, after = (np.array([np.interp(end, time, axis) for axis in position.T]) for end in ends)
     speed: Floats = np.linalg.norm(after - before, axis=0) / SPEED_WIDTH_S
     return speed
 
@@ -282,7 +281,7 @@ def average_stops(
         hint = f"the longest pause is {max(b - a for a, b in pauses):.2g} s" if pauses else ""
         expected = "the arm at rest for a while, several times"
         raise InputError(f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
-    estimate = None if offset is not None else estimate_offset(joints.tool_path(robot), poses)
+    estimate = None if offset is not None else estimate_offset(joints, poses, robot)
     if estimate is not None and most_offset is not None and abs(estimate.seconds) > most_offset:
         found = f"an offset of {estimate.seconds:.4g} s against the joints' clock"
         raise InputError(f"topic {poses.source.topic}", found, f"at most {most_offset:g} s")
@@ -316,24 +315,16 @@ def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tu
     In windows of that length the standard deviation of every joint is within a few times its scatter: that of the
     calmest windows, or what encoders may hide.
     """
-    time, readings = joints.time, joints.readings
-    width, rate = 0.5 * still, period(time)
-    first, end = np.arange(len(time)), np.searchsorted(time, time + width + 0.5 * rate)
-    n = end - first
-    whole = (time + width <= time[-1] + 0.5 * rate) & (n >= max(3.0, 0.5 * width / rate))
-    if not whole.any():
+    time, width = joints.time, 2 * max(1, round(0.25 * still / period(joints.time))) + 1
+    if len(time) < width:
         return []
-    first, end, n = first[whole], end[whole], n[whole, None]
-    centred = readings - readings.mean(axis=0)
-    sums, squares = (np.vstack([np.zeros(robot.n_joints), np.cumsum(x, axis=0)]) for x in (centred, centred**2))
-    mean = (sums[end] - sums[first]) / n
-    scatter = np.sqrt(np.maximum((squares[end] - squares[first]) / n - mean**2, 0.0))  # (n_windows, n_joints)
+    centred = joints.readings - joints.readings.mean(axis=0)
+    mean, square = (uniform_filter1d(x, width, axis=0) for x in (centred, centred**2))
+    scatter = np.sqrt(np.maximum(square - mean**2, 0.0))
     least = [MIN_SCATTER[joint.unit] for joint in robot.joints]
     calm = np.all(scatter <= STILL_SCATTERS * np.maximum(np.quantile(scatter, 0.02, axis=0), least), axis=1)
-    begins, ends = time[first[calm]], time[end[calm] - 1]
-    gaps = np.flatnonzero(begins[1:] > np.maximum.accumulate(ends)[:-1])
-    parts = zip(np.split(begins, gaps + 1), np.split(ends, gaps + 1), strict=True)
-    return [(float(a[0]), float(b[-1])) for a, b in parts if len(a)]
+    pauses = find_objects(label(binary_dilation(calm, np.ones(width - 2, dtype=np.bool_)))[0])
+    return [(float(time[pause][0]), float(time[pause][-1])) for (pause,) in pauses]
 
 
 def _inner(stop: tuple[float, float]) -> tuple[float, float]:
@@ -477,26 +468,17 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
 
 JOINT_TYPE = "sensor_msgs/msg/JointState"
 
-_Pose = tuple[Any, str, Any, Any]
-"""Header, child frame, position and quaternion of one pose in a message."""
-
-POSE_TYPES: dict[str, Callable[[Any], list[_Pose]]] = {
-    "geometry_msgs/msg/PoseStamped": lambda m: [(m.header, "", m.pose.position, m.pose.orientation)],
-    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: [
-        (m.header, "", m.pose.pose.position, m.pose.pose.orientation)
-    ],
-    "geometry_msgs/msg/TransformStamped": lambda m: [_transform(m)],
-    "nav_msgs/msg/Odometry": lambda m: [(m.header, m.child_frame_id, m.pose.pose.position, m.pose.pose.orientation)],
-    "tf2_msgs/msg/TFMessage": lambda m: [_transform(one) for one in m.transforms],
+POSE_TYPES = {
+    "geometry_msgs/msg/PoseStamped": "pose",
+    "geometry_msgs/msg/PoseWithCovarianceStamped": "pose.pose",
+    "geometry_msgs/msg/TransformStamped": "transform",
+    "nav_msgs/msg/Odometry": "pose.pose",
+    "tf2_msgs/msg/TFMessage": "transform",
 }
-"""Types of messages with poses, and how these are taken out of one."""
+"""Types of messages with poses, and where these are in one, or in each of its `transforms`."""
 
 MAX_BACK_S = 1.0
 """Stamps that go back by less, [s], are put in order."""
-
-
-def _transform(m: Any) -> _Pose:
-    return m.header, m.child_frame_id, m.transform.translation, m.transform.rotation
 
 
 Sample = tuple[int, int, Sequence[float]]
@@ -610,9 +592,12 @@ def _read_poses(
     """The poses of one frame in another; without rotations where all are the same."""
     place, samples = f"{bag}: topic {topic[0]}", dict[tuple[str, str], list[Sample]]()
     for received, message in _messages(reader, topic):
-        for header, child, p, q in POSE_TYPES[topic[1]](message):
-            pair = header.frame_id.removeprefix("/"), child.removeprefix("/")  # ROS 1 had a slash before names
-            sample = (_stamp(header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+        for m in getattr(message, "transforms", [message]):
+            at = attrgetter(POSE_TYPES[topic[1]])(m)
+            p, q = (at.translation, at.rotation) if hasattr(at, "translation") else (at.position, at.orientation)
+            frame, child = m.header.frame_id, getattr(m, "child_frame_id", "")
+            pair = frame.removeprefix("/"), child.removeprefix("/")  # ROS 1 had a slash before names
+            sample = (_stamp(m.header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
             samples.setdefault(pair, []).append(sample)
     wanted = [None if frame is None else frame.removeprefix("/") for frame in frames]
     fitting = [pair for pair in samples if all(f in (None, g) for f, g in zip(wanted, pair, strict=True))]

@@ -577,7 +577,7 @@ class FoundCorners(NamedTuple):
 
 
 def image_files(given: Sequence[Path]) -> list[Path]:
-    """Files of images: those given, those in a folder, and those of a pattern such as `images/*.png`, in order.
+    """Files of images: those given, and those in a folder, in order.
 
     Raises:
         InputError: There are none, or two of one name: an image is known by its name without the ending.
@@ -587,8 +587,6 @@ def image_files(given: Sequence[Path]) -> list[Path]:
         found = [path]
         if path.is_dir():
             found = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith("."))
-        elif not path.exists() and any(c in path.name for c in "*?["):
-            found = sorted(f for f in path.parent.glob(path.name) if f.is_file())
         if not found:
             raise InputError(str(path), "no images", f"files that end in {', '.join(_ENDINGS)}")
         files += found
@@ -611,7 +609,7 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
     for k, file in enumerate(files):
         tell("looking for corners", k, len(files))
         image = decode(read_bytes(file), file.name)
-        width, height = image.shape[::-1]
+        height, width = image.shape
         size = size or (width, height)
         if size != (width, height):
             expected = f"{size[0]} x {size[1]} px as {files[0].name}"
@@ -770,8 +768,7 @@ def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
         if tables.camera_file is not None:
             (into / "camera.yaml").write_bytes(tables.camera_file)
         else:
-            fit = tables.fit
-            words = f"# fg-calib board: estimated from {len(fit.views)} images, in px; 1 sigma\n"
+            fit, words = tables.fit, "# fg-calib board: estimated from the images, in px; 1 sigma\n"
             values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
             write_text(into / "camera.yaml", words + yaml.safe_dump(values, sort_keys=False))
         names.extend(sorted(file.name for file in into.iterdir()))

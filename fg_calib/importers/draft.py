@@ -47,12 +47,6 @@ _MODELS: dict[str, Model] = {
 }
 """Models by a column that no other has, in order of precedence."""
 
-_OTHER_MODELS = {
-    "pose": "or distance-rotation, which needs no frame; board if a camera on the tool measured where a board is",
-    "position": "or distance, which needs no frame",
-    "orientation": "or rotation, which needs no frame",
-}
-
 _UNITS = {"length": (LENGTHS, "m", "mm", 30.0), "angle": (ANGLES, "rad", "deg", 13.0)}
 """Units of each kind, the one that is guessed, and the one that is guessed where a value is larger than that."""
 
@@ -65,7 +59,8 @@ _TEMPLATE = """\
 robot: {robot}
 {notes}measurements:
 {entries}
-units: {units}  # {why}
+# Models of pairs need no frame: distance for position, rotation for orientation, distance-rotation for pose.
+units: {units}  # DECIDE where headers do not say: they are guessed from the values' sizes
 # DECIDE the noise, 1 sigma in the units above: the values are guesses, so it is estimated from residuals;
 # put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings.
 noise: {noise}
@@ -94,12 +89,11 @@ class _Recognised:
     Attributes:
         path: Its file.
         model: Model of its measurements; None of joint readings alone, and of pairs.
-        present: Known columns that it has, except those of joints.
+        present: Known columns that it has, except those of joints; and those of its pairs.
         columns: Header of each column that the table calls otherwise, by the known name.
         units: Its units of `length` and `angle`, if it has such columns.
-        guessed: Which of the units are guesses from the sizes of the values.
         unused: Columns without a meaning.
-        pairs: The table of pairs that are of its configurations, if there is one.
+        pairs: The file of the pairs that are of its configurations, if there is one.
     """
 
     path: Path
@@ -107,27 +101,20 @@ class _Recognised:
     present: tuple[str, ...]
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
-    guessed: tuple[str, ...] = ()
     unused: tuple[str, ...] = ()
-    pairs: _Recognised | None = None
-
-    @property
-    def tables(self) -> tuple[_Recognised, ...]:
-        """The table, and that of its pairs."""
-        return (self,) if self.pairs is None else (self, self.pairs)
+    pairs: Path | None = None
 
     @property
     def noise(self) -> list[str]:
         """Kinds of noise that its model needs and no column specifies."""
         kinds = INSTRUMENTS[str(self.model)].noise
         if self.model in PAIR_MODELS:  # nothing is formed from contact points but what was measured between them
-            kinds = tuple(kind for kind in kinds if self.pairs is not None and kind in self.pairs.present)
+            kinds = tuple(kind for kind in kinds if self.pairs is not None and kind in self.present)
             kinds = (*(("point",) if "group" in self.present else ()), *kinds)
         columns = {"position": "x", "orientation": "rx", "pixel": "u"}
-        present = {name for table in self.tables for name in table.present}
-        if COVARIANCE[0] in present:
+        if COVARIANCE[0] in self.present:
             return []
-        return [k for k in kinds if not {f"sigma_{k}", f"sigma_{columns.get(k, k)}"} & present]
+        return [k for k in kinds if not {f"sigma_{k}", f"sigma_{columns.get(k, k)}"}.intersection(self.present)]
 
 
 # --- a table ----------------------------------------------------------------------------------------------------------
@@ -159,7 +146,7 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
             every.setdefault(name, k)
     kinds = {name: of.unit for of in sets for name in of.names}
     kinds |= {n: "length" if joint.prismatic else "angle" for n, joint in zip(joints, robot.joints, strict=False)}
-    units, guessed = dict[str, str](), list[str]()
+    units = dict[str, str]()
     for kind, (possible, *_) in _UNITS.items():
         of_kind = {name: k for name, k in every.items() if kinds.get(name) == kind}
         there = {_SPELLINGS.get(written[k], written[k]) for k in of_kind.values() if written[k]}
@@ -167,7 +154,6 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
             raise InputError(table.name, f"{kind}s in {', '.join(sorted(there))}", f"one of {', '.join(possible)}")
         if of_kind:
             units[kind] = there.pop() if there else _guess_unit(table, kind, of_kind)
-            guessed += [kind] if not any(written[k] for k in of_kind.values()) else []
     present = tuple(name for name in every if name not in joints)
     return _Recognised(
         path=path,
@@ -175,7 +161,6 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
         present=present,
         columns={name: table.columns[k] for name, k in every.items() if name != table.columns[k]},
         units=units,
-        guessed=tuple(guessed),
         unused=tuple(c for k, c in enumerate(table.columns) if k not in every.values()),
     )
 
@@ -237,10 +222,9 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
             raise InputError(table.path.name, "joint readings alone", "what was measured at them, or pairs", hint)
         if "camera" in INSTRUMENTS[table.model].options and not found["camera"]:
             raise InputError(table.path.name, "images of a camera that is not among the files", "camera.yaml too")
-    every, units = [one for table in tables for one in table.tables], {"length": "m", "angle": "rad"}
-    for one in reversed(every):  # those of the first table
+    units = {"length": "m", "angle": "rad"}
+    for one in reversed(tables):  # those of the first table
         units |= one.units
-    guessed = sorted({kind for one in every for kind in one.guessed})
     factors = {"": 1.0, "length": LENGTHS[units["length"]], "angle": ANGLES[units["angle"]]}
     sigmas = {kind: _GUESSES.get(kind, ("length", 1e-4)) for table in tables for kind in table.noise}
     noise = {kind: float(f"{sigma / factors[of]:.2g}") for kind, (of, sigma) in sigmas.items()}
@@ -251,7 +235,6 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
         notes=_NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool)),
         entries="\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent)),
         units=_flow(units),
-        why=f"DECIDE: {' and '.join(guessed)} guessed from the values' sizes" if guessed else "as the headers say",
         noise=_flow({**noise, "joint": 0.0, "estimate": True}),
     )
 
@@ -298,15 +281,15 @@ def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
     first, *others = sorted(tables, key=lambda t: 0 if t.model is None else 1 if "group" in t.present else 2)
     measured = ("distance" in pairs[0].present, "angle" in pairs[0].present)
     model = {of: model for model, of in PAIR_MODELS.items()}.get(measured, "distance")
-    return [replace(first, model=model, pairs=pairs[0]), *others]
+    present, units = (*first.present, *pairs[0].present), {**pairs[0].units, **first.units}
+    return [replace(first, model=model, pairs=pairs[0].path, present=present, units=units), *others]
 
 
 def _entry(table: _Recognised, cameras: Sequence[Path], units: Mapping[str, str], folder: Path) -> list[str]:
     """Lines of a table in the job's list of measurements."""
-    other = _OTHER_MODELS.get(str(table.model))
-    lines = [f"table: {_path(table.path, folder)}", f"model: {table.model}" + (f"  # {other}" if other else "")]
+    lines = [f"table: {_path(table.path, folder)}", f"model: {table.model}"]
     if table.pairs is not None:
-        lines.append(f"pairs: {_path(table.pairs.path, folder)}")
+        lines.append(f"pairs: {_path(table.pairs, folder)}")
     if table.model in POSE_MODELS:
         lines.append("frame: unknown  # DECIDE: known only if the measurement frame is the robot's base frame")
     if "camera" in INSTRUMENTS[str(table.model)].options:

@@ -73,7 +73,6 @@ def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     assert given["units"] == {"length": "mm", "angle": "deg"}
     assert given["measurements"][0]["columns"] == names
     assert "DECIDE whether these are what the names mean" in (folder / JOB).read_text()
-    assert "guessed" not in (folder / JOB).read_text()
     write(name="plain.csv")
     (folder / "plain.yaml").write_text("{robot: robot.yaml, measurements: plain.csv, model: position}")
     mine, plain = (read_job(folder / f).tables[0].measurements for f in (JOB, "plain.yaml"))
@@ -85,7 +84,7 @@ def test_units_that_no_header_specifies_are_guessed_from_the_values(fg_calib, fo
     folder, write = folder
     given = drafted(fg_calib, folder, folder / "robot.yaml", write(factors=DEGREES))
     assert given["units"] == {"length": "mm", "angle": "deg"}
-    assert "# DECIDE: angle and length guessed from the values' sizes" in (folder / JOB).read_text()
+    assert "# DECIDE where headers do not say: they are guessed from the values' sizes" in (folder / JOB).read_text()
     assert given["noise"]["position"] == 0.1
 
 
