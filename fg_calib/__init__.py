@@ -18,51 +18,8 @@ import lazy_loader  # type: ignore[import-untyped]
 
 __version__ = "0.1.0"
 
-_import, __dir__, _ = lazy_loader.attach_stub(__name__, __file__)
-
-__all__ = [
-    "Assessment",
-    "Calibration",
-    "CalibrationError",
-    "CustomMeasurements",
-    "Design",
-    "DistanceFactor",
-    "InputError",
-    "Job",
-    "KnownPoint",
-    "Limits",
-    "Measurements",
-    "Noise",
-    "Options",
-    "Pairing",
-    "Problem",
-    "ProblemError",
-    "Result",
-    "Robot",
-    "RotationAngleFactor",
-    "Scenario",
-    "Solution",
-    "SolverError",
-    "SolverOptions",
-    "Table",
-    "assess",
-    "build_problem",
-    "calibrate",
-    "calibrate_job",
-    "calibrate_jobs",
-    "compare",
-    "correct",
-    "design",
-    "export",
-    "observe_configurations",
-    "observe_structure",
-    "predict",
-    "read_job",
-    "read_robot",
-    "simulate",
-    "solve",
-]
-"""The names of most users: 40. Others are public in the folders: `fg_calib.io`, `fg_calib.statistics`, ..."""
+_import, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+"""The names of most users, as the stub lists them: 40. Others are public in the folders: `fg_calib.io`, ..."""
 
 _READERS = {"Robot": ("from_urdf", "urdf", "read_urdf"), "Measurements": ("from_frame", "tables", "read_measurements")}
 """Constructors that read files, which the folders of these classes do not import: they are attached here."""

@@ -30,8 +30,6 @@ from fg_calib.inputs import (
     Options,
     SolverError,
     as_floats,
-    check,
-    check_flag,
     check_names,
     check_number,
     checked,
@@ -270,7 +268,6 @@ class Calibration:
         Raises:
             InputError: The folder cannot be written, or the calibration was itself loaded from one.
         """
-        check("residuals", residuals, ResidualFile)
         solution, assessed = self._assessed
         tables = {"configurations.csv": self.configurations}
         if residuals != "none":
@@ -533,6 +530,7 @@ class Calibration:
         """Whether the solver has converged and nothing speaks against the result."""
         return self.result.trustworthy
 
+    @checked
     @single_threaded
     def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
         """Where the tool truly is at joint readings, and how well that is known.
@@ -545,7 +543,6 @@ class Calibration:
         Raises:
             InputError: The readings are of other joints, or there is no measurement frame.
         """
-        check_flag("world", world)
         shape_of("readings", readings, f"(n, {self.robot.n_joints})")
         q = as_floats("readings", np.atleast_2d(readings), f"(n, {self.robot.n_joints})")
         return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table) if world else None))

@@ -34,7 +34,7 @@ class Job(Brief):
     document: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check_fields(self, "job")
+        check_fields(self, "job: ")
 
     @property
     def tables(self) -> tuple[Table, ...]:

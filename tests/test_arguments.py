@@ -1,12 +1,13 @@
 """What public functions are given is compared with their type hints."""
 
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fg_calib import InputError, Options, Robot
-from fg_calib.inputs import as_hinted, checked
+from fg_calib.inputs import Strategy, check_type, checked
 from fg_calib.robot import solve_inverse
 
 
@@ -30,10 +31,9 @@ def test_an_argument_that_does_not_fit_is_one_line(arguments, message):
         named(*arguments)
 
 
-def test_arguments_that_fit_pass_and_paths_become_paths():
+def test_arguments_that_fit_pass_as_they_are():
     options = Options()
     assert named("a", options) == ("a", options, ())
-    assert named(PurePosixPath("a/b"))[0] == Path("a/b")
 
 
 def test_a_wrong_call_fails_in_pythons_own_words():
@@ -41,8 +41,14 @@ def test_a_wrong_call_fails_in_pythons_own_words():
         named()
 
 
-def test_numbers_and_words_are_checked_where_they_are_used():
-    assert as_hinted("x", "text", float) == "text"
+def test_choices_and_switches_are_checked_and_numbers_where_they_are_used():
+    check_type("x", "text", float)
+    check_type("x", "star", Strategy | None)
+    check_type("x", np.True_, bool)
+    with pytest.raises(InputError, match=r"x: found 'stars', expected one of star, .*; did you mean star\?"):
+        check_type("x", "stars", Strategy | None)
+    with pytest.raises(InputError, match="x: found 'yes', expected True or False"):
+        check_type("x", "yes", bool)
 
 
 def test_a_generator_that_is_none_is_one_line():

@@ -236,7 +236,7 @@ def test_a_calibration_goes_to_other_processes(found):
         (
             {"measurements": Q},
             InputError,
-            r"measurements: found ndarray of shape \(4, 4\), expected a Measurements, a",
+            r"measurements: found ndarray of shape \(4, 4\), expected a Measurements or a Table",
         ),
         (
             {"measurements": Measurements.from_arrays(Q[:, :3], position=np.zeros((4, 3)))},

@@ -100,7 +100,7 @@ MISTAKES = {
         lambda f=f: f(prefer=["A2"]), "prefer: unknown parameter 'A2', expected one of base.x, base.y, base.z, "
         "base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, d2, ...; did you mean a2?"
     ) for f in (problem, structure, practical)},
-    "one name for a list": (lambda: problem(prefer="a2"), "prefer: found 'a2', expected a list of names"),
+    "one name for a list": (lambda: structure(prefer="a2"), "prefer: found 'a2', expected a list of names"),
     "readings of another robot": (lambda: pose(ROBOT, np.zeros((2, 3))), "readings: shape (2, 3), expected (n, 2) for "
                                   "the robot's joints"),
     "configurations below 0": (lambda: structure(n_configurations=-1), "n_configurations: found -1, expected a whole "

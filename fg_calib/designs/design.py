@@ -30,8 +30,6 @@ from fg_calib.inputs import (
     Pairing,
     ProblemError,
     as_floats,
-    check,
-    check_flag,
     check_number,
     checked,
 )
@@ -159,8 +157,7 @@ def design(
         InputError: A value makes no sense, or nothing can be measured from anywhere.
         ProblemError: What would be measured determines nothing.
     """
-    check("criterion", criterion, Criterion)
-    _check_values(n, target, n_candidates, lever, seed, fitted)
+    _check_values(n, target, n_candidates, lever, seed)
     given, task = (_check_readings(name, q, of.robot) for name, q in (("given", given), ("task", task)))
     draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
     if not any(p.estimated for p in of.robot.parameters):
@@ -202,9 +199,7 @@ def _build_pool(
     return build_pool(scenario, draw_groups(scenario, n, generator), given=given)
 
 
-def _check_values(
-    n: int | None, target: float | None, n_candidates: int, lever: float, seed: int, fitted: bool | None
-) -> None:
+def _check_values(n: int | None, target: float | None, n_candidates: int, lever: float, seed: int) -> None:
     """Check the values that a design is asked for with.
 
     Raises:
@@ -219,8 +214,6 @@ def _check_values(
     check_number("n_candidates", n_candidates, least=2, whole=True, most=MOST_DRAWN)
     check_number("lever", lever)
     check_number("seed", seed, whole=True)
-    if fitted is not None:
-        check_flag("fitted", fitted)
 
 
 def _check_readings(name: str, given: object, robot: Robot) -> Floats | None:

@@ -35,7 +35,7 @@ from fg_calib.exports.urdf import (
     tesseract_text,
     ur_kinematics,
 )
-from fg_calib.inputs import Floats, InputError, as_floats, check, check_flag, checked, printable, shown
+from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
 from fg_calib.io import Units, encoding_of, replacing, require_absent, robot_text
 from fg_calib.robot import CONVENTIONS, Robot, frame_values
 
@@ -160,11 +160,7 @@ def export(
         InputError: The format cannot hold the arm, the nominal robot is not known or another one, or an option means
             nothing for the format.
     """
-    check("to", to, ExportFormat)
     found = _arm_of(arm, nominal)
-    check("tool", tool, ToolOfZeros)
-    check_flag("far", far)
-    check_flag("calibration_elements", calibration_elements)
     given: dict[str, Any] = {"configurations": configurations is not None, "tool": tool != "calibrated", "far": far}
     given |= {"calibration_elements": calibration_elements, "ur_base": ur_base, "ur_hash": ur_hash}
     for name, value in given.items():
@@ -265,7 +261,7 @@ def _urdf(arm: _Arm, calibration_elements: bool) -> Export:
 def _ur(arm: _Arm, base: UrBase | None, word: str | None) -> Export:
     urdf = arm.robot.urdf
     drawn_base: UrBase = "base_link" if urdf is not None and urdf.base_link.endswith("base_link") else "base"
-    base = drawn_base if base is None else check("ur_base", base, UrBase)
+    base = base or drawn_base
     if word is not None and (not isinstance(word, str) or not word.isprintable() or " " in word or not word):
         raise InputError("ur_hash", f"found {shown(word)}", "a word such as calib_12788084448423163542")
     kinematics, tool = ur_kinematics(arm.robot, base)

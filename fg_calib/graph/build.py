@@ -30,7 +30,6 @@ from fg_calib.inputs import (
     PairErrors,
     Pairing,
     ProblemError,
-    as_pairing,
     check_names,
     checked,
 )
@@ -217,7 +216,7 @@ def predicted_problem(
         pairing: How pairs are formed; a star if None.
         pair_errors: Whether pairs of one configuration share its errors or count as independent.
     """
-    options = Options(model, as_pairing(pairing), frame, gauge="none", pair_errors=pair_errors)
+    options = Options(model, pairing or Pairing(), frame, gauge="none", pair_errors=pair_errors)
     options = replace(options, model=INSTRUMENTS[options.model].random_model(Table(measurements)))
     table = Table(
         predict_measurements(robot, measurements, options.model), options.model, options.pairing, options.frame

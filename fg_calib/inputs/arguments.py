@@ -1,22 +1,20 @@
 """Checks of arguments: by type hints, of choices, numbers and names.
 
-`checked` compares only the package's classes, generators, executors, sequences of them, text and paths. Numbers, arrays
-and choices are checked where they are used.
+`checked` compares the package's classes, generators, executors, sequences of them, choices, switches, text and paths.
+Numbers and arrays are checked where they are used.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
 from functools import cache, wraps
-from inspect import Parameter, signature
+from inspect import signature
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from fg_calib.inputs.errors import InputError, shown
 
@@ -43,7 +41,16 @@ EXAMPLES = {
 """Where an object of a class comes from, for messages."""
 
 _COMPARED = ("fg_calib.", "concurrent.", "numpy.random.", "pathlib")
-"""Modules whose classes are compared; text and None are too."""
+"""Modules whose classes are compared; choices, switches, text and None are too."""
+
+_WORDS = {
+    str: "text",
+    bool: "True or False",
+    Path: "a path",
+    Mapping: "a mapping",
+    dict: "a mapping",
+    Callable: "a function",
+}
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -51,15 +58,14 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def with_checked(*args: P.args, **kwargs: P.kwargs) -> R:
-        takes, hints = _signature(function), _hints(function)
+        hints = _hints(function)
         try:
-            given = takes.bind(*args, **kwargs)
+            given = _signature(function).bind(*args, **kwargs).arguments
         except TypeError:  # in Python's own words
             return function(*args, **kwargs)
-        for name in given.arguments.keys() & hints.keys():
-            if takes.parameters[name].kind not in (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD):
-                given.arguments[name] = as_hinted(name, given.arguments[name], hints[name])
-        return function(*given.args, **given.kwargs)
+        for name in given.keys() & hints.keys():
+            check_type(name, given[name], hints[name])
+        return function(*args, **kwargs)
 
     return with_checked
 
@@ -69,33 +75,29 @@ def check_fields(of: object, place: str = "") -> None:
 
     Args:
         of: The object.
-        place: What stands before a field's name in messages.
+        place: The words before a field's name in messages.
 
     Raises:
         InputError: A field does not fit.
     """
-    hints = _hints(type(of))  # type: ignore[arg-type] # classes are hashable
-    for f in fields(of):  # type: ignore[arg-type] # a dataclass
-        as_hinted(f"{place}: {f.name}" if place else f.name, getattr(of, f.name), hints[f.name])
+    for name, hint in _hints(type(of)).items():  # type: ignore[arg-type] # classes are hashable
+        check_type(f"{place}{name}", getattr(of, name), hint)
 
 
-def as_hinted(place: str, value: Any, hint: Any) -> Any:
-    """A value that fits a type hint; a path of another class as a `Path`.
+def check_type(place: str, value: Any, hint: Any) -> None:
+    """Check that a value fits a type hint.
 
     Raises:
         InputError: The value does not fit.
     """
     kinds = _alternatives(hint)
     if _fits(value, hint) and not (Path in kinds and isinstance(value, str) and not value):
-        return value
-    if Path in kinds and isinstance(value, os.PathLike):
-        return Path(os.fspath(value))
+        return
     words = [_describe(kind) for kind in kinds if kind is not NoneType and not (kind is str and Path in kinds)]
-    example = next(
-        (f", such as {EXAMPLES[n]}" for n in (getattr(k, "__name__", "") for k in kinds) if n in EXAMPLES), ""
-    )
-    expected = " or ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
-    raise InputError(place, f"found {shown(value)}", f"{expected}{example}")
+    names = (getattr(kind, "__name__", "") for kind in kinds)
+    example = next((f", such as {EXAMPLES[name]}" for name in names if name in EXAMPLES), "")
+    choices = [choice for kind in kinds if get_origin(kind) is Literal for choice in get_args(kind)]
+    raise InputError(place, f"found {shown(value)}", f"{' or '.join(words)}{example}", did_you_mean(value, choices))
 
 
 _signature = cache(signature)
@@ -119,24 +121,26 @@ def _fits(value: Any, hint: Any) -> bool:
     origin, parts = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in parts)
+    if origin is Literal:
+        return isinstance(value, str) and value in parts
     if origin is Sequence or (origin is tuple and parts[1:] == (...,)):
-        names = str in _alternatives(parts[0]) and Path not in _alternatives(parts[0])  # checked where they are known
+        items = _alternatives(parts[0])
+        names = Path not in items and any(kind is str or get_origin(kind) is Literal for kind in items)
         return names or (isinstance(value, list | tuple) and all(_fits(one, parts[0]) for one in value))
     if origin in (Mapping, dict):
         return isinstance(value, Mapping) and all(_fits(one, parts[1]) for one in value.values())
-    if origin is Callable:
-        return callable(value)
-    is_compared = isinstance(hint, type) and origin is None
-    is_compared = is_compared and (hint in (str, NoneType) or hint.__module__.startswith(_COMPARED))
-    return not is_compared or isinstance(value, hint)
+    if not isinstance(hint, type) or not (hint in (str, bool, NoneType) or hint.__module__.startswith(_COMPARED)):
+        return origin is not Callable or callable(value)
+    return isinstance(value, hint) or (hint is bool and type(value).__name__.startswith("bool"))  # numpy's
 
 
 def _describe(hint: Any) -> str:
-    words = {str: "text", Path: "a path", Mapping: "a mapping", dict: "a mapping", Callable: "a function"}
-    kind = get_origin(hint) or hint
+    kind, parts = get_origin(hint) or hint, get_args(hint)
+    if kind is Literal:
+        return f"one of {', '.join(parts)}"
     if kind in (Sequence, tuple):
-        return f"a list of {getattr(get_args(hint)[0], '__name__', 'them')}"
-    return words.get(kind) or f"a{'n' * (kind.__name__[0] in 'AEIO')} {kind.__name__}"
+        return f"a list of {getattr(parts[0], '__name__', 'them')}"
+    return _WORDS.get(kind) or f"a{'n' * (kind.__name__[0] in 'AEIO')} {kind.__name__}"
 
 
 def check(key: str, value: object, possible: Any) -> Any:
@@ -151,36 +155,9 @@ def check(key: str, value: object, possible: Any) -> Any:
         InputError: It is none of them.
     """
     options = get_args(possible) or tuple(possible)
-    for option in options:
-        if value is option or (isinstance(value, type(option)) and value == option):  # numpy's text is text too
-            return option
-    words = ", ".join(map(str, options))
-    raise InputError(key, f"found {shown(value)}", f"one of {words}", did_you_mean(value, options))
-
-
-def set_checked(of: object, place: str = "", **possible: Any) -> None:
-    """Check choices among the fields of a frozen dataclass, and set each to the option that it is.
-
-    Args:
-        of: The object.
-        place: What stands before a field's name in messages.
-        possible: A `Literal` for each field.
-
-    Raises:
-        InputError: One is none of those possible.
-    """
-    for key, options in possible.items():
-        object.__setattr__(of, key, check(f"{place}{key}", getattr(of, key), options))
-
-
-def check_flag(key: str, value: object) -> None:
-    """Check that a switch is True or False, and no word that happens to count as True.
-
-    Raises:
-        InputError: It is neither.
-    """
-    if type(value).__name__ not in ("bool", "bool_"):  # Python's and numpy's
-        raise InputError(key, f"found {shown(value)}", "True or False")
+    if not isinstance(value, str) or value not in options:
+        raise InputError(key, f"found {shown(value)}", f"one of {', '.join(options)}", did_you_mean(value, options))
+    return value
 
 
 def check_number(
@@ -190,7 +167,6 @@ def check_number(
     least: float = 0.0,
     above: bool = False,
     whole: bool = False,
-    finite: bool = True,
     most: int | None = None,
 ) -> None:
     """Check that an option is a number of the right kind and size.
@@ -201,27 +177,23 @@ def check_number(
         least: The smallest number possible.
         above: Whether it must be above that.
         whole: Whether it must be a whole number.
-        finite: Whether it must be finite.
         most: The largest number possible.
 
     Raises:
         InputError: It is no number, nan, or not of this kind and size.
     """
-    good = isinstance(value, Real) and not isinstance(value, bool)
-    if good:
-        try:
-            x = float(value)  # type: ignore[arg-type]
-        except OverflowError:  # a whole number beyond any float
-            x = math.inf
-        good = (x > least if above else x >= least) and (math.isfinite(x) or not finite)
-        good = good and not (whole and not isinstance(value, Integral))
-        if good and math.isfinite(x) and (x > MOST_SIZE or (above and x < LEAST_SIZE)):
-            raise InputError(key, f"found {shown(value)}", ORDINARY)
-        if good and most is not None and x > most:
-            raise InputError(key, f"found {shown(value)}", f"at most {most}")
-    if not good:
-        kind = "a whole number" if whole else "a finite number" if finite else "a number"
+    try:
+        x = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    except OverflowError:  # a whole number beyond any float
+        x = math.inf
+    large = x > least if above else x >= least
+    if not large or not math.isfinite(x) or (whole and not isinstance(value, Integral)):
+        kind = "a whole number" if whole else "a finite number"
         raise InputError(key, f"found {shown(value)}", f"{kind} {'above' if above else 'not below'} {least:g}")
+    if x > MOST_SIZE or (above and x < LEAST_SIZE):
+        raise InputError(key, f"found {shown(value)}", ORDINARY)
+    if most is not None and x > most:
+        raise InputError(key, f"found {shown(value)}", f"at most {most}")
 
 
 def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str = "parameter") -> None:

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from fg_calib.inputs.arguments import as_hinted, check, check_flag, check_names, check_number, listed, set_checked
-from fg_calib.inputs.errors import InputError, shown
+from fg_calib.inputs.arguments import check, check_fields, check_names, check_number, check_type, listed
+from fg_calib.inputs.errors import InputError
 
 MODELS: dict[str, str] = {
     "pose": "pose",
@@ -72,7 +72,7 @@ class Pairing:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "strategy", check("pairing", self.strategy, Strategy))
+        check("pairing", self.strategy, Strategy)
         check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
         check_number("pairing: seed", self.seed, whole=True)
         for key in ("count", "seed"):
@@ -81,16 +81,6 @@ class Pairing:
 
     def __str__(self) -> str:
         return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
-
-
-def as_pairing(pairing: Pairing | None) -> Pairing:
-    """The pairing given, a star if None.
-
-    Raises:
-        InputError: It is something else, such as a strategy's bare name.
-    """
-    as_hinted("pairing", pairing, Pairing | None)
-    return pairing or Pairing()
 
 
 PAIR_MODELS: dict[Model, tuple[bool, bool]] = {
@@ -132,23 +122,9 @@ class Limits:
     angle: float | None = None
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            if getattr(self, f.name) is not None:
-                check_number(f"accept: {f.name}", getattr(self, f.name), above=True)
-
-    @classmethod
-    def given(cls, limits: Limits | Mapping[str, float] | None) -> Limits:
-        """The limits given, as such or by name; none at all if None.
-
-        Raises:
-            InputError: A name is not known, or a limit is no number above 0.
-        """
-        if limits is None or isinstance(limits, Limits):
-            return limits or cls()
-        if not isinstance(limits, Mapping):
-            raise InputError("accept", f"found {shown(limits)}", "limits by name")
-        check_names("accept", limits, [f.name for f in fields(cls)], "limit")
-        return cls(**limits)
+        for name, limit in vars(self).items():
+            if limit is not None:
+                check_number(f"accept: {name}", limit, above=True)
 
 
 @dataclass(frozen=True)
@@ -195,20 +171,16 @@ class Options:
     folds: int | None = None
 
     def __post_init__(self) -> None:
-        set_checked(self, model=Model, frame=FrameKnowledge, gauge=Gauge)
-        set_checked(self, pair_errors=PairErrors, encoder=EncoderNoise, loss=Loss)
-        as_hinted("pairing", self.pairing, Pairing)
-        check_flag("estimate_noise", self.estimate_noise)
-        if self.estimate_tolerance is not None:
-            set_checked(self, estimate_tolerance=SharedScale)
-            if self.gauge != "prior":
-                found = f"to be estimated with gauge: {self.gauge}"
-                raise InputError("tolerance", found, "gauge: prior, the scale of which it is")
-        if self.max_iterations is not None:
-            check_number("max_iterations", self.max_iterations, above=True, whole=True)
-        object.__setattr__(self, "accept", Limits.given(self.accept))
-        if self.folds is not None:
-            check_number("folds", self.folds, least=2, whole=True)
+        if isinstance(self.accept, Mapping):
+            check_names("accept", self.accept, list(LIMITED), "limit")
+            object.__setattr__(self, "accept", Limits(**self.accept))
+        check_fields(self)
+        if self.estimate_tolerance is not None and self.gauge != "prior":
+            found = f"to be estimated with gauge: {self.gauge}"
+            raise InputError("tolerance", found, "gauge: prior, the scale of which it is")
+        for key, least in (("max_iterations", 1), ("folds", 2)):
+            if getattr(self, key) is not None:
+                check_number(key, getattr(self, key), least=least, whole=True)
 
     @classmethod
     def of(cls, options: Options | None = None, **choices: Any) -> Options:
@@ -224,26 +196,14 @@ class Options:
         check_names("options", choices, [*(f.name for f in fields(cls)), "prior"], "option")
         if "prior" in choices:
             prior = choices.pop("prior")
-            check_flag("prior", prior)
+            check_type("prior", prior, bool)
             gauge = choices.setdefault("gauge", "prior" if prior else "none")
             if prior != (gauge == "prior"):
                 raise InputError("prior", f"found {prior} with gauge: {gauge}", "gauge alone")
-        choices["pairing"] = as_pairing(choices.get("pairing"))
-        if not isinstance(choices.get("prefer", ()), str):
-            choices["prefer"] = listed("prefer", choices.get("prefer", ()))
+        choices["prefer"] = listed("prefer", choices.get("prefer", ()))
         return cls(**choices)
 
     @property
     def has_priors(self) -> bool:
         """Whether the robot's tolerances are priors."""
         return self.gauge == "prior"
-
-    @property
-    def uses_pairs(self) -> bool:
-        """Whether the model is one of pairs."""
-        return self.model in PAIR_MODELS
-
-    @property
-    def unknown_frame(self) -> bool:
-        """Whether world_T_base is estimated."""
-        return self.frame == "unknown" and not self.uses_pairs

@@ -355,8 +355,10 @@ def camera_in(given: Any, place: str, folder: Path) -> tuple[Camera | None, bool
 
 def _limits(given: object, units: Units) -> Limits:
     """The errors that the user accepts, in [m] and [rad]."""
-    if not isinstance(given, dict) or not given.keys() <= LIMITED.keys():
-        return Limits.given(given)  # type: ignore[arg-type] # raises
+    given = {} if given is None else given
+    if not isinstance(given, dict):
+        raise InputError("accept", f"found {shown(given)}", "limits by name")
+    check_names("accept", given, list(LIMITED), "limit")
     return Limits(**{key: quantity(one, LIMITED[key], units, f"accept: {key}") for key, one in given.items()})
 
 

@@ -22,8 +22,8 @@ from fg_calib.inputs import (
     AngleUnit,
     InputError,
     LengthUnit,
+    check_fields,
     did_you_mean,
-    set_checked,
 )
 from fg_calib.io.atomic import read_text
 
@@ -311,7 +311,7 @@ class Units:
     angle: AngleUnit = "rad"
 
     def __post_init__(self) -> None:
-        set_checked(self, "units: ", length=LengthUnit, angle=AngleUnit)
+        check_fields(self, "units: ")
 
     def name(self, unit: str) -> str:
         """The file's unit for what is in `m` or `rad` inside the program."""

@@ -23,10 +23,8 @@ from fg_calib.inputs import (
     Pairing,
     as_floats,
     check_fields,
-    check_flag,
     check_number,
     listed,
-    set_checked,
     shown,
 )
 from fg_calib.measurements.dataset import Labels, Measurements, Pairs, only_of
@@ -271,13 +269,8 @@ class Table(Brief):
             bare = [name for name, k in known.items() if isinstance(k, list | tuple | np.ndarray)]
             known |= {name: KnownPoint(known[name]) for name in bare}
             object.__setattr__(self, "known", known)
-        check_fields(self, "table")
+        check_fields(self, "table: ")
         object.__setattr__(self, "own", tuple(self.own))
-        for name in ("offset", "fixed_camera"):
-            check_flag(f"table: {name}", getattr(self, name))
-        if self.model is not None:
-            set_checked(self, "table: ", model=Model)
-        set_checked(self, "table: ", frame=FrameKnowledge)
         if self.model is None and self.frame == "unknown":
             raise InputError(
                 "table: frame", "unknown, without a model", "a kind with unknowns of its own for the frame"
