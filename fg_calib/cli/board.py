@@ -31,8 +31,7 @@ def board(
 ) -> None:
     """Make tables of images of a board: its corners, and its poses with their covariances."""
     if (camera is None) != estimate_camera:
-        say("error: one of --camera and --estimate-camera is needed, and only one")
-        raise typer.Exit(2)
+        raise typer.BadParameter("one of the two is needed", param_hint="--camera and --estimate-camera")
     from fg_calib import importers
     from fg_calib.io import Units, read_bytes, read_camera, require_own, require_writable
 

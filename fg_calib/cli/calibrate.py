@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -21,35 +21,27 @@ if TYPE_CHECKING:
     from fg_calib.batch import JobSummary, Order
     from fg_calib.calibration import Calibration
 
+Residuals = Literal["csv", "parquet", "none"]
+
 
 def calibrate(
     jobs: Annotated[list[Path], argument("JOB", "The job, such as calibration.yaml; or many.")],
-    out: Annotated[
-        Path | None,
-        option("--out", "DIR", "Write result.json, the calibrated robot and tables there; of many, folders."),
-    ] = None,
-    folds: Annotated[
-        int | None, option("--folds", None, "Hold every configuration out once, in so many folds.", min=2)
-    ] = None,
+    out: Annotated[Path | None, option("--out", "DIR", "Write the result there; of many jobs, folders.")] = None,
+    folds: Annotated[int | None, option("--folds", None, "Cross-validate, in so many folds.", min=2)] = None,
     report: Annotated[bool, option("--report", None, "Write report.html there too: one page to pass on.")] = False,
     figures: Annotated[bool, option("--figures", None, "Write the page's figures there too, as SVG files.")] = False,
-    residuals: Annotated[
-        Literal["csv", "parquet", "none"],
-        option("--residuals", None, "How single residuals are written: of millions of rows a CSV is large."),
-    ] = "csv",
+    residuals: Annotated[Residuals, option("--residuals", None, "How single residuals are written.")] = "csv",
     workers: Annotated[int | None, option("--workers", "N", "Run jobs or folds on so many processes.", min=1)] = None,
-    scheduler: Annotated[
-        str | None, option("--scheduler", "ADDRESS", "Run them on a Dask cluster: tcp://host:8786.")
-    ] = None,
+    scheduler: Annotated[str | None, option("--scheduler", "ADDRESS", "Run them on a Dask cluster.")] = None,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
     from fg_calib.batch import Order, job_names
     from fg_calib.io import require_writable
+    from fg_calib.parallel import dask_executor, local_processes
 
     if out is None and (report or figures):
-        hint = "--report" if report else "--figures"
-        raise typer.BadParameter("needs --out, the folder to write to", param_hint=hint)
+        raise typer.BadParameter("needs --out, the folder to write to", param_hint="--report and --figures")
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
     several = len(jobs) > 1
@@ -59,23 +51,14 @@ def calibrate(
     if scheduler is not None:  # its workers run elsewhere
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     saved = {"report": report, "figures": figures, "residuals": residuals}
-    orders = [
-        Order(name, job, None if out is None else out / name, folds, saved)
-        for name, job in zip(names, jobs, strict=True)
-    ]
-    with _executor(workers, scheduler) as executor:
+    folders = [None if out is None else out / name for name in names]
+    orders = [Order(*one, folds, saved) for one in zip(names, jobs, folders, strict=True)]
+    run_on = dask_executor(scheduler) if scheduler else local_processes(workers) if workers else nullcontext()
+    with run_on as executor:
         if several:
             _calibrate_many(orders, out, executor, as_json)
         else:
             show_calibration(orders[0].carry_out(executor), as_json)
-
-
-def _executor(workers: int | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
-    if workers is None and scheduler is None:
-        return nullcontext()
-    from fg_calib.parallel import dask_executor, local_processes
-
-    return dask_executor(scheduler) if scheduler else local_processes(workers or 1)
 
 
 def show_calibration(found: Calibration, as_json: bool) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, ResultFolder, argument, option, read_quantity, show_result
+from fg_calib.cli.output import Json, ResultFolder, angle_option, argument, length_option, option, show_result
 
 NewTable = Annotated[Path, argument("TABLE", "New rows: a table like the job's, or a job with several.")]
 Pairs = Annotated[Path | None, option("--pairs", "TABLE", "Table of pairs, if the job has one.")]
@@ -17,8 +17,8 @@ Like = Annotated[str | None, option("--like", "NAME", "Which of the job's tables
 def check(
     result: ResultFolder,
     table: NewTable,
-    limit: Annotated[str | None, option("--limit", "LENGTH", "Largest RMS error of positions, such as 0.5mm.")] = None,
-    limit_angle: Annotated[str | None, option("--limit-angle", "ANGLE", "Of orientations, such as 0.05deg.")] = None,
+    limit: Annotated[float | None, length_option("--limit", "Largest RMS error of positions, such as 0.5mm.")] = None,
+    limit_angle: Annotated[float | None, angle_option("--limit-angle", "Of orientations, such as 0.05deg.")] = None,
     pairs: Pairs = None,
     like: Like = None,
     as_json: Json = False,
@@ -27,12 +27,8 @@ def check(
     from fg_calib.calibration import Calibration
     from fg_calib.report import build_check_report, check_document
 
-    limits = {
-        "limit": read_quantity(limit, "m", "--limit"),
-        "limit_angle": read_quantity(limit_angle, "rad", "--limit-angle"),
-    }
     calibration = Calibration.load(result)
-    found = calibration.check(table, **limits, pairs=pairs, like=like)
+    found = calibration.check(table, limit=limit, limit_angle=limit_angle, pairs=pairs, like=like)
     joints = [joint.unit for joint in calibration.robot.joints]
     show_result(as_json, lambda: check_document(found), lambda: build_check_report(found, joints))
     if not found.passed:

@@ -14,9 +14,7 @@ def correct(
     out: Annotated[Path | None, option("--out", "CSV", "Write the table of commands there.")] = None,
     length: Length = "m",
     angle: Angle = "rad",
-    world: Annotated[
-        bool, option("--world", None, "The targets are in the measurement frame, not from the base.")
-    ] = False,
+    world: Annotated[bool, option("--world", None, "The targets are in the measurement frame.")] = False,
     table: Annotated[int | None, option("--table", None, "Number of the table whose frame that is, from 0.")] = None,
     as_json: Json = False,
 ) -> None:

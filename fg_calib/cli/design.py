@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, Seed, argument, end, option, read_quantity, say, show_result
+from fg_calib.cli.output import Json, Seed, argument, end, length_option, option, say, show_result
 
 if TYPE_CHECKING:
     from fg_calib.io import Units
@@ -15,36 +15,20 @@ if TYPE_CHECKING:
     from fg_calib.robot import Robot
     from fg_calib.simulation import Scenario
 
+Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
+Frame = Literal["base", "fitted"]
+
 
 def design(
-    of: Annotated[
-        str, argument("SCENARIO|JOB", "A scenario (a file, or space-robot); or a job, whose rows count already.")
-    ],
+    of: Annotated[str, argument("SCENARIO|JOB", "A scenario, or a job, whose rows count already.")],
     n: Annotated[int | None, option("--n", "N", "How many poses; 30 if neither this nor --target.")] = None,
-    target: Annotated[
-        str | None, option("--target", "LENGTH", "As few as reach this RMS error, such as 0.5mm.")
-    ] = None,
+    target: Annotated[float | None, length_option("--target", "As few as reach this RMS error, such as 0.5mm.")] = None,
     given: Annotated[Path | None, option("--given", "TABLE", "Configurations that are measured in any case.")] = None,
-    candidates: Annotated[
-        str | None,
-        option(
-            "--candidates", "N|TABLE|SCENARIO|rows", "How many are drawn (2000); a table; a scenario; a job's rows."
-        ),
-    ] = None,
-    task: Annotated[
-        Path | None, option("--task", "TABLE", "Where the tool is to be right; anywhere within limits if none.")
-    ] = None,
-    criterion: Annotated[
-        Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"],
-        option("--criterion", None, "What is made small: I, the error over the task, or one of the literature's."),
-    ] = "I",
-    error: Annotated[
-        Literal["base", "fitted"] | None,
-        option("--error", None, "Errors in the base frame, or after the best rigid fit; by what is measured if none."),
-    ] = None,
-    lever: Annotated[
-        str | None, option("--lever", "LENGTH", "Orientations count too, by what they move at this distance.")
-    ] = None,
+    candidates: Annotated[str | None, option("--candidates", "N|TABLE|SCENARIO|rows", "How many, or which.")] = None,
+    task: Annotated[Path | None, option("--task", "TABLE", "Where the tool is to be right; anywhere if none.")] = None,
+    criterion: Annotated[Criterion, option("--criterion", None, "What is made small: I, the error.")] = "I",
+    error: Annotated[Frame | None, option("--error", None, "In the base frame, or after the best fit.")] = None,
+    lever: Annotated[float | None, length_option("--lever", "Where orientations count by what they move.")] = None,
     out: Annotated[Path | None, option("--out", "DIR", "Write tables and a job to fill in there.")] = None,
     seed: Seed = 0,
     as_json: Json = False,
@@ -55,15 +39,14 @@ def design(
     from fg_calib.report import build_design_report, design_document, write_design
 
     if n is not None and target is not None:
-        say("error: --n and --target: one of the two")
-        raise typer.Exit(2)
+        raise typer.BadParameter("one of the two", param_hint="--n and --target")
     subject, units, robot = _read(of)
     if out is not None:
         require_writable(out)
     choices: dict[str, Any] = {
         "n": n,
-        "target": read_quantity(target, "m", "--target"),
-        "lever": read_quantity(lever, "m", "--lever") or 0.0,
+        "target": target,
+        "lever": lever or 0.0,
         "fitted": None if error is None else error == "fitted",
         "criterion": criterion,
         "seed": seed,

@@ -9,30 +9,20 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from importlib import import_module
 from typing import Annotated, NoReturn
 
 import typer
 
 from fg_calib import __version__
-from fg_calib.cli.bag import bag
-from fg_calib.cli.board import board
-from fg_calib.cli.calibrate import calibrate
-from fg_calib.cli.check import check
-from fg_calib.cli.compare import compare
-from fg_calib.cli.correct import correct
-from fg_calib.cli.design import design
-from fg_calib.cli.example import example
-from fg_calib.cli.export import export
-from fg_calib.cli.history import history
-from fg_calib.cli.init import init
-from fg_calib.cli.inspect import inspect
-from fg_calib.cli.observe import observe
 from fg_calib.cli.output import progress, say
-from fg_calib.cli.predict import predict
-from fg_calib.cli.report import report
-from fg_calib.cli.simulate import simulate
-from fg_calib.cli.update import update
 from fg_calib.inputs import CalibrationError, printable
+
+COMMANDS = (
+    *("init", "inspect", "calibrate", "report", "export", "correct", "predict", "compare", "check", "update"),
+    *("history", "observe", "design", "simulate", "example", "bag", "board"),
+)
+"""The commands in the order of the help: each is the function of that name in the module of that name."""
 
 app = typer.Typer(
     name="fg-calib",
@@ -40,11 +30,8 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (
-    *(init, inspect, calibrate, report, export, correct, predict, compare, check, update, history),
-    *(observe, design, simulate, example, bag, board),
-):
-    app.command()(command)
+for command in COMMANDS:
+    app.command()(getattr(import_module(f"fg_calib.cli.{command}"), command))
 
 
 class _Line(logging.Formatter):

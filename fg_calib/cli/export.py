@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,19 +12,9 @@ from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, 
 from fg_calib.inputs import escaped
 
 Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
-At = Annotated[
-    Literal["workspace", "measured"] | None,
-    option("--at", None, "Of zeros: fit them over the joint limits, or where the RESULT was measured."),
-]
-Tool = Annotated[
-    Literal["nominal", "calibrated"] | None,
-    option("--tool", None, "Of zeros: the controller's tool; as calibrated if not given."),
-]
-UrBase = Annotated[
-    Literal["base", "base_link"] | None,
-    option("--ur-base", None, "Of ur: which frame of ur_description the arm's base is."),
-]
-Elements = Annotated[bool, option("--calibration-elements", None, "Of urdf: write joint zeros into <calibration>.")]
+At = Literal["workspace", "measured"]
+Tool = Literal["nominal", "calibrated"]
+UrBase = Literal["base", "base_link"]
 
 
 def export(
@@ -32,11 +22,11 @@ def export(
     to: Annotated[Format, option("--to", None, "What is to read it: see the documentation of export.")],
     out: Annotated[Path | None, option("--out", "FILE", "A new file; on stdout if not given.")] = None,
     nominal: Annotated[Path | None, option("--nominal", "ROBOT", "The nominal robot; a RESULT has its own.")] = None,
-    at: At = None,
-    tool: Tool = None,
+    at: Annotated[At, option("--at", None, "Of zeros: fitted over the limits, or where measured.")] = "workspace",
+    tool: Annotated[Tool, option("--tool", None, "Of zeros: the controller's tool.")] = "calibrated",
     far: Annotated[bool, option("--far", None, "Of dh and mdh: be exact, however far frames are.")] = False,
-    calibration_elements: Elements = False,
-    ur_base: UrBase = None,
+    calibration_elements: Annotated[bool, option("--calibration-elements", None, "Of urdf: zeros in it.")] = False,
+    ur_base: Annotated[UrBase | None, option("--ur-base", None, "Of ur: ur_description's name of the base.")] = None,
     ur_hash: Annotated[str | None, option("--ur-hash", "HASH", "Of ur: the controller's own hash.")] = None,
     base_link: BaseLink = None,
     tip_link: TipLink = None,
@@ -51,33 +41,24 @@ def export(
     is_result = is_folder(arm) or arm.suffix.lower() == ".json"
     if is_result and (base_link or tip_link):
         raise typer.BadParameter("a RESULT knows its links", param_hint="--base-link and --tip-link")
-    if at is not None and to != "zeros":
-        raise typer.BadParameter(f"means nothing for {to}", param_hint="--at")
     if at == "measured" and not is_result:
         raise typer.BadParameter("needs a RESULT with its configurations", param_hint="--at measured")
     if out is not None:
         require_absent(out.parent, [out.name])
     found = Calibration.load(arm) if is_result else read_robot(arm, base_link=base_link, tip_link=tip_link)
-    choices: dict[str, Any] = {
-        "far": far,
-        "calibration_elements": calibration_elements,
-        "ur_base": ur_base,
-        "ur_hash": ur_hash,
-    }
+    choices = {"far": far, "calibration_elements": calibration_elements, "ur_base": ur_base, "ur_hash": ur_hash}
     before = None if nominal is None else read_robot(nominal, base_link=base_link, tip_link=tip_link)
     q = measured_configurations(arm) if at == "measured" else None
-    made = export_arm(found, to, nominal=before, configurations=q, tool=tool or "calibrated", **choices)
-    on_stdout = ""
+    made = export_arm(found, to, nominal=before, configurations=q, tool=tool, **choices)  # type: ignore[arg-type]
     if out is not None:
         made.write(out)
         say(f"wrote {out}")
     if as_json:
         show_json(made.document())
     elif out is None:
-        on_stdout = made.text
         lines = made.text.removesuffix("\n").split("\n")
-        show("\n".join(escaped(line.expandtabs()) for line in lines) if sys.stdout.isatty() else "\n".join(lines))
+        show("\n".join(escaped(line.expandtabs()) if sys.stdout.isatty() else line for line in lines))
     for note in made.notes:
-        if note not in on_stdout:
+        if as_json or out is not None or note not in made.text:
             say(note)
     end(made.findings, not_accepted=made.not_accepted)

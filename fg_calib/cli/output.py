@@ -31,9 +31,28 @@ def option(name: str, metavar: str | None, about: str, **limits: Any) -> Any:
         name: Such as `--out`.
         metavar: What it takes, for the help; None for a switch or a choice.
         about: The line of help.
-        limits: Of numbers: `min`.
+        limits: Of numbers: `min`; of text: `parser`.
     """
     return typer.Option(name, metavar=metavar, readable=False, help=about, **limits)
+
+
+def length_option(name: str, about: str) -> Any:
+    """An option that takes a length with its unit, which a command gets in [m]."""
+    return _quantity_option(name, "LENGTH", "m", about)
+
+
+def angle_option(name: str, about: str) -> Any:
+    """An option that takes an angle with its unit, which a command gets in [rad]."""
+    return _quantity_option(name, "ANGLE", "rad", about)
+
+
+def _quantity_option(name: str, metavar: str, unit: Literal["m", "rad"], about: str) -> Any:
+    def read(text: str) -> float:
+        from fg_calib.io import quantity
+
+        return quantity(text, unit, None, name)
+
+    return option(name, metavar, about, parser=read)
 
 
 Json = Annotated[bool, option("--json", None, "Print the result as JSON on stdout, and nothing else there.")]
@@ -104,17 +123,6 @@ def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: C
     _hide_progress()
     given = Console().is_terminal or "COLUMNS" in os.environ
     Console(highlight=False, width=width_for(shown, Console().width if given else WIDTH)).print(shown)
-
-
-def read_quantity(text: str | None, unit: Literal["m", "rad"], option_name: str) -> float | None:
-    """A length or an angle that an option gives with its unit, [m] or [rad]; None if it is not given.
-
-    Raises:
-        InputError: It has no unit, or is no number.
-    """
-    from fg_calib.io import quantity
-
-    return None if text is None else quantity(text, unit, None, option_name)
 
 
 def names_in(text: str) -> list[str]:

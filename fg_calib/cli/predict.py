@@ -5,15 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from fg_calib.cli.output import Angle, Json, Length, ResultFolder, end, option, read_quantity, say, show_result
+from fg_calib.cli.output import Angle, Json, Length, ResultFolder, end, length_option, option, say, show_result
 
 
 def predict(
     result: ResultFolder,
-    at: Annotated[
-        Path | None, option("--at", "TABLE", "Configurations, q1 ...; all over the workspace if none.")
-    ] = None,
-    limit: Annotated[str | None, option("--limit", "LENGTH", "Say where errors are within it, such as 0.5mm.")] = None,
+    at: Annotated[Path | None, option("--at", "TABLE", "Configurations; over the workspace if not given.")] = None,
+    limit: Annotated[float | None, length_option("--limit", "Say where errors are within it, such as 0.5mm.")] = None,
     out: Annotated[Path | None, option("--out", "DIR", "Write predict.json, predict.csv and pictures there.")] = None,
     length: Length = "m",
     angle: Angle = "rad",
@@ -25,12 +23,12 @@ def predict(
     from fg_calib.io import Units, read_joint_table, require_writable
     from fg_calib.report import build_prediction_report, prediction_document, write_prediction
 
-    most, units = read_quantity(limit, "m", "--limit"), Units(length, angle)
+    units = Units(length, angle)
     if out is not None:
         require_writable(out)
     arm = Calibration.load(result)
     ids, readings = ((), None) if at is None else read_joint_table(at, arm.robot, units)
-    found = predict_tool(arm, readings, limit=most)
+    found = predict_tool(arm, readings, limit=limit)
     if out is not None:
         write_prediction(out, found, arm.result, arm.robot, ids, units)
     show_result(

@@ -13,22 +13,17 @@ from fg_calib.cli.output import Json, ResultFolder, option
 if TYPE_CHECKING:
     from fg_calib.robot import Robot
 
+Many = list[str] | None
+
 
 def update(
     result: ResultFolder,
     table: NewTable,
     out: Annotated[Path, option("--out", "DIR", "Write the new result there, with its history.")],
     date: Annotated[str | None, option("--date", "DATE", "When the rows were measured; now if left out.")] = None,
-    growth: Annotated[
-        list[str] | None,
-        option("--growth", "NAME=FIGURE", "1 sigma of drift in a day, of a parameter or a kind: theta=0.001deg."),
-    ] = None,
-    changed: Annotated[
-        list[str] | None, option("--changed", "NAME", "What has changed since: nothing is taken over of it.")
-    ] = None,
-    anchors_stay: Annotated[
-        bool, option("--anchors-stay", None, "Anchors of the same name are where they were.")
-    ] = False,
+    growth: Annotated[Many, option("--growth", "NAME=FIGURE", "1 sigma of drift in a day: theta=0.001deg.")] = None,
+    changed: Annotated[Many, option("--changed", "NAME", "What has changed since: it is estimated anew.")] = None,
+    anchors_stay: Annotated[bool, option("--anchors-stay", None, "Anchors of the same name have not moved.")] = False,
     pairs: Pairs = None,
     like: Like = None,
     as_json: Json = False,
@@ -46,8 +41,8 @@ def update(
     found = before.update(
         table,
         date=date,
-        growth=_growth(growth or [], before.robot),
-        changed=changed or [],
+        growth=_growth(growth or (), before.robot),
+        changed=changed or (),
         anchors_stay=anchors_stay,
         pairs=pairs,
         like=like,

@@ -168,7 +168,8 @@ def test_a_board_with_two_poses_is_in_the_table_of_corners_alone(job, fg_calib, 
 @pytest.mark.parametrize("given", [[], ["--camera", "camera.yaml", "--estimate-camera"]])
 def test_one_camera_is_needed(job, fg_calib, given):
     ended = run(fg_calib, job, *given, camera=False)
-    assert (ended.code, ended.err) == (2, "error: one of --camera and --estimate-camera is needed, and only one\n")
+    assert ended.code == 2
+    assert "--camera and --estimate-camera: one of the two is needed" in ended.err
 
 
 def test_without_opencv_it_says_what_to_install(job, fg_calib, monkeypatch):

@@ -99,18 +99,12 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
         "out/below: cannot be written: ",
     ),
     "no robot to observe": (nothing, ("observe", "missing.yaml"), "missing.yaml: no such file"),
-    "an unknown parameter": (nothing, ("observe", ROBOT, "--prefer", "d9"), "no parameter 'd9'"),
+    "an unknown parameter": (nothing, ("observe", ROBOT, "--prefer", "d9"), "unknown parameter 'd9'"),
     "a table in degrees": (nothing, OBSERVE[:4], "is the table in deg?"),
-    "noise of zero": (nothing, (*OBSERVE, "--position-noise", 0), "--position-noise: found 0.0, expected a finite num"),
-    "noise below zero": (
+    "noise of zero": (
         nothing,
-        (*OBSERVE, "--joint-noise", -1),
-        "--joint-noise: found -1.0, expected a finite number",
-    ),
-    "noise of nothing": (
-        nothing,
-        (*OBSERVE, "--orientation-noise", 1e-29),
-        "--orientation-noise: found 1e-29 deg, expected 1e-30 rad or more",
+        (*OBSERVE, "--position-noise", 0),
+        "noise: position: found 0.0, expected a finite number",
     ),
     "no z": (written("x,y\n1,2\n"), CORRECT, "table.csv"),
     "orientations alone": (written("qx,qy,qz,qw\n0,0,0,1\n"), CORRECT, "orientations without x y z"),
@@ -186,29 +180,14 @@ USAGE = {  # command, what is said of it
     "processes and a scheduler": (("calibrate", JOB, "--workers", 2, "--scheduler", "tcp://a:1"), "--scheduler"),
     "an unknown model": (("observe", ROBOT, "--model", "poses"), "--model"),
     "an unknown unit": (("observe", ROBOT, "--angle", "grad"), "--angle"),
-    "noise without a table": (
-        ("observe", ROBOT, "--position-noise", "0.001"),
-        "no effect without --configurations",
-    ),
+    "noise below zero": ((*OBSERVE, "--joint-noise", -1), "--joint-noise"),
+    "a seed of a table": ((*OBSERVE, "--seed", "1"), "no effect with --configurations"),
     "a unit without a table": (("observe", ROBOT, "--angle", "deg"), "no effect without --configurations"),
-    "noise of another model": (
-        (*OBSERVE, "--model", "position", "--orientation-noise", "0.001"),
-        "error: --orientation-noise has no effect with --model position",
-    ),
-    "a frame of pairs": (
-        (*OBSERVE, "--model", "distance", "--frame", "unknown"),
-        "error: --frame has no effect with --model distance",
-    ),
-    "pairs of poses": (
-        (*OBSERVE, "--model", "pose", "--pairing", "chain"),
-        "error: --pairing has no effect with --model pose",
-    ),
     "stops and an accuracy": ((*DESIGN, "--n", 3, "--target", "1mm"), "--n and --target"),
     "an unknown criterion": ((*DESIGN, "--criterion", "G"), "--criterion"),
     "an unknown error": ((*DESIGN, "--error", "tool"), "--error"),
     "an unknown format": (("export", ROBOT, "--to", "kuka"), "'kuka' is not one of 'urdf', 'ur', 'tesseract'"),
     "a robot measured": (("export", ROBOT, "--to", "zeros", "--at", "measured"), "needs a RESULT"),
-    "places of a table": ((*EXPORT, "--at", "workspace"), "means nothing for dh"),
     "links of a result": (("export", "result", "--to", "dh", "--tip-link", "a"), "a RESULT knows its links"),
 }
 
