@@ -13,21 +13,24 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fg_calib.diagnostics.linearity import find_ambiguous_rows
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
-from fg_calib.diagnostics.verdict import Statement, listed, texts
-from fg_calib.graph import Problem, Solution, linear_system, problem_of, tables_of, unsolved
-from fg_calib.inputs import Brief, checked
+from fg_calib.diagnostics.verdict import Severity, Statement, listed, texts
+from fg_calib.graph import Problem, linear_system, problem_of, solve, tables_of, unsolved
+from fg_calib.inputs import Brief, CalibrationError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
 from fg_calib.observability import NOT_EXCITED, Identifiability, identifiability_of
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot
-from fg_calib.statistics import spread_of, with_left_out
+from fg_calib.statistics import MAX_OUTLIER_SHARE, judge_fit, spread_of, with_left_out
+from fg_calib.statistics.residual_table import residual_table
 
-AMBIGUOUS_SHARE = 0.05
-"""Share of pairs of ambiguous sign, from which it is reported."""
+FAR, MEDIAN = 10.0, 0.6745
+"""Studentised residual over its typical size from which a row disagrees; the median size of what is normal."""
+
+MAX_ROWS = 20_000
+"""Rows up to which single ones that disagree are looked for."""
 
 NEAR = 1e-3
 """How far each reading of two configurations may be apart that are nearly the same, [rad] (prismatic: [m])."""
@@ -83,7 +86,6 @@ class TableSurvey:
         copy: Two that are the same; empty without.
         n_repeats: Those at the readings of one before them, with other values: they show the noise.
         n_leaked: Test rows at, or within `NEAR` of, a configuration of train rows.
-        n_ambiguous: Train pairs whose sign is ambiguous within the prior sigmas.
     """
 
     name: str
@@ -99,7 +101,21 @@ class TableSurvey:
     copy: str
     n_repeats: int
     n_leaked: int
-    n_ambiguous: int
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A measurement that disagrees with the others, by the arm that a robust loss fits to all.
+
+    Attributes:
+        name: The configurations that it is of, or the landmark, and its table if there are several.
+        ratio: Size of its studentised residual over the typical one of its kind of noise.
+        test: Whether it is a test row.
+    """
+
+    name: str
+    ratio: float
+    test: bool
 
 
 @dataclass(frozen=True)
@@ -111,6 +127,7 @@ class Inspection(Brief):
         tables: Counts, table by table (a table seen from several stations is several).
         joints: The ranges of the readings.
         setups: Typical residuals of each table before calibration, and a mistake in its set-up if one explains them.
+        disagreements: Measurements that disagree with the others, the farthest first.
         identifiability: What the train rows determine, at nominal.
         expected_error: How far off the calibrated tool is expected to be; None where the arm is only evaluated.
         n_residuals: Scalar residuals of the fit.
@@ -127,6 +144,7 @@ class Inspection(Brief):
     tables: tuple[TableSurvey, ...]
     joints: tuple[JointRange, ...]
     setups: tuple[SetupCheck, ...]
+    disagreements: tuple[Disagreement, ...]
     identifiability: Identifiability
     expected_error: ExpectedError | None
     n_residuals: int
@@ -160,14 +178,17 @@ def inspect_job(job: Job) -> Inspection:
     tables = tables_of(job.measurements, job.options)
     whole = problem.whole or problem
     judged = replace(whole, robot=job.robot) if problem.evaluated else whole
+    setups = check_tables(judged, whole.start, with_landmarks=True)
+    misread = any(check.explanations for check in setups)  # then all rows disagree
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
     n_directions = spread.rank + linear_system(problem, problem.start).left.rank
     found = Inspection(
         robot=job.robot.name,
-        tables=tuple(_survey(at_nominal, number, table) for number, table in enumerate(tables)),
+        tables=tuple(_survey(problem, number, table) for number, table in enumerate(tables)),
         joints=_joints(problem, job.robot),
-        setups=tuple(check_tables(judged, whole.start, with_landmarks=True)),
+        setups=tuple(setups),
+        disagreements=() if misread else _disagreements(job),
         identifiability=identifiability_of(problem.whole or problem, problem.start, "practical"),
         expected_error=None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread)),
         n_residuals=problem.n_residuals,
@@ -181,12 +202,34 @@ def inspect_job(job: Job) -> Inspection:
     return replace(found, findings=texts(statements, "error"), cautions=texts(statements, "note"))
 
 
-def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
+def _disagreements(job: Job) -> tuple[Disagreement, ...]:
+    """The measurements that disagree with the others; none where these are many, or the rows."""
+    problem = problem_of(job, loss="cauchy")
+    if problem.n_residuals > MAX_ROWS:
+        return ()
+    try:
+        solution = solve(problem)
+        table = residual_table(solution)
+        size = np.abs(judge_fit(solution, spread_of(solution), table).studentised)
+    except CalibrationError:
+        return ()
+    judged, found = (table.reason_code == 0) & np.isfinite(size), dict[int, Disagreement]()
+    for k in np.unique(table.group[judged]).tolist():
+        rows = np.flatnonzero(judged & (table.group == k))
+        ratio = size[rows] / max(1.0, np.median(size[rows]) / MEDIAN)
+        of = f" of {problem.data.labels[table.groups[k][0]]}" * (len(problem.data.labels) > 1)
+        for far, i in sorted(zip(ratio[ratio > FAR].tolist(), rows[ratio > FAR].tolist(), strict=True)):
+            name = "-".join(table.names[end] for end in (table.a[i], table.b[i]) if end >= 0)
+            found[int(table.measurement_number[i])] = Disagreement(name + of, far, bool(table.test[i]))
+    worst = tuple(sorted(found.values(), key=lambda one: -one.ratio))
+    return worst if len(found) <= MAX_OUTLIER_SHARE * table.begins.sum() else ()
+
+
+def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
     """The counts of a table, with the test rows that it states."""
-    m, problem = table.measurements, at_nominal.problem
+    m = table.measurements
     copies, copy, repeats = find_copies(table)
     series = [s for s in problem.data.blocks if s.table == number]
-    pairs = find_ambiguous_rows(at_nominal, np.zeros((problem.variables.n_columns, 0)), 0, number)
     n_residuals = Counter[str]()
     for s in series:
         for name, n in zip(s.kind.names, s.used[s.train].sum(axis=0).tolist(), strict=True):
@@ -206,7 +249,6 @@ def _survey(at_nominal: Solution, number: int, table: Table) -> TableSurvey:
         copy=copy,
         n_repeats=repeats,
         n_leaked=_n_leaked(m),
-        n_ambiguous=len(set(pairs.names)),
     )
 
 
@@ -221,11 +263,9 @@ def _n_leaked(m: Measurements) -> int:
 def _joints(problem: Problem, robot: Robot) -> tuple[JointRange, ...]:
     """The readings of each joint in all tables."""
     q = problem.data.readings
-    columns = zip(robot.joints, q.min(axis=0), q.max(axis=0), robot.limits, outside_limits(q, robot).T, strict=True)
-    return tuple(
-        JointRange(joint.name, joint.unit, float(low), float(high), (float(limits[0]), float(limits[1])), int(n.sum()))
-        for joint, low, high, limits, n in columns
-    )
+    limits, outside = map(tuple, robot.limits.tolist()), outside_limits(q, robot).sum(axis=0).tolist()
+    columns = zip(robot.joints, q.min(axis=0).tolist(), q.max(axis=0).tolist(), limits, outside, strict=True)
+    return tuple(JointRange(joint.name, joint.unit, *values) for joint, *values in columns)
 
 
 def _check_setups(found: Inspection, job: Job) -> Iterator[Statement]:
@@ -233,7 +273,14 @@ def _check_setups(found: Inspection, job: Job) -> Iterator[Statement]:
     arm = [p for p in job.robot.parameters if p.estimated and 1 <= p.owner <= job.robot.n_joints]
     has_priors = job.options.has_priors and all(p.tolerance is not None for p in arm)
     for check in reporting(found.setups):
-        yield Statement("error" if check.explanations or has_priors else "note", str(check))
+        severity: Severity = "error" if check.explanations or has_priors else "note"
+        yield Statement(severity, str(check), check.explanations or not found.disagreements)  # else these are why
+    wrong, loss, tested = found.disagreements, job.options.loss, sum(one.test for one in found.disagreements)
+    text = f"measurements that disagree with the others: {len(wrong)} ({listed([one.name for one in wrong])})"
+    text += ": look at them" * bool(tested or loss == "none")
+    text += ", or let a robust loss do so (loss: gnc)" * (loss == "none" and tested < len(wrong))
+    text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
+    yield Statement("error" if tested or loss == "none" else "note", text, wrong)
     for joint in found.joints:
         text = f"{joint.name} is outside its limits in {joint.n_outside} configurations: is it in another unit?"
         yield Statement("error", text, joint.n_outside)
@@ -265,25 +312,18 @@ def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
     yield Statement("note", text, n)
     text = "no test rows: nothing would check how well the calibration predicts (column split)"
     yield Statement("note", text, not (found.evaluated or tested))
-    yield Statement("note", "gauge none: what is not determined has no sigma", options.gauge == "none" and lost)
 
 
 def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
-    """Check each table for copies, leaked test rows, pairs of ambiguous sign; noise and priors to be estimated."""
+    """Check each table for copies, leaked test rows; noise and priors to be estimated."""
     for t in found.tables:
         text = f"{t.name}: rows that are exact copies of others: {t.n_copies} ({t.copy}); each counts as one more"
         yield Statement("note", f"{text} measurement: remove it", t.n_copies)
         text = f"{t.name}: test rows at configurations of train rows, no check of a prediction: {t.n_leaked}"
         yield Statement("note", text, t.n_leaked)
-        text = f"{t.name}: the sign of {t.n_ambiguous} of {t.n_pairs} train pairs is ambiguous within the prior sigmas"
-        text += " (near 0 or 180 deg): measure longer and wider motions, in which more joints move"
-        yield Statement("note", text, t.n_ambiguous > AMBIGUOUS_SHARE * t.n_pairs)
     text = "is to be estimated: sigmas and accuracy here are for what is specified, or 1 mm and 1 mrad"
     yield Statement("note", f"noise {text}", job.options.estimate_noise)
     yield Statement("note", f"the scale of prior sigmas {text}", job.options.estimate_tolerance)
-    unseen = [t.name for t, check in zip(found.tables, found.setups, strict=True) if t.model and not check.residuals]
-    text = f"{listed(unseen)}: too few rows to look for common mistakes (units, signs, columns) before solving"
-    yield Statement("note", text, unseen)
 
 
 CHECKS = (_check_setups, _check_result, _check_tables)

@@ -99,14 +99,13 @@ class AmbiguousRows:
     share: float = 0.0
 
 
-def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: int | None = None) -> AmbiguousRows:
+def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> AmbiguousRows:
     """Lengths and angles of ambiguous sign; of many an even sample.
 
     Args:
         solution: The solution.
         sqrt_cov: A square root S of the posterior covariance S S^T of the core, shape (n_columns, k).
         rank: Number of determined directions.
-        table: Number of the table whose rows are looked at; all if None.
     """
     problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
@@ -115,7 +114,7 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int, table: 
         return AmbiguousRows()
     for noise in (noise for noise in solution.noises if len(noise.series.train)):
         s = noise.series
-        if s.kind.ends != 2 or not set(s.kind.names) <= {"distance", "angle"} or table not in (None, s.table):
+        if s.kind.ends != 2 or not set(s.kind.names) <= {"distance", "angle"}:
             continue
         rows = s.train[:: -(-len(s.train) // MAX_ROWS)]
         end = forward(at.chains[s.table], problem.data.trigs(problem.robot)[s.table], s.ends[rows].ravel())

@@ -101,10 +101,6 @@ class Setup:
         names = [p.name for p in self.robot.parameters if p.estimated and p.name not in self.tool]
         return replace(self, robot=self.robot.with_estimated([*names, *sorted(fitted)]))
 
-    def with_values(self, values: Floats) -> Setup:
-        """The set-up with other nominal values of the robot."""
-        return replace(self, robot=self.robot.with_values(values))
-
     def measuring(self, **changes: Any) -> Setup:
         """The set-up with other measurements."""
         return replace(self, table=replace(self.table, measurements=replace(self.table.measurements, **changes)))

@@ -88,27 +88,21 @@ class SetupCheck(Brief):
         return max((residual.excess for residual in self.residuals), default=0.0)
 
     @property
-    def worst(self) -> TypicalResidual:
-        """The kind with the largest excess."""
-        return max(self.residuals, key=lambda residual: residual.excess)
-
-    @property
     def far(self) -> bool:
         """Whether noise and prior sigmas do not predict these residuals."""
         return self.excess > FAR
 
     def __str__(self) -> str:
-        of_table = f"{self.table}: " if self.table else ""
+        worst = max(self.residuals, key=lambda residual: residual.excess)
+        words = f"{self.table}: {worst.kind} residuals" if self.table else f"{worst.kind} residuals"
         if not self.explanations:
             times = f"{self.excess:.3g} times what noise and prior sigmas predict"
-            found = f"{self.worst.kind} residuals before calibration are {shown(self.worst)} in the median, {times}"
-            return f"{of_table}{found}: no common mistake in a set-up explains it"
+            words += f" before calibration are {shown(worst)} in the median, {times}"
+            return f"{words}: no common mistake in a set-up explains it"
         first, *others = self.explanations
-        after = next(r for r in first.residuals if r.kind == self.worst.kind)
+        after = next(r for r in first.residuals if r.kind == worst.kind)
         also = "".join(f", or if {other}" for other in others[:2])
-        also += f", or {len(others) - 2} more (--json has all)" if len(others) > 2 else ""
-        fall = f"{self.worst.kind} residuals fall from {shown(self.worst)} to {shown(after)} in the median"
-        return f"{of_table}{fall} if {first}{also}"
+        return f"{words} fall from {shown(worst)} to {shown(after)} in the median if {first}{also}"
 
 
 def shown(residual: TypicalResidual) -> str:
@@ -150,7 +144,7 @@ def check_setup(
         setup = setup_of(robot, given)
         if setup is None or (setup.has_landmarks and not doubtful):
             return SetupCheck()
-        return _check_alone(setup, doubtful)
+        return _check_alone(setup, doubtful, SetupCheck())
 
 
 def check_problem(problem: Problem, before: Floats, *, doubtful: bool = False) -> SetupCheck:
@@ -188,10 +182,9 @@ def check_tables(
     with one_blas_thread:
         for number, (label, table) in enumerate(zip(labels, problem.data.tables, strict=True)):
             setup, one = setup_of(whole.robot, table), SetupCheck()
-            if setup is not None and setup.has_landmarks and with_landmarks:
-                one = _check_alone(setup, True)
-            elif setup is not None and not setup.has_landmarks and _enough(setup):
+            if setup is not None and not setup.has_landmarks:
                 together[number] = SetupCheck(residuals_at(whole, before, whole.robot, number))
+            if setup is not None and (with_landmarks or not setup.has_landmarks):
                 one = _check_alone(setup, doubtful, together[number])
             checks.append(replace(one, table=label if len(labels) > 1 else ""))
     if not reporting(checks):
@@ -202,23 +195,14 @@ def check_tables(
     return checks
 
 
-def _enough(setup: Setup) -> bool:
-    """Whether a table has enough rows to tell residuals from what is fitted to them."""
-    m, pairs = setup.table.measurements, setup.table.measurements.pairs
-    n_free = 6 * (setup.table.frame == "unknown") + len(setup.fitted_tool)
-    n_rows = pairs.n_pairs if pairs is not None and m.groups is None else 3 * m.n_configurations
-    return n_rows >= 2 * n_free + 6
-
-
-def _check_alone(setup: Setup, doubtful: bool, together: SetupCheck | None = None) -> SetupCheck:
+def _check_alone(setup: Setup, doubtful: bool, found: SetupCheck) -> SetupCheck:
     """The check of a table, and the mistakes that explain its residuals.
 
     Args:
         setup: The table.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
-        together: Its residuals with the base and the tool that all tables determine together.
+        found: Its residuals with the base and the tool that all tables determine together; empty if not known.
     """
-    found = together or SetupCheck()
     if not found.residuals or found.far or doubtful:
         alone = SetupCheck(nominal_residuals(setup))
         found = alone if not found.residuals or 0.0 < alone.excess < found.excess else found
@@ -254,8 +238,8 @@ def _doubles(single: Sequence[_Trial], given: float) -> list[_Trial]:
 
     for (one,), _ in sorted(single, key=lambda pair: left(pair[1]))[:N_COMBINED]:
         for two in setup_hypotheses(one.without):
-            words, what = frozenset((one.words, two.words)), [m.words.partition(" are in ")[0] for m in (one, two)]
-            if words not in found and what[0] != what[1]:
+            words = frozenset((one.words, two.words))
+            if words not in found:
                 found[words] = _trial(one, two)
     return [
         pair
@@ -316,12 +300,13 @@ def _robot_in_units(setup: Setup) -> _Found:
     robot = setup.robot
     in_m = np.array([parameter.unit == "m" for parameter in robot.parameters])
     reach = float(np.sum(np.abs(robot.nominal[in_m])))
-    far, has_angles = reach > MAX_REACH, robot.convention in CONVENTIONS and robot.nominal[~in_m].any()
-    for factor, unit in LENGTHS.items() if far or 0.0 < reach < MIN_REACH else ():
-        if (factor < 1.0) == far:
-            yield f"the robot's lengths are in {unit}", setup.with_values(robot.nominal * np.where(in_m, factor, 1.0))
-    for factor, unit in ANGLES.items() if has_angles else ():
-        yield f"the robot's angles are in {unit}", setup.with_values(robot.nominal * np.where(in_m, 1.0, factor))
+    for factor, unit in LENGTHS.items():
+        if not MIN_REACH <= reach <= MAX_REACH and MIN_REACH <= factor * reach <= MAX_REACH:
+            values = robot.nominal * np.where(in_m, factor, 1.0)
+            yield f"the robot's lengths are in {unit}", replace(setup, robot=robot.with_values(values))
+    for factor, unit in ANGLES.items() if robot.convention in CONVENTIONS and robot.nominal[~in_m].any() else ():
+        values = robot.nominal * np.where(in_m, 1.0, factor)
+        yield f"the robot's angles are in {unit}", replace(setup, robot=robot.with_values(values))
 
 
 def _measured_in_units(setup: Setup) -> _Found:
@@ -390,7 +375,6 @@ def _columns(setup: Setup) -> _Found:
             yield f"{'xyz'[k]} has the wrong sign", setup.measuring(position=m.position * (1.0 - 2.0 * np.eye(3)[k]))
     if image is not None:
         yield "columns u, v hold v, u", setup.measuring(image=image[:, [1, 0, 2, 3]])
-        yield "columns corner_x, corner_y hold y, x", setup.measuring(image=image[:, [0, 1, 3, 2]])
 
 
 ORIENTATIONS: dict[str, Callable[[Floats], Rotation]] = {
@@ -431,20 +415,16 @@ def _conventions(setup: Setup) -> _Found:
 
 
 def _joint_columns(setup: Setup) -> _Found:
-    """A joint in another unit, moving the other way, or a quarter or half a turn away; columns of joints exchanged."""
+    """A joint that moves the other way, or is a quarter or half a turn away; columns of joints exchanged."""
     q, joints = setup.table.measurements.readings, setup.robot.joints
     n, others = len(joints), dict[str, Floats]()
     for i, only in enumerate(np.eye(n)):
-        if sum(joint.prismatic == joints[i].prismatic for joint in joints) > 1:
-            yield from _in_units(setup, f"readings of joint {i + 1}", only > 0.0)
         others[f"joint {i + 1} moves the other way (the sign of its readings)"] = q * (1.0 - 2.0 * only)
         for degrees in () if joints[i].prismatic else (90, -90, 180):
             others[f"the zero of joint {i + 1} is off by {degrees} deg"] = q + np.deg2rad(degrees) * only
     for i, j in combinations(range(n), 2):
         order = [j if k == i else i if k == j else k for k in range(n)]
         others[f"the readings of joints {i + 1} and {j + 1} are exchanged"] = q[:, order]
-    if n > 3:
-        others["the joints are in the opposite order"] = q[:, ::-1]
     for words, readings in others.items():
         yield words, setup.measuring(readings=readings)
 

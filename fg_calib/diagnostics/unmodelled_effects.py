@@ -112,12 +112,6 @@ class LinearFit:
     fitted: Floats
     dof: int
 
-    @classmethod
-    def of(cls, columns: Floats, r: Floats, n: int) -> LinearFit:
-        """The fit of columns, shape (n_rows, m), to residuals of which noise can make n differ freely."""
-        fitted = basis_of(columns)
-        return cls(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1])
-
     def padded(self, columns: Floats) -> Floats:
         """Columns of the rows, shape (n_rows, m), of the priors too."""
         return np.pad(columns, ((0, len(self.r) - len(columns)), (0, 0)))
@@ -211,10 +205,7 @@ def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:
 
 
 def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
-    """Offsets of instruments that were not estimated and are significant; none of more rows than `MAX_ROWS`.
-
-    With a robust loss, which cuts residuals off, noise counts as specified at least.
-    """
+    """Offsets of instruments that were not estimated and are significant; none of more rows than `MAX_ROWS`."""
     problem, found = solution.problem, list[Offset]()
     if not _offsets(problem) or problem.n_residuals > MAX_ROWS or problem.has_more:
         return ()
@@ -224,8 +215,7 @@ def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
         p, _, after = fit.test(column[:, None])
         if p < P_VALUE:
             new = column - fit.fitted @ (fit.fitted.T @ column)
-            least = 1e-300 if problem.state.weights is None else 1.0
-            sigma = np.sqrt(max(float(after.r @ after.r) / after.dof, least) / float(new @ new))
+            sigma = np.sqrt(float(after.r @ after.r) / after.dof / float(new @ new))
             found.append(Offset(table, -float(new @ fit.r) / float(new @ new), float(sigma)))
     return tuple(found)
 
@@ -252,11 +242,8 @@ def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
         The fit, the columns of the rows, shape (n_rows, m), and their names, shape (m,).
     """
     problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
-    chains, core = with_link_motions(problem, solution.parameters)
-    offsets, errors = (
-        _offsets(problem),
-        [_joint_errors(problem.robot, t.measurements.readings) for t in problem.data.tables],
-    )
+    (chains, core), offsets = with_link_motions(problem, solution.parameters), _offsets(problem)
+    errors = [_joint_errors(problem.robot, t.measurements.readings) for t in problem.data.tables]
     columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)
     columns[list(offsets)] = len(core) + at.n_nuisance + np.arange(len(offsets))
     wide = replace(at, chains=chains, n_columns=len(core), columns=columns, n_nuisance=at.n_nuisance + len(offsets))
@@ -273,7 +260,8 @@ def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
     J_prior = np.pad(J_prior, ((0, 0), (0, problem.variables.n_nuisance)))
     n = problem.n_independent + len(r_prior) + len(r_unknown)
     columns = np.concatenate([J[:, ~more], J_prior, J_unknown])
-    return LinearFit.of(columns, np.concatenate([r[:, 0], r_prior, r_unknown]), n), J[:, more], all_names[more]
+    fitted, r = basis_of(columns), np.concatenate([r[:, 0], r_prior, r_unknown])
+    return LinearFit(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1]), J[:, more], all_names[more]
 
 
 def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:

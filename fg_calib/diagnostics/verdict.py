@@ -170,6 +170,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     noise_like = effects.probability_of_noise(solution) if tested and change is None else None
     case = Case(solution, spread, fit, missing, change, noise_like)
     statements = [statement for check in CHECKS for statement in check(case) if statement.applies]
+    statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
     doubts = any(s.severity == "error" for s in statements)
     if not problem.evaluated:
         much = any(kind.factor > MOST_ESTIMATED for kind in fit.goodness.kinds)
@@ -357,15 +358,9 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
         yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)
 
 
-def check_tables(case: Case) -> Iterator[Statement]:
-    """Check whether tables lack values that their model needs."""
-    for table in case.problem.data.tables:
-        yield from (Statement("note", text) for text in missing_values(table))
-
-
 CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (
     *(check_solver, check_change, check_fit, check_kept_noise, check_test_rows, check_priors, check_prior_scales),
-    *(check_signs, check_estimated_noise, check_tables),
+    *(check_signs, check_estimated_noise),
 )
 """The checks of every solution, in the order of their statements; for what comes before and after them see `judge`."""
 

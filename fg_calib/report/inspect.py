@@ -180,12 +180,13 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "tables": [the fields of `TableSurvey`], "joints": [the fields of `JointRange`, with "share" and "still"],
       "residuals": [{"table", "kind", "unit", "size", "expected", "excess", "n"}],
       "explanations": [{"table", "mistakes"}],
+      "disagreements": [{"name", "ratio", "test"}],
       "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded": {reason: count},
       "observability": as observability.json,
       "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
       "inputs": {path: sha256} }
     """
-    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "expected_error")
+    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "disagreements", "expected_error")
     counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
     document: dict[str, Any] = tables.plain(
         {

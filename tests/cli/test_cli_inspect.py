@@ -5,7 +5,7 @@ import json
 import pytest
 import yaml
 from jobs import ur5e, write_job
-from simulated import measure, true_robot
+from simulated import measure, plus, true_robot
 
 from fg_calib.report import inspection_document
 
@@ -82,7 +82,7 @@ def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
     shape = {
         "schema": str, "version": str, "robot": str, "ready": bool, "findings": list, "cautions": list,
         "evaluated": bool, "tables": list, "joints": list, "residuals": list, "explanations": list,
-        "n_residuals": int, "n_priors": int, "n_unknowns": int, "dof": int,
+        "disagreements": list,         "n_residuals": int, "n_priors": int, "n_unknowns": int, "dof": int,
         "n_excluded": dict, "observability": dict, "expected_error": dict, "inputs": dict,
     }  # fmt: skip
     assert {key: type(value) for key, value in found.items()} == shape
@@ -99,13 +99,13 @@ def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
 def test_json_of_a_job_with_findings_has_them(fg_calib, job):
     from dataclasses import replace
 
-    ended = fg_calib("inspect", job(lambda m: replace(m, position=m.position * 1e3)), "--json")
+    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, [4], 0.05))), "--json")
     assert ended.code == 3
     found = json.loads(ended.out, parse_constant=_refuse)
     assert not found["ready"]
     assert len(found["findings"]) == 1
-    (one,) = found["explanations"]
-    assert one == {"table": "", "mistakes": ["x, y, z are in mm, not m"]}
+    (one,) = found["disagreements"]
+    assert (one["name"], one["test"]) == ("4", False)
 
 
 def test_bad_input_is_the_line_that_calibrate_gives(fg_calib, example):

@@ -50,7 +50,6 @@ def wxyz(m):
 SPOILT = {
     "x, y, z are in mm, not m": lambda m: replace(m, position=m.position * 1e3),
     "x, y, z are in m, not mm": lambda m: replace(m, position=m.position * 1e-3),
-    "readings of joint 3 are in deg, not rad": lambda m: replace(m, readings=m.readings * only(3, 180 / np.pi, 1)),
     "joint readings are in deg, not rad": lambda m: replace(m, readings=np.rad2deg(m.readings)),
     "joint readings are in rad, not deg": lambda m: replace(m, readings=np.deg2rad(m.readings)),
     "the poses are inverted": inverted,
@@ -60,7 +59,6 @@ SPOILT = {
     "z has the wrong sign": lambda m: replace(m, position=m.position * [1, 1, -1]),
     "joint 2 moves the other way": lambda m: replace(m, readings=m.readings * only(2, -1, 1)),
     "the readings of joints 2 and 3 are exchanged": lambda m: exchanged(m, 2, 3),
-    "the joints are in the opposite order": lambda m: replace(m, readings=m.readings[:, ::-1]),
     "the zero of joint 2 is off by 90 deg": lambda m: replace(m, readings=m.readings - only(2, np.pi / 2)),
 }
 """Mistakes in a table: how they are named, and how they are made."""
