@@ -39,7 +39,7 @@ from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
-from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, RowModel, square_root
+from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel, square_root
 from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
 
 Codes = NDArray[np.int8]
@@ -383,12 +383,9 @@ class RowStatistics:
     """
 
     def __init__(self, solution: Solution, spread: Spread, table: ResidualTable) -> None:
-        problem = solution.problem
+        problem, noises = solution.problem, solution.noises
         self.solution, self.spread, self.table = solution, spread, table
-        self.robust, self._shared = (
-            problem.state.weights is not None,
-            any(noise.loading.shape[2] for noise in solution.noises),
-        )
+        self.robust, self._shared = problem.state.weights is not None, any(n.loading.shape[2] for n in noises)
         self.weight: Floats = np.ones(table.n) if self.robust else np.broadcast_to(1.0, table.n)
         for number, weights in enumerate(problem.state.weights or ()):
             mine = table.rows_of(number)
@@ -397,7 +394,8 @@ class RowStatistics:
         known = len(fitted) <= (MAX_KEPT if self._shared else MAX_INDEPENDENT)
         known &= not (self.robust or problem.missing_correlation)
         keep = (table.used & known) | (table.test & (len(test) <= MAX_KEPT))
-        kept, of_kept = np.flatnonzero(keep), self._read(keep)
+        self._model = RowModel(problem, solution.parameters, noises)
+        self._kept, self._errors = np.flatnonzero(keep), self._read(keep)
         w = self.weight
         variance = np.where(table.used, 1.0 - 2.0 * w, 1.0)  # in place, as of a million rows each array counts
         variance *= self.leverage
@@ -406,23 +404,26 @@ class RowStatistics:
             self.studentised: Floats = table.after / (table.sigma * np.sqrt(np.maximum(variance, 1e-12)))
             squares = (table.after / table.sigma) ** 2
         self.studentised[variance < LEAST_VARIANCE] = np.nan
-        covariance = of_kept.at(np.searchsorted(kept, fitted)).fitted(spread.tangent) if known else None
+        covariance = self._of(fitted).with_errors(-self._model.of_all(spread.tangent)) if known else None
         chosen = slice(None) if len(fitted) == table.n else fitted
         of_fitted, means = w[chosen] * squares[chosen], w[chosen] * variance[chosen]
         self.fitted = JudgedRows(table, fitted, of_fitted, means, covariance, self._shared)
-        self.predicted = self._predict(test, squares[test], kept, of_kept)
+        self.predicted = self._predict(test, squares[test])
 
-    def _read(self, keep: Booleans) -> RowErrors:
+    def _of(self, rows: Integers) -> ResidualCovariance:
+        """What some of the kept rows follow from, over sigma."""
+        return self._errors.at(np.searchsorted(self._kept, rows))
+
+    def _read(self, keep: Booleans) -> ResidualCovariance:
         """Leverage of every row; what the rows to keep follow from, over sigma."""
-        table, tangent, noises = self.table, self.spread.tangent, self.solution.noises
-        model = RowModel(self.solution.problem, self.solution.parameters, noises)
+        table, tangent, model = self.table, self.spread.tangent, self._model
         self.leverage: Floats = np.full(table.n, np.nan)
-        kept, root, asked = [model.empty()], square_root(tangent), keep | table.test
-        for number, noise in enumerate(noises):
+        kept, root, asked, T = [model.empty()], square_root(tangent), keep | table.test, model.of_all(tangent)
+        for number, noise in enumerate(self.solution.noises):
             measured, last = noise.series.measured, table.rows_of(number).start
             step = _CHUNK if model.is_plain(number) else _CHUNK_WITH_STATES
             for start in range(0, noise.series.n, step):
-                chunk = slice(start, min(start + step, noise.series.n))
+                chunk = np.arange(start, min(start + step, noise.series.n))
                 first, last = last, last + int(np.sum(measured[chunk]))
                 rows = slice(first, last)
                 if model.is_plain(number) and not asked[rows].any():
@@ -430,16 +431,13 @@ class RowStatistics:
                     of_rows = (squares + noise.variance[chunk])[measured[chunk]]
                     self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
                     continue
-                found = model.errors(number, np.arange(chunk.start, chunk.stop))
-                found = found.at(np.flatnonzero(measured[chunk])).over(table.sigma[rows])
-                self.leverage[rows] = (
-                    np.einsum("ij,ij->i", found.J @ found.of_all(tangent), found.J) + found.noise - 1.0
-                )
-                lost = table.test[rows] & np.isnan(self.spread.variance(found.J[:, : len(tangent)]))
+                found = model.errors(number, chunk).at(np.flatnonzero(measured[chunk])).over(table.sigma[rows])
+                self.leverage[rows] = found.with_errors(T).diagonal - 1.0
+                lost = table.test[rows] & np.isnan(self.spread.variance(found.P[:, : len(tangent)]))
                 self.leverage[rows][lost] = np.nan
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
-        return RowErrors.joined(kept)
+        return ResidualCovariance.joined(kept)
 
     def fit_kinds(self) -> tuple[KindFit, ...]:
         """The fit of the fitted rows by kind."""
@@ -536,14 +534,12 @@ class RowStatistics:
             variance[self.table.rows_of(number)] = np.sum(of_joints**2, axis=2)[noise.series.measured]
         return variance
 
-    def _predict(self, test: Integers, squares: Floats, kept: Integers, of_kept: RowErrors) -> JudgedRows:
+    def _predict(self, test: Integers, squares: Floats) -> JudgedRows:
         """The predicted rows that can be judged: those known, and no outliers.
 
         Args:
             test: Predicted rows of the table.
             squares: Their squared residuals over sigma.
-            kept: Rows of the table that `of_kept` is of.
-            of_kept: What these follow from.
         """
         table = self.table
         judged = np.isfinite(self.leverage[test]) & ~(self.leverage[test] < LEAST_VARIANCE - 1.0)
@@ -552,10 +548,11 @@ class RowStatistics:
             judged &= ~np.isin(table.measurement_number[test], table.measurement_number[far])
         rows = test[judged]
         means, covariance = 1.0 + self.leverage[rows], None
-        if np.isin(rows, kept).all():
-            errors, of = of_kept.at(np.searchsorted(kept, rows)), (self.spread.tangent, self.spread.actual)
-            means = errors.predicted(*of).diagonal
-            covariance = errors.over(np.sqrt(means)).predicted(*of)
+        if np.isin(rows, self._kept).all():
+            K, T = self._model.of_all(self.spread.actual), self._model.of_all(self.spread.tangent)
+            predicted = self._of(rows).with_errors(K, T)
+            means = predicted.diagonal
+            covariance = predicted.over(np.sqrt(means))
             with np.errstate(invalid="ignore"):
                 self.studentised[rows] = table.after[rows] / (table.sigma[rows] * np.sqrt(means))
         return JudgedRows(table, rows, squares[judged] / means, np.ones(len(rows)), covariance, self._shared)

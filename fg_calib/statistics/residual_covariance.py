@@ -8,11 +8,11 @@ estimate is off, and -T F^T its covariance with the errors of configurations tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse
+from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
 from fg_calib.graph import PRIVATE_SHARE, Problem, RowNoise, at_parameters, felt, linear_system, reach, says_where
@@ -31,9 +31,11 @@ class ResidualCovariance:
     """Covariance `D + L L^T + P M P^T` of rows.
 
     Attributes:
-        d: Diagonal of D, shape (n,).
-        L: Sparse, shape (n, n_errors).
-        P: Shape (n, k).
+        d: Diagonal of D, the variance of private noise, shape (n,).
+        L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
+        P: Derivatives in the core, landmarks following it, then in the landmarks' errors of 1 sigma at a given core.
+            Where fitted and predicted rows share errors, then also `L F^T`, F what the fit made of those errors (see
+            `graph.felt`). Shape (n, k).
         M: Symmetric, shape (k, k).
     """
 
@@ -49,15 +51,41 @@ class ResidualCovariance:
         return out
 
     def at(self, rows: Integers) -> ResidualCovariance:
-        """The part at some rows; errors of more than one in `FEW` of them are columns of P."""
-        L = self.L[rows]
-        many = FEW * np.bincount(L.indices, minlength=L.shape[1]) > len(rows)
-        M = scipy.linalg.block_diag(self.M, np.eye(int(many.sum())))
-        return ResidualCovariance(self.d[rows], L[:, ~many], np.hstack([self.P[rows], L[:, many].toarray()]), M)
+        """The part at some rows."""
+        return ResidualCovariance(self.d[rows], self.L[rows], self.P[rows], self.M)
+
+    def over(self, sigma: Floats) -> ResidualCovariance:
+        """The covariance of rows divided by their sigma, shape (n,)."""
+        L = Sparse(
+            (self.L.data / np.repeat(sigma, np.diff(self.L.indptr)), self.L.indices, self.L.indptr), shape=self.L.shape
+        )
+        return ResidualCovariance(self.d / sigma**2, L, self.P / sigma[:, None], self.M)
+
+    @staticmethod
+    def joined(parts: Sequence[ResidualCovariance]) -> ResidualCovariance:
+        """Several groups of rows, one after the other, M still open."""
+        d, P = np.concatenate([part.d for part in parts]), np.concatenate([part.P for part in parts])
+        return ResidualCovariance(d, Sparse(scipy.sparse.vstack([part.L for part in parts])), P, np.zeros((0, 0)))
+
+    def with_errors(self, K: Floats, T: Floats | None = None) -> ResidualCovariance:
+        """The rows with M by the covariance of the estimate's errors.
+
+        Args:
+            K: Minus their covariance of fitted rows, their covariance of predicted ones (see `RowModel.of_all`).
+            T: The covariance by the noise that rows are weighted by, where the estimate felt errors of these rows.
+        """
+        felt_, n = np.zeros_like(K) if T is None else -T, self.P.shape[1]
+        return replace(self, M=np.block([[K, felt_], [felt_, np.zeros_like(K)]])[:n, :n])
+
+    def split(self) -> ResidualCovariance:
+        """The same covariance with errors of more than one in `FEW` rows among the columns of P."""
+        many = FEW * np.bincount(self.L.indices, minlength=self.L.shape[1]) > len(self.d)
+        P, M = np.hstack([self.P, self.L[:, many].toarray()]), block_diag(self.M, np.eye(int(many.sum())))
+        return ResidualCovariance(self.d, self.L[:, ~many], P, M)
 
     def moments(self, rows: Integers) -> tuple[float, float]:
         """Trace, and trace of the square, of the part at some rows."""
-        part = self.at(rows)
+        part = self.at(rows).split()
         d, L, P, M, variances = part.d, part.L, part.P, part.M, part.diagonal
         gram, PMP, LP = L @ L.T if L.shape[0] < L.shape[1] else L.T @ L, P.T @ P @ M, L.T @ P
         square = d @ (2.0 * variances - d) + gram.power(2).sum() + 2.0 * np.vdot(LP @ M, LP) + np.vdot(PMP, PMP.T)
@@ -72,8 +100,8 @@ class ResidualCovariance:
             z: The residuals, shape (n_rows,).
             rows: Which.
         """
-        part, noise = self.at(rows), self.d[rows] + row_squares(self.L[rows])
-        d = np.maximum(part.d, PRIVATE_SHARE * noise)
+        whole = self.at(rows)
+        part, d = whole.split(), np.maximum(whole.d, PRIVATE_SHARE * (whole.d + row_squares(whole.L)))
         T = (part.L @ part.L.T + scipy.sparse.diags_array(d)).tocsr()
         dense, columns = T.toarray(), np.column_stack([part.P, z])
         weighed, variances = np.empty(columns.shape), np.empty(len(z))
@@ -88,71 +116,6 @@ class ResidualCovariance:
         G = part.M @ np.linalg.inv(np.eye(V.shape[1]) + part.P.T @ V @ part.M)  # C^-1 = T^-1 - V G V^T
         lost = (d - part.d) @ (variances - np.einsum("ij,ij->i", V @ G, V))
         return float(z @ Tz - (V.T @ z) @ G @ (V.T @ z)), float(len(z) - lost)
-
-
-@dataclass(frozen=True)
-class RowErrors:
-    """What rows follow from.
-
-    Attributes:
-        J: Derivatives in the core, landmarks following it, then in the landmarks' errors of 1 sigma at a given core,
-            shape (n, n_columns + n_landmark_errors).
-        private: Variance of each row's private noise, shape (n,).
-        L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
-        felt: `L M^T`, M what the fit made of those errors (see `graph.felt`), shape of J; no columns where fitted and
-            predicted rows share none.
-    """
-
-    J: Floats
-    private: Floats
-    L: Sparse
-    felt: Floats
-
-    @property
-    def noise(self) -> Floats:
-        """Variance of rows by noise alone, shape (n,)."""
-        return self.private + row_squares(self.L)
-
-    def at(self, rows: Integers) -> RowErrors:
-        """What some of the rows follow from."""
-        return RowErrors(*(getattr(self, f.name)[rows] for f in fields(self)))
-
-    def over(self, sigma: Floats) -> RowErrors:
-        """What rows divided by their sigma, shape (n,), follow from."""
-        s, L = sigma[:, None], self.L
-        L = Sparse((L.data / np.repeat(sigma, np.diff(L.indptr)), L.indices, L.indptr), shape=L.shape)
-        return RowErrors(self.J / s, self.private / sigma**2, L, self.felt / s)
-
-    @staticmethod
-    def joined(parts: Sequence[RowErrors]) -> RowErrors:
-        """What several groups of rows, one after the other, follow from."""
-        J, private, felt_ = (np.concatenate([getattr(p, name) for p in parts]) for name in ("J", "private", "felt"))
-        return RowErrors(J, private, Sparse(scipy.sparse.vstack([part.L for part in parts])), felt_)
-
-    def of_all(self, covariance: Floats) -> Floats:
-        """The covariance of core and landmarks' errors, of that of the core: shape (n_all, n_all)."""
-        return scipy.linalg.block_diag(covariance, np.eye(self.J.shape[1] - len(covariance)))
-
-    def fitted(self, tangent: Floats) -> ResidualCovariance:
-        """Covariance of fitted rows.
-
-        Args:
-            tangent: T, the covariance of the core.
-        """
-        return ResidualCovariance(self.private, self.L, self.J, -self.of_all(tangent))
-
-    def predicted(self, tangent: Floats, actual: Floats) -> ResidualCovariance:
-        """Covariance of predicted rows, whose errors the estimate may have felt.
-
-        Args:
-            tangent: T, the covariance of the core by the noise that rows are weighted by.
-            actual: K, its covariance.
-        """
-        T, K = self.of_all(tangent), self.of_all(actual)
-        if not self.felt.shape[1]:
-            return ResidualCovariance(self.private, self.L, self.J, K)
-        M = np.block([[K, -T], [-T, np.zeros_like(T)]])
-        return ResidualCovariance(self.private, self.L, np.hstack([self.J, self.felt]), M)
 
 
 class RowModel:
@@ -206,22 +169,26 @@ class RowModel:
         """The chain of a block at the estimate."""
         return self._at.chains[self._noises[number].series.table]
 
-    def empty(self) -> RowErrors:
-        """What no rows follow from."""
+    def empty(self) -> ResidualCovariance:
+        """No rows."""
         n = self._follow.shape[1]
-        felt_ = np.zeros((0, n if len(self._common) else 0))
-        return RowErrors(np.zeros((0, n)), np.zeros(0), Sparse((0, int(self._first[-1]))), felt_)
+        P = np.zeros((0, 2 * n if len(self._common) else n))
+        return ResidualCovariance(np.zeros(0), Sparse((0, int(self._first[-1]))), P, np.zeros((0, 0)))
 
-    def errors(self, number: int, rows: Integers) -> RowErrors:
-        """What the rows of some measurements of a block follow from."""
+    def of_all(self, covariance: Floats) -> Floats:
+        """The covariance of core and landmarks' errors, of that of the core: shape (n_all, n_all)."""
+        return block_diag(covariance, np.eye(self._follow.shape[1] - self._n))
+
+    def errors(self, number: int, rows: Integers) -> ResidualCovariance:
+        """What the rows of some measurements of a block follow from; M is still open."""
         core, private, L, N = self._given_landmarks(number, rows)
-        J = np.pad(core, ((0, 0), (0, self._follow.shape[1] - self._n)))
+        P = np.pad(core, ((0, 0), (0, self._follow.shape[1] - self._n)))
         if N.shape[1]:
-            nowhere = np.repeat(self._nowhere[number][rows], len(J) // max(len(rows), 1))
-            J = J + np.where(nowhere, np.nan, 0.0)[:, None] + N @ self._follow
+            nowhere = np.repeat(self._nowhere[number][rows], len(P) // max(len(rows), 1))
+            P = P + np.where(nowhere, np.nan, 0.0)[:, None] + N @ self._follow
             L = L + N @ self._averaged
-        felt_ = L[:, self._common] @ self._felt.T if len(self._common) else np.zeros((len(J), 0))
-        return RowErrors(J, private, L, felt_)
+        P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
+        return ResidualCovariance(private, L, P, np.zeros((0, 0)))
 
     def _given_landmarks(self, number: int, rows: Integers) -> tuple[Floats, Floats, Sparse, Sparse]:
         """J, private variance and L of rows were their landmarks known; derivatives in these, sparse.

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import scipy.sparse
+from scipy.linalg import block_diag
 
 from fg_calib.graph import PRIVATE_SHARE
-from fg_calib.statistics.residual_covariance import ResidualCovariance, RowErrors, square_root
+from fg_calib.statistics.residual_covariance import ResidualCovariance, square_root
 
 N = 60
 
@@ -50,14 +51,14 @@ def test_fitted_rows_vary_by_their_noise_minus_what_the_estimate_takes_up():
     rng = np.random.default_rng(4)
     J, own = rng.normal(size=(N, 5)), 0.1 * rng.normal(size=(N, 2))
     L = scipy.sparse.csr_array(np.kron(np.eye(N // 4), np.ones((4, 1))) * rng.uniform(0.5, 1.0, (N, 1)))
-    errors = RowErrors(np.hstack([J, own]), rng.uniform(0.5, 1.0, N), L, np.zeros((N, 0)))
-    C, sigma = np.diag(errors.private) + (L @ L.T).toarray(), rng.uniform(0.5, 2.0, N)
+    rows = ResidualCovariance(rng.uniform(0.5, 1.0, N), L, np.hstack([J, own]), np.zeros((0, 0)))
+    C, sigma = np.diag(rows.d) + (L @ L.T).toarray(), rng.uniform(0.5, 2.0, N)
     T = np.linalg.inv(J.T @ np.linalg.inv(C) @ J)
     expected = C - J @ T @ J.T - own @ own.T
-    np.testing.assert_allclose(dense(errors.fitted(T)), expected, rtol=1e-10, atol=1e-12)
-    over = dense(errors.over(sigma).fitted(T))
-    np.testing.assert_allclose(over, expected / np.outer(sigma, sigma), rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(errors.noise, np.diag(C))
+    fitted = rows.with_errors(-block_diag(T, np.eye(2)))
+    np.testing.assert_allclose(dense(fitted), expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(dense(fitted.over(sigma)), expected / np.outer(sigma, sigma), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(dense(fitted.split()), expected, rtol=1e-10, atol=1e-12)
 
 
 def test_predicted_rows_are_correlated_with_the_estimate_by_the_errors_that_they_share():
@@ -68,7 +69,8 @@ def test_predicted_rows_are_correlated_with_the_estimate_by_the_errors_that_they
     W = np.linalg.inv(C[np.ix_(fit, fit)])
     T = np.linalg.inv(J[fit].T @ W @ J[fit])
     M = J[fit].T @ W @ L[fit]
-    errors = RowErrors(J[new], np.ones(N // 2), scipy.sparse.csr_array(L[new]), L[new] @ M.T)
+    P = np.hstack([J[new], L[new] @ M.T])
+    rows = ResidualCovariance(np.ones(N // 2), scipy.sparse.csr_array(L[new]), P, np.zeros((0, 0)))
     moved = np.hstack([-J[new] @ T @ J[fit].T @ W, np.eye(N // 2)])
-    np.testing.assert_allclose(dense(errors.predicted(T, T)), moved @ C @ moved.T, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(dense(rows.with_errors(T, T)), moved @ C @ moved.T, rtol=1e-9, atol=1e-11)
     np.testing.assert_allclose(square_root(T) @ square_root(T).T, T, rtol=1e-10)
