@@ -291,12 +291,8 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
     rows = RowStatistics(solution, spread, table)
     level = suspect_level(int(np.sum(table.reason_code == 0)))
     with np.errstate(invalid="ignore"):
-        suspicious = np.abs(rows.studentised) > level
-    flag = np.zeros(table.n, dtype=np.int8)
-    flag[suspicious] = FLAGS.index("suspect")
-    flag[rows.weight < OUTLIER_WEIGHT] = FLAGS.index("outlier")
-    flag[table.test] = FLAGS.index("test")
-    flag[table.reason_code != 0] = FLAGS.index("excluded")
+        suspect, outlier = np.abs(rows.studentised) > level, rows.weight < OUTLIER_WEIGHT
+    which = {"excluded": table.reason_code != 0, "test": table.test, "outlier": outlier, "suspect": suspect}
 
     def worst_first(chosen: Booleans) -> Integers:
         found = np.flatnonzero(chosen)
@@ -307,11 +303,11 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
         leverage=rows.leverage,
         studentised=rows.studentised,
         weight=rows.weight,
-        flag=flag,
+        flag=np.select(list(which.values()), [np.int8(FLAGS.index(name)) for name in which], np.int8(0)),
         level=level,
-        suspects=worst_first((flag == FLAGS.index("suspect")) | (flag == FLAGS.index("outlier"))),
+        suspects=worst_first(table.used & (suspect | outlier)),
         configurations=rows.fitted.suspect_configurations() if not rows.robust else (),
-        test=rows.fit_predicted(worst_first(suspicious & (flag == FLAGS.index("test")))),
+        test=rows.fit_predicted(worst_first(suspect & table.test & (table.reason_code == 0))),
     )
 
 

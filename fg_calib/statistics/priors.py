@@ -65,7 +65,6 @@ from fg_calib.graph import (
     eliminate,
     linear_system,
     prior_rows,
-    relinearized_at,
     solve,
     unknown_prior_rows,
     with_factors,
@@ -74,11 +73,10 @@ from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, SharedScale,
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
+from fg_calib.statistics.variance_components import settle
 
 SETTLED = 1e-3
 """Relative change of a scale below which it has settled: a hundredth of what it is known to at best."""
-
-MAX_ROUNDS = 30
 
 COMMON_SIGMA, GROUP_SIGMA = float(np.log(5.0)), float(np.log(3.0))
 """Prior sigma of the logarithm of a scale: of all together, and of each group."""
@@ -121,31 +119,17 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
         return solve_with(problem)
     groups, group = _groups_of(problem.robot, parameters, by)
     members = tuple(tuple(p.name for p, k in zip(parameters, group, strict=True) if k == j) for j in range(len(groups)))
-    scale, step, seconds, now = np.ones(len(groups)), np.zeros(len(groups)), 0.0, problem
-    for _ in range(MAX_ROUNDS):
-        solution = solve_with(now)
-        seconds += solution.seconds
-        corrections, follow = _corrections(solution, specified, scale[group], group)
+
+    def refit(theta: Floats) -> tuple[Solution, Floats, tuple[Floats, EstimatedScales, Floats]]:
+        solution = solve_with(_with_scales(problem, by, dict(zip(groups, np.exp(theta).tolist(), strict=True))))
+        corrections, follow = _corrections(solution, specified, np.exp(theta)[group], group)
         found = fit_scales(corrections)
-        wanted, half = found.mean.theta - np.log(scale), 0.5 * np.abs(step)
-        step = np.where(wanted * step < 0.0, np.clip(wanted, -half, half), wanted)
-        moves = float(np.abs(step).max())
-        if moves < SETTLED:
-            break
-        scale = scale * np.exp(step)
-        noise = replace(problem.state, factors=solution.problem.state.factors)
-        now = _with_scales(
-            relinearized_at(problem, problem.start, noise), by, dict(zip(groups, scale.tolist(), strict=True))
-        )
-    low, high = np.exp(found.interval)
-    figures = (v.tolist() for v in (scale, low, high, found.mean.determined))
+        return solution, found.mean.theta - theta, (theta, found, follow)
+
+    solution, (theta, found, follow) = settle(refit, len(groups), SETTLED, "tolerances")
+    figures = (v.tolist() for v in (*np.exp([theta, *found.interval]), found.mean.determined))
     scales = tuple(ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
-    estimated = ToleranceScales(scales, follow @ found.added_covariance @ follow.T)
-    solution = replace(solution, estimated_tolerances=estimated, seconds=seconds)
-    if moves < SETTLED or not solution.converged:
-        return solution
-    message = f"not converged: the estimated tolerances still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
-    return replace(solution, converged=False, message=message)
+    return replace(solution, estimated_tolerances=ToleranceScales(scales, follow @ found.added_covariance @ follow.T))
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,9 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse
@@ -112,13 +113,7 @@ def has_joint_noise(problem: Problem) -> bool:
 def noise_components(solution: Solution) -> NoiseComponents:
     """How much noise of each origin the residuals of a solution show."""
     problem = solution.problem
-    kinds = {
-        (noise.series.table, family): None
-        for noise in problem.noises
-        if noise.series.used[noise.series.train].any()
-        for family in _families(noise)
-    }
-    names = (*kinds, JOINT_NOISE) if has_joint_noise(problem) else tuple(kinds)
+    names = _origins(problem)
     system, roots = linear_system(problem, solution.parameters), [_root(problem, name) for name in names]
     u = system.weighted_residual / np.sqrt(_robust_weights(problem))
     squares = np.array([np.sum((E.T @ u) ** 2) for E in roots])
@@ -133,6 +128,13 @@ def noise_components(solution: Solution) -> NoiseComponents:
     squares, expected = np.maximum(squares, TINY), np.maximum(expected, TINY)
     work = np.column_stack([E @ (E.T @ u) for E in roots]) / np.sqrt(squares / expected)
     return NoiseComponents(names, squares, expected, work.T @ system.project(work))
+
+
+def _origins(problem: Problem) -> tuple[NoiseName, ...]:
+    """Tables and kinds of the fitted rows, then the joint readings."""
+    fitted = [noise for noise in problem.noises if noise.series.used[noise.series.train].any()]
+    kinds = dict.fromkeys((noise.series.table, family) for noise in fitted for family in _families(noise))
+    return (*kinds, JOINT_NOISE) if has_joint_noise(problem) else tuple(kinds)
 
 
 def _families(noise: RowNoise) -> list[str]:
@@ -220,45 +222,66 @@ def _is_indeterminate(found: NoiseComponents, name: NoiseName, estimated: Sequen
 def _settle(
     problem: Problem, options: SolverOptions | None, kept: frozenset[NoiseName]
 ) -> tuple[Solution, dict[NoiseName, float]]:
-    """Solve and scale the noise until its components are as expected; steps back are at most half of the last one.
+    """Solve and scale the noise until its components are as expected.
 
     Returns:
         The solution, not converged where the factors have not settled, and the degrees of freedom of each origin that
         was estimated, next to the others.
     """
-    seconds, last = 0.0, dict[NoiseName, float]()
-    for _ in range(MAX_ROUNDS):
-        solution = solve(problem, options)
-        seconds += solution.seconds
+    names, factors = _origins(problem), problem.state.factors
+
+    def refit(theta: Floats) -> tuple[Solution, Floats, NoiseComponents]:
+        now = {name: factors.get(name, 1.0) * float(np.exp(t)) for name, t in zip(names, theta, strict=True)}
+        solution = solve(_scaled(problem, now), options)
         found = noise_components(solution)
-        steps = _steps(found, kept)
-        solution = replace(solution, estimated_noise=tuple(steps), seconds=seconds)
-        for name, step in steps.items():
-            half = 0.5 * abs(last.get(name, 0.0))
-            steps[name] = float(np.clip(step, -half, half)) if step * last.get(name, 0.0) < 0.0 else step
-        moves = max(map(abs, steps.values()), default=0.0)
-        if moves < SETTLED:
+        return solution, _steps(found, kept), found
+
+    solution, found = settle(refit, len(names), SETTLED, "noise")
+    free = np.flatnonzero(_is_estimated(found, kept)).tolist()
+    degrees = {names[i]: found.degrees(i, np.array(free)) for i in free}
+    return replace(solution, estimated_noise=tuple(degrees)), degrees
+
+
+def settle(
+    refit: Callable[[Floats], tuple[Solution, Floats, Any]], n: int, settled: float, what: str
+) -> tuple[Solution, Any]:
+    """Refit with other factors until they settle; steps back are at most half of the last one.
+
+    Args:
+        refit: Returns the solution by the logarithms of the factors, their step, and what else is asked of the last.
+        n: Number of factors.
+        settled: Step of the logarithms from which on they have settled.
+        what: The factors are on, for the message where they do not settle.
+    """
+    theta, step, seconds = np.zeros(n), np.zeros(n), 0.0
+    for _ in range(MAX_ROUNDS):
+        solution, wanted, rest = refit(theta)
+        seconds += solution.seconds
+        half = 0.5 * np.abs(step)
+        step = np.where(wanted * step < 0.0, np.clip(wanted, -half, half), wanted)
+        moves = float(np.abs(step).max(initial=0.0))
+        if moves < settled:
             break
-        factors = problem.state.factors
-        last, problem = steps, _scaled(problem, {n: factors.get(n, 1.0) * float(np.exp(s)) for n, s in steps.items()})
+        theta = theta + step
     else:
-        message = f"not converged: the estimated noise still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
+        message = f"not converged: the estimated {what} still moved by {moves:.1g} after {MAX_ROUNDS} rounds"
         solution = replace(solution, converged=False, message=message if solution.converged else solution.message)
-    free = np.array([found.names.index(name) for name in steps], dtype=np.int64)
-    return solution, {name: found.degrees(i, free) for name, i in zip(steps, free.tolist(), strict=True)}
+    return replace(solution, seconds=seconds), rest
 
 
-def _steps(found: NoiseComponents, kept: frozenset[NoiseName]) -> dict[NoiseName, float]:
-    """Steps of the logarithms of the factors, of the origins whose noise is estimated."""
-    joint, q, t = JOINT_NOISE in found.names, found.squares, found.expected
-    estimated = np.array(
-        [n not in kept and (joint or e >= LEAST_REDUNDANCY) for n, e in zip(found.names, t, strict=True)]
-    )
-    free = np.flatnonzero(estimated & ~((q < t) & (t < NEGLIGIBLE)))
+def _is_estimated(found: NoiseComponents, kept: frozenset[NoiseName]) -> Booleans:
+    """Whose noise is estimated: without joint noise what has redundancy enough."""
+    enough = (JOINT_NOISE in found.names) | (found.expected >= LEAST_REDUNDANCY)
+    return enough & np.array([name not in kept for name in found.names], dtype=np.bool_)
+
+
+def _steps(found: NoiseComponents, kept: frozenset[NoiseName]) -> Floats:
+    """Steps of the logarithms of the factors; 0 of those that are not estimated."""
+    q, t = found.squares, found.expected
+    free = np.flatnonzero(_is_estimated(found, kept) & ~((q < t) & (t < NEGLIGIBLE)))
     step = np.zeros(len(t))
     step[free] = _solve(found.information[np.ix_(free, free)], (0.5 * t * np.log(q / t))[free])
-    step = np.clip(step, -MAX_STEP, MAX_STEP)
-    return {name: float(s) for name, s, of in zip(found.names, step, estimated, strict=True) if of}
+    return np.clip(step, -MAX_STEP, MAX_STEP)
 
 
 def _solve(T: Floats, b: Floats) -> Floats:
