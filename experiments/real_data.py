@@ -92,7 +92,7 @@ def ur10_poses(task: Task) -> Row:
     table = found.assessment.fit.residuals
     row = fit_result(found)
     for kind in ("position", "orientation"):
-        chosen = table.test & np.char.startswith(table.kind, kind)
+        chosen = table.test & (table.family == table.families.index(kind))
         for when in ("before", "after"):
             norms = np.linalg.norm(getattr(table, when)[chosen].reshape(-1, 3), axis=1)
             row |= {f"{kind} {when}": rms(norms), f"{kind} {when}, norms": norms.tolist()}

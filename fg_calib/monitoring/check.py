@@ -158,12 +158,7 @@ def _too_few(rows: Linear) -> str:
 
 
 def _judge(
-    at: Linear,
-    limits: Limits,
-    found: list[HypothesisTest],
-    likely: list[HypothesisTest],
-    gross: list[str],
-    few: str,
+    at: Linear, limits: Limits, found: list[HypothesisTest], likely: list[HypothesisTest], gross: list[str], few: str
 ) -> Check:
     calibrated = at.placed.calibrated
     held = at.placed.errors()
@@ -245,11 +240,7 @@ def _reasons(
     excess = float(np.sqrt(at.chi2 / at.dof))
     if change is not None:
         sizes = dict(
-            zip(
-                ("orientation", "position"),
-                hypotheses.rms_motion(hypotheses.motion(at, change)).tolist(),
-                strict=True,
-            )
+            zip(("orientation", "position"), hypotheses.rms_motion(hypotheses.motion(at, change)).tolist(), strict=True)
         )
         far = [kind for kind, size in sizes.items() if size > limits.get(kind, np.inf)]
         where = f"; over the whole workspace {_shown(sizes[far[0]], far[0])} RMS" if far else ""

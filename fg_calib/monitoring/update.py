@@ -15,13 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fg_calib.graph import (
-    Knowledge,
-    Problem,
-    Solution,
-    kept_of,
-    solve,
-)
+from fg_calib.graph import Knowledge, Problem, Solution, kept_of, solve
 from fg_calib.inputs import NEAR, Floats, InputError, ProblemError, did_you_mean, known_names
 from fg_calib.measurements import TARGET, build_dataset
 from fg_calib.monitoring.hypotheses import named_changes

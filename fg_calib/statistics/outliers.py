@@ -21,13 +21,7 @@ from fg_calib.graph import Problem, Solution, solve, with_factors
 from fg_calib.inputs import Booleans, SolverError
 from fg_calib.statistics.covariance import Spread, spread_of
 from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, chi_square, judge_fit
-from fg_calib.statistics.residual_table import (
-    CHANCE,
-    MAX_OUTLIER_SHARE,
-    ResidualTable,
-    residual_table,
-    suspect_level,
-)
+from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table, suspect_level
 
 MAX_ROWS = 20_000
 """Rows up to which outliers are looked for: of more, few of them spoil little."""

@@ -155,11 +155,6 @@ class ResidualTable(FrozenArrays):
         """Number of rows."""
         return len(self.kind_code)
 
-    @property
-    def kind(self) -> NDArray[np.str_]:
-        """`distance`, `angle`, `position.x`, ... of each row, shape (n,)."""
-        return np.array([kind.name for kind in self.kinds] or [""])[self.kind_code]
-
     @cached_property
     def families(self) -> tuple[str, ...]:
         """Kinds of noise, in the order in which they first stand in the table."""
@@ -168,8 +163,7 @@ class ResidualTable(FrozenArrays):
     @property
     def family(self) -> Codes:
         """Kind of noise of each row, in `families`, shape (n,)."""
-        codes = [self.families.index(kind.family) for kind in self.kinds]
-        return np.array(codes or [0], dtype=np.int16)[self.kind_code]
+        return self._coded([self.families.index(kind.family) for kind in self.kinds])
 
     @cached_property
     def groups(self) -> tuple[tuple[int, str], ...]:
@@ -179,8 +173,10 @@ class ResidualTable(FrozenArrays):
     @property
     def group(self) -> Codes:
         """Table and kind of noise of each row, in `groups`, shape (n,)."""
-        codes = [self.groups.index((kind.table, kind.family)) for kind in self.kinds]
-        return np.array(codes or [0], dtype=np.int16)[self.kind_code]
+        return self._coded([self.groups.index((kind.table, kind.family)) for kind in self.kinds])
+
+    def _coded(self, of_kinds: list[int]) -> Codes:
+        return np.array(of_kinds or [0], dtype=np.int16)[self.kind_code]
 
     @property
     def used(self) -> Booleans:
@@ -219,16 +215,14 @@ class ResidualTable(FrozenArrays):
         Args:
             table: Of which table; of all if None.
         """
-        found: dict[str, dict[str, dict[str, float]]] = {"train": {}, "test": {}}
-        counted = self.reason_code == 0
+        counted, found = self.reason_code == 0, dict[str, dict[str, dict[str, float]]](train={}, test={})
         if table is not None:
-            counted = counted & np.array([kind.table == table for kind in self.kinds] or [False])[self.kind_code]
-        for code, split in enumerate(found):
+            counted = counted & (self._coded([kind.table for kind in self.kinds]) == table)
+        for code, of_split in enumerate(found.values()):
             for k, name in enumerate(self.families):
                 rows = np.flatnonzero(counted & (self.split == code) & (self.family == k))
                 if len(rows):
-                    _, before, after, _ = self._rms_of(rows)
-                    found[split][name] = {"before": before, "after": after}
+                    of_split[name] = dict(zip(("before", "after"), self._rms_of(rows)[1:3], strict=True))
         return found
 
     def _rms_of(self, rows: Integers) -> tuple[int, float, float, float]:
@@ -340,15 +334,11 @@ def residual_table(solution: Solution) -> ResidualTable:
 
 def _at_fitted_readings(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
     """Which rows are of readings, at both ends, at which rows are fitted, shape (n,)."""
-    n, counts = len(readings), (rows["reason_code"] == 0) & ~rows["test"]
-    place = np.append(same_readings(readings), n)
-    ends = [np.where((end >= 0) & (end < n), end, n) for end in (rows["a"], rows["b"])]
-    fitted = np.zeros(n + 1, dtype=np.bool_)
-    for end in ends:
-        fitted[place[end[counts]]] = True
-    fitted[n] = True  # no end there
-    known: Booleans = fitted[place[ends[0]]] & fitted[place[ends[1]]] & ((ends[0] < n) | (ends[1] < n))
-    return known
+    place, fitted = np.append(same_readings(readings), -1), (rows["reason_code"] == 0) & ~rows["test"]
+    ends = [place[np.where(rows[end] < len(readings), rows[end], -1)] for end in ("a", "b")]  # -1: no configuration
+    known = np.isin(ends, [-1, *np.unique(np.compress(fitted, ends, axis=1))]).all(axis=0)
+    out: Booleans = np.logical_and(known, np.not_equal(ends, -1).any(axis=0))
+    return out
 
 
 def same_readings(readings: Floats) -> Integers:

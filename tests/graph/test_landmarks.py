@@ -103,7 +103,8 @@ def test_points_of_test_rows_are_predicted_and_train_rows_alone_are_fitted():
     assert [v.symbol for v in problem.variables.nuisance] == ["L(0)", "L(1)", "L(2)"]
     assert [(p.name, p.n) for p in found.estimates.landmarks] == [("g0", 11), ("g1", 12), ("g2", 12), ("g3", 0)]
     table = found.fit.residuals
-    contact, distances = np.char.startswith(table.kind, "point"), np.flatnonzero(table.kind == "distance")
+    kind = np.array(table.families)[table.family]
+    contact, distances = kind == "point", np.flatnonzero(kind == "distance")
     assert np.sum(table.test & contact) == 3 * 13
     assert table.test[distances].tolist() == [False, True]
     p, d = pose(found.robot, m.readings).position, m.groups.pairs.distance

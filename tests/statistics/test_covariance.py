@@ -160,7 +160,7 @@ def test_residual_table_holds_every_row_before_and_after(model):
         build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=10), model=model, pairing=Pairing("chain"))
     )
     table = assess(solution).fit.residuals
-    assert len(table.kind) == (30 * 6 if model == "pose" else 2 * (19 + 9))
+    assert table.n == (30 * 6 if model == "pose" else 2 * (19 + 9))
     assert table.test.sum() == (10 * 6 if model == "pose" else 2 * 9)
     rms = table.rms()
     for split in ("train", "test"):

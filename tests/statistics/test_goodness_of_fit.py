@@ -171,7 +171,7 @@ def test_a_same_point_that_is_not_is_suspect():
     (kind,) = goodness.kinds
     assert (kind.kind, kind.n) == ("distance", 18 + 2 * 3)
     same, other = (np.flatnonzero(table.a == k) for k in (0, 1))
-    assert list(table.kind[same]) == ["distance.x", "distance.y", "distance.z"]
+    assert [table.kinds[code].name for code in table.kind_code[same]] == ["distance.x", "distance.y", "distance.z"]
     assert goodness.leverage[same] == pytest.approx(0.0, abs=1e-6)
     assert np.all(np.abs(goodness.studentised[same]) < 1.0)
     assert np.linalg.norm(table.after[other] / table.sigma[other]) == pytest.approx(10.0, abs=1.0)
