@@ -108,9 +108,7 @@ class TangentCovariance(FrozenArrays):
             moved = robot.with_values(v.moved(self.parameters, step)[v.robot_span])
             return np.ravel(np.asarray(function(moved), dtype=np.float64))
 
-        columns = [(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps[: v.n_robot_columns]]
-        of_frame = [np.zeros_like(at(np.zeros(v.n_columns)))] * (v.n_columns - v.n_robot_columns)
-        return np.array(columns + of_frame).T
+        return np.array([(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps]).T
 
 
 @dataclass(frozen=True)

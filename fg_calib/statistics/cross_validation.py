@@ -296,7 +296,8 @@ class Acceptance:
 def accept(limits: Limits, held_out: Sequence[HeldOut], findings: Sequence[str]) -> Acceptance | None:
     """Judge the limits of a job by what was held out; None without limits.
 
-    Tables are judged one by one: many rows of one do not make up for those of another.
+    Tables with enough rows are judged one by one: many rows of one do not make up for those of another. Where none has
+    enough, all together are.
 
     Args:
         limits: The limits.
@@ -304,21 +305,12 @@ def accept(limits: Limits, held_out: Sequence[HeldOut], findings: Sequence[str])
         findings: Why the result is not to be trusted: it then passes nothing.
     """
     judged = []
-    for kind in (f.name for f in fields(limits)):
-        limit = getattr(limits, kind)
+    for kind, limit in ((f.name, getattr(limits, f.name)) for f in fields(limits)):
         if limit is not None:
-            parts = _judged_alone([held for held in held_out if held.kind == kind])
-            judged += [_judge(kind, limit, held, findings) for held in parts or (None,)]
+            parts = [held for held in held_out if held.kind == kind]
+            enough = [held for held in parts if held.n >= LEAST] or ([pooled(parts)] if parts else [])
+            judged += [_judge(kind, limit, held, findings) for held in enough or (None,)]
     return Acceptance(tuple(judged)) if judged else None
-
-
-def _judged_alone(held_out: Sequence[HeldOut]) -> list[HeldOut]:
-    """What is judged by itself: each table with rows enough, the others together where these are enough."""
-    alone = [held for held in held_out if held.n >= LEAST]
-    others = [held for held in held_out if held.n < LEAST]
-    if others and (not alone or sum(held.n for held in others) >= LEAST):
-        alone.append(pooled(others, "other tables" if alone else ""))
-    return alone
 
 
 def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str]) -> Judgement:
@@ -326,7 +318,7 @@ def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str
         return Judgement(kind, limit, None, None, 0, "not evaluated", f"no measurement of any {kind} was held out")
 
     exceeds = held.after > limit
-    reasons = {
+    doubts = {
         f"fewer than {LEAST} were held out": held.n < LEAST,
         "frame, base or tool were fitted to these rows, which are too few for that": held.few,
         "the noise of the measurements hides it": exceeds and held.after**2 - held.noise**2 <= limit**2,
@@ -334,10 +326,7 @@ def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str
         "within the limit, but the result is not to be trusted": not exceeds and bool(findings),
         "the error is not known": not np.isfinite(held.after),
     }
-    verdict: Verdict = "fail" if exceeds else "pass"
-    reason = f"new rows, by {held.by}" * (bool(held.by) and not exceeds)
-    for doubt, applies in reasons.items():
-        if applies:
-            verdict, reason = "not evaluated", doubt
-            break
+    verdict: Verdict = "not evaluated" if any(doubts.values()) else "fail" if exceeds else "pass"
+    passed_by = f"new rows, by {held.by}" if held.by else ""
+    reason = next((doubt for doubt, applies in doubts.items() if applies), passed_by)
     return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason, held.table)

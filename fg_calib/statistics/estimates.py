@@ -263,11 +263,9 @@ def _n_rows(problem: Problem) -> Integers:
     """Number of train measurements that each landmark takes part in, shape (n_landmarks,)."""
     unknowns = problem.data.landmarks
     counts = np.zeros(len(unknowns.names), dtype=np.int64)
-    for s in problem.data.blocks:
-        owners = unknowns.owners[s.nuisances[s.train]]
-        for k, column in enumerate(owners.T if s.kind.ends else ()):
-            new = np.all(owners[:, :k] != column[:, None], axis=1)
-            counts += np.bincount(column[new], minlength=len(counts))
+    for s in (s for s in problem.data.blocks if s.kind.ends):
+        owners = np.sort(unknowns.owners[s.nuisances[s.train]], axis=1)
+        counts += np.bincount(owners[np.diff(owners, axis=1, prepend=-1) != 0], minlength=len(counts))
     return counts
 
 
@@ -277,7 +275,11 @@ def _joint_errors(solution: Solution) -> JointErrors | None:
         return None
     joints = np.flatnonzero(data.sigma_joint > 0.0)
     sigma = problem.sigma_joint[joints]
-    rows, share = _share_of_variance(solution, joints)
+    rows, slots = problem.rows.configurations, problem.rows.slots
+    share, of_joints = np.zeros((len(rows), problem.robot.n_joints)), slots < problem.robot.n_joints
+    variance = linear_system(problem, solution.parameters).z_variance.reshape(len(rows), -1)
+    share[:, slots[of_joints]] = 1.0 - variance[:, of_joints]  # of its prior variance, by which an error varies
+    share = share[:, joints]
     error = joint_errors(problem, solution.parameters)[np.ix_(rows, joints)]
     with np.errstate(invalid="ignore", divide="ignore"):
         studentised = np.where(share > LEAST_SHARE, error / (sigma * np.sqrt(share)), np.nan)
@@ -293,13 +295,3 @@ def _joint_errors(solution: Solution) -> JointErrors | None:
         studentised=studentised,
         suspects=tuple((int(i), int(k)) for i, k in zip(*np.unravel_index(worst, size.shape), strict=True)),
     )
-
-
-def _share_of_variance(solution: Solution, joints: Integers) -> tuple[Integers, Floats]:
-    """Configurations of the fitted rows, and by which share of its prior variance each estimated error varies."""
-    rows = solution.problem.rows
-    variance = linear_system(solution.problem, solution.parameters).z_variance
-    share = np.zeros((len(rows.configurations), solution.problem.robot.n_joints))
-    of_joints = rows.slots < share.shape[1]
-    share[:, rows.slots[of_joints]] = 1.0 - variance.reshape(len(share), -1)[:, of_joints]
-    return rows.configurations, share[:, joints]

@@ -47,7 +47,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -117,7 +117,9 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
     parameters = _prior_parameters(specified)
     if by is None or problem.evaluated or not parameters:
         return solve_with(problem)
-    groups, group = _groups_of(problem.robot, parameters, by)
+    names = [_group_of(problem.robot, p, by) for p in parameters]
+    groups = tuple(dict.fromkeys(names))
+    group = np.array([groups.index(name) for name in names], dtype=np.int64)
     members = tuple(tuple(p.name for p, k in zip(parameters, group, strict=True) if k == j) for j in range(len(groups)))
 
     def refit(theta: Floats) -> tuple[Solution, Floats, tuple[Floats, EstimatedScales, Floats]]:
@@ -414,22 +416,6 @@ def _prior_parameters(variables: Variables) -> list[Parameter]:
     """The parameter of each row of `prior_rows`, in their order."""
     owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
     return [p for p in owned if p.tolerance is not None] if variables.priors else []
-
-
-def _groups_of(robot: Robot, parameters: Sequence[Parameter], by: SharedScale) -> tuple[tuple[str, ...], Integers]:
-    """What shares a scale.
-
-    Args:
-        robot: The robot.
-        parameters: Those that have a tolerance.
-        by: What they share it by.
-
-    Returns:
-        The groups in the order in which they come first, and the number of each parameter's, shape (n,).
-    """
-    names = [_group_of(robot, p, by) for p in parameters]
-    groups = tuple(dict.fromkeys(names))
-    return groups, np.array([groups.index(name) for name in names], dtype=np.int64)
 
 
 def _group_of(robot: Robot, parameter: Parameter, by: SharedScale) -> str:
