@@ -36,7 +36,7 @@ from fg_calib.exports.urdf import (
     ur_kinematics,
 )
 from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
-from fg_calib.io import Units, encoding_of, replacing, require_absent, robot_text
+from fg_calib.io import Units, require_absent, robot_text, write_text
 from fg_calib.robot import CONVENTIONS, Robot, frame_values
 
 ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
@@ -85,8 +85,7 @@ class Export:
         """
         path = Path(path)
         require_absent(path.parent, [path.name])
-        with replacing(path) as temporary:
-            temporary.write_bytes(self.text.encode(encoding_of(self.text) if self.to == "urdf" else "utf-8"))
+        write_text(path, self.text)
 
     def document(self) -> dict[str, Any]:
         """What `--json` prints.

@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.exports.dh import Links, in_table, inverse, links_of, rigid, row_transform, transform
 from fg_calib.inputs import Floats, InputError
-from fg_calib.io import ROUNDING, urdf_text
+from fg_calib.io import ROUNDING, joint_origins, urdf_text
 from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
 
 FARTHEST_SLIDE = 1000.0
@@ -155,8 +155,9 @@ def zeros_of_origins(nominal: Robot, calibrated: Robot) -> tuple[dict[str, float
     """
     zeros: dict[str, float] = {}
     origins: dict[str, dict[str, float]] = {}
+    all_drawn, all_found = joint_origins(nominal), joint_origins(calibrated)
     for i, joint in enumerate(calibrated.joints):
-        drawn, found = _origin(nominal, joint), _origin(calibrated, joint)
+        drawn, found = all_drawn[joint.name], all_found[joint.name]
         zeros[joint.name], origins[joint.name] = 0.0, found
         if all(abs(drawn[kind] - found[kind]) <= ROUNDING for kind in drawn):
             continue
@@ -174,12 +175,6 @@ def zeros_of_origins(nominal: Robot, calibrated: Robot) -> tuple[dict[str, float
         zeros[joint.name] = zero
         origins[joint.name] = frame_of_matrix(rest)
     return zeros, origins
-
-
-def _origin(robot: Robot, joint: Joint) -> dict[str, float]:
-    """x, y, z, yaw, pitch and roll of a joint's origin."""
-    values = {p.name: p.nominal for p in robot.parameters}
-    return {kind: values[f"{joint.name}.{kind}"] for kind in FRAME_KINDS}
 
 
 def frame_matrix(values: Mapping[str, float]) -> Floats:
@@ -203,7 +198,7 @@ def calibrated_urdf(robot: Robot, nominal: Robot | None) -> str:
     """
     text = "" if robot.urdf is None else robot.urdf.text
     if nominal is None:
-        return urdf_text(text, {joint.name: _origin(robot, joint) for joint in robot.joints})
+        return urdf_text(text, joint_origins(robot))
     zeros, origins = zeros_of_origins(nominal, robot)
     return urdf_text(text, origins, zeros)
 

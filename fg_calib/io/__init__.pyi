@@ -40,7 +40,7 @@ from .saved import (
     write_calibration,
 )
 from .tables import Targets, joint_columns, read_joint_table, read_measurements, read_targets
-from .urdf import ROUNDING, encoding_of, read_urdf, urdf_text, write_urdf
+from .urdf import ROUNDING, joint_origins, read_urdf, urdf_text, write_urdf
 from .yaml import (
     ANGLES,
     LENGTHS,
@@ -92,7 +92,6 @@ __all__ = [
     "camera_in",
     "check_choices",
     "configuration_frame",
-    "encoding_of",
     "exists",
     "fill_folder",
     "first_misfit",
@@ -102,6 +101,7 @@ __all__ = [
     "joint_columns",
     "joint_frame",
     "joint_noise",
+    "joint_origins",
     "key_of",
     "names_of",
     "noting_reads",

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names
-from fg_calib.io.atomic import decoded, read_bytes, replacing
+from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import shown
 from fg_calib.robot import FRAME_KINDS, IN_RAD, MOST_ANGLE, Joint, Robot, RobotBuilder, UrdfSource, frame_values
 
@@ -34,9 +34,6 @@ ROUNDING = 1e-13
 """Change of an origin's figure, [m] and [rad], that is rounding of the solution: parameters that nothing moves."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.ASCII | re.IGNORECASE)
-
-_CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
-"""Elements of a joint."""
 
 _NO_ENTITIES = "a URDF without entities: they are not expanded"
 
@@ -88,11 +85,12 @@ def read_urdf(
         InputError: There is no such file, it is not a URDF, or the chain is not one of revolute, continuous,
             prismatic and fixed joints.
     """
+    from lxml import etree
+
     if str(path).lstrip().startswith("<"):
         raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
     path = Path(path)
-    data = read_bytes(path)
-    text, root = _parse(data, path.name)
+    root = _parse(read_bytes(path), path.name)
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", frame_values("base", base), 0, False)
     try:
@@ -111,7 +109,7 @@ def read_urdf(
         fixed=fixed,
         estimate=estimate,
         tolerance=tolerance,
-        urdf=UrdfSource(text, base_link, tip_link),
+        urdf=UrdfSource(etree.tostring(root.getroottree(), encoding="unicode"), base_link, tip_link),
         place=place or path.name,
     )
 
@@ -119,22 +117,11 @@ def read_urdf(
 _XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
 
 
-def _check_children(joint: _UrdfJoint, place: str) -> None:
-    """Raise for a misspelt or doubled element, which a default or the first one would take the place of."""
-    tags = [child.tag for child in joint.element if isinstance(child.tag, str)]
-    for tag in tags:
-        if tag in _CHILDREN and tags.count(tag) > 1:
-            raise InputError(place, f"two elements <{tag}>", "one")
-        if tag not in _CHILDREN and (hint := did_you_mean(tag, _CHILDREN)):
-            raise InputError(place, f"element <{tag}>", hint=hint)
-
-
 def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:
     """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
     n_joints = 0
     for joint, backwards in chain:
         here = f"{place}: joint {joint.name!r}"
-        _check_children(joint, here)
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
@@ -144,10 +131,10 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
 
 
 def write_urdf(path: Path | str, robot: Robot) -> None:
-    """Write the URDF the robot was read from with the origins of its moving joints at the nominal values.
+    """Write the URDF the robot was read from with the origins of its moving joints at the nominal values, in UTF-8.
 
     Other elements and comments stay: see `urdf_text`. A URDF has no place for base and tool: `write_robot` writes
-    them beside it.
+    them to a file of its own.
 
     Raises:
         InputError: The folder does not exist or may not be written to.
@@ -155,20 +142,13 @@ def write_urdf(path: Path | str, robot: Robot) -> None:
     """
     if robot.urdf is None:
         raise ValueError("the robot was not read from a URDF")
+    write_text(Path(path), urdf_text(robot.urdf.text, joint_origins(robot)))
+
+
+def joint_origins(robot: Robot) -> dict[str, dict[str, float]]:
+    """Nominal origins of the joints of a robot from a URDF, by joint and kind, [m] and [rad]."""
     values = {p.name: p.nominal for p in robot.parameters}
-    origins = {j.name: {kind: values[f"{j.name}.{kind}"] for kind in FRAME_KINDS} for j in robot.joints}
-    text = urdf_text(robot.urdf.text, origins)
-    with replacing(Path(path)) as temporary:
-        temporary.write_bytes(text.encode(encoding_of(text)))
-
-
-def encoding_of(text: str) -> str:
-    """The encoding that an XML text declares; UTF-8 if it declares none."""
-    declared = _DECLARATION.match(text)
-    return declared[1] if declared and declared[1] else "utf-8"
-
-
-_DECLARATION = re.compile(r"""\ufeff?<\?xml(?:[^>]*?\sencoding\s*=\s*["']([\w.-]+)["'])?.*?\?>""", re.DOTALL)
+    return {j.name: {kind: values[f"{j.name}.{kind}"] for kind in FRAME_KINDS} for j in robot.joints}
 
 
 def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
@@ -184,8 +164,7 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
     """
     from lxml import etree
 
-    parser = etree.XMLParser(resolve_entities=False, load_dtd=False, no_network=True)
-    root = etree.fromstring(text.encode(encoding_of(text)), parser)
+    root = etree.fromstring(text, etree.XMLParser(**_SAFE))
     for joint in root.findall("joint"):
         name = joint.get("name", "")
         if name in origins:
@@ -193,8 +172,7 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
         if zeros is not None and abs(zeros.get(name, 0.0)) > ROUNDING:
             rising = sum(_figures(_attribute(joint, "calibration", "rising", "0")))
             _set(joint, "calibration", {"rising": [rising + zeros[name]]})
-    declared = _DECLARATION.match(text)
-    return (f"{declared[0]}\n" if declared else "") + str(etree.tostring(root.getroottree(), encoding="unicode")) + "\n"
+    return f'<?xml version="1.0"?>\n{etree.tostring(root.getroottree(), encoding="unicode")}\n'
 
 
 def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> None:
@@ -212,13 +190,16 @@ def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> Non
         element.set(name, " ".join(repr(float(number)) for number in numbers))
 
 
-def _parse(data: bytes, place: str) -> tuple[str, Element]:
-    """The text and the root element of an XML file, which may neither refer to other files nor hold entities."""
+_SAFE: Mapping[str, Any] = {"resolve_entities": False, "load_dtd": False, "no_network": True}
+"""Options of lxml's parser: neither entities nor other files are read."""
+
+
+def _parse(data: bytes, place: str) -> Element:
+    """The root element of an XML file, which may neither refer to other files nor hold entities."""
     from lxml import etree
 
-    safe = etree.XMLParser(resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False)
     try:
-        root = etree.fromstring(data, safe)
+        root = etree.fromstring(data, etree.XMLParser(**_SAFE))
     except etree.XMLSyntaxError as error:
         expected = _NO_ENTITIES if "entity" in error.msg.lower() else ""
         hint = _XACRO if "xacro" in error.msg else ""
@@ -226,16 +207,12 @@ def _parse(data: bytes, place: str) -> tuple[str, Element]:
             decoded(data, place)  # says of other encodings what they are
         found = f"not XML: {error.msg.replace(', use XML_PARSE_HUGE option', '')}"
         raise InputError(f"{place}:{error.lineno}", found, expected, hint) from None
-    document = root.getroottree().docinfo
-    types: Any = document.internalDTD
+    types: Any = root.getroottree().docinfo.internalDTD
     if types is not None and (types.system_url or types.entities()):
         raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
     if root.tag != "robot":
         raise InputError(place, f"root element <{root.tag}>", "<robot>")
-    try:
-        return data.decode(document.encoding or "utf-8"), root
-    except (UnicodeDecodeError, LookupError):  # libxml2 knows more encodings than Python
-        raise InputError(place, f"text in {document.encoding}", "text in UTF-8", "save it as UTF-8") from None
+    return root
 
 
 def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
@@ -363,9 +340,9 @@ class _Tree:
                 raise InputError(self._place, f"links in a circle: {circle}", "a tree of links")
         return links
 
-    def _only(self, found: list[str], what: str, argument: str) -> str:
+    def _only(self, found: list[str], what: str, key: str) -> str:
         if len(found) != 1:
-            where = f"{{urdf: {self._place}, {argument}: ...}} in a file, --{argument.replace('_', '-')} of observe"
-            hint = f"name one as {argument}: {where}"
+            option = f"--{key.replace('_', '-')}"
+            hint = f"name one as {key}: {{urdf: {self._place}, {key}: ...}} in a file, {option} of observe"
             raise InputError(self._place, f"{len(found)} {what} links ({', '.join(found)})", "one", hint)
         return found[0]
