@@ -58,10 +58,7 @@ def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
     import polars as pl
 
     table, fit = assessed.fit.residuals, assessed.fit.goodness
-    suspect = np.zeros(table.n, dtype=np.bool_)
-    suspect[fit.suspects] = True
-    if fit.test is not None:
-        suspect[fit.test.suspects] = True
+    suspects = np.append(fit.suspects, () if fit.test is None else fit.test.suspects)
     ends, sources = solution.problem.end_names, solution.problem.data.labels
     measured = table.measured - table.excess  # so that predicted minus measured is 0 on average
     columns = {
@@ -83,7 +80,7 @@ def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
         "weight": fit.weight,
         "flag": _coded(FLAGS, fit.flag),
         "noise_adds": table.excess,
-        "suspect": suspect,
+        "suspect": np.isin(np.arange(table.n), suspects),
     }
     if len(sources) > 1:
         columns["table"] = _coded([sources[kind.table] for kind in table.kinds], table.kind_code)
@@ -126,9 +123,6 @@ def joint_frame(found: JointErrors, solution: Solution) -> pl.DataFrame:
     import polars as pl
 
     n, k = found.error.shape
-    suspect = np.zeros((n, k), dtype=np.bool_)
-    for place in found.suspects:
-        suspect[place] = True
     joint, units = np.tile(np.arange(k), n), [solution.problem.robot.joints[j].unit for j in found.joints]
     columns = {
         "id": _coded(solution.problem.end_names, np.repeat(found.configurations + 1, k)),
@@ -140,7 +134,7 @@ def joint_frame(found: JointErrors, solution: Solution) -> pl.DataFrame:
         "sigma": np.tile(found.sigma, n),
         "error_over_sigma": (found.error / found.sigma).ravel(),
         "studentised": found.studentised.ravel(),
-        "suspect": suspect.ravel(),
+        "suspect": [place in found.suspects for place in np.ndindex(n, k)],
     }
     return pl.DataFrame(columns)
 
@@ -198,7 +192,7 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     robot = read_robot(file, base_link=links[0], tip_link=links[1])
     names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]
     same = [p.name for p in robot.parameters] == names
-    if not same or np.abs(robot.nominal - estimates).max(initial=0.0) > ROUNDING_IN_UNITS:
+    if not same or not np.allclose(robot.nominal, estimates, 0.0, ROUNDING_IN_UNITS):
         found = "other values" if same else "other parameters"
         raise InputError(str(file), f"{found} than in result.json", "the files of one calibration")
     return robot

@@ -147,12 +147,8 @@ RESULTS = [
     ('{"schema": "fg-calib/result/9"}', '{folder}/result.json: schema fg-calib/result/9, expected fg-calib/result/2; calibrate its job again'),
     (lambda d: d.pop("dof"), "{folder}/result.json: missing key 'dof'"),
     (lambda d: d.update(dof="many"), "{folder}/result.json: dof: found 'many', expected a whole number"),
-    (lambda d: d["parameters"][0].update(estimate=float("nan")), "{folder}/result.json: parameter 1: correction: found 0.0, expected nan; was the file changed?"),
-    (lambda d: d["parameters"][6].update(sigma=-1), '{folder}/result.json: parameter 7: sigma: found -1.0, ...'),
-    (lambda d: d["parameters"].append(d["parameters"][0]), "{folder}/result.json: parameters: names: found 16, expected 17; was the file changed?"),
     (lambda d: d["posterior"].update(covariance=[[1,2],[3,4]]), "{folder}/result.json: posterior: covariance: shape: found (2, 2), expected (10, 10); was the file changed?"),
-    (lambda d: d.update(trustworthy=not d["trustworthy"]), '{folder}/result.json: trustworthy: ...'),
-    (lambda d: d["frame_estimate"].update(sigma=[-1]*6), "{folder}/result.json: frames: negative sigma: found True, expected False; was the file changed?"),
+    (lambda d: d["frame_estimate"].update(xyz=[0]), "{folder}/result.json: frames: shape: found [1, 4, 6], expected [3, 4, 6]; was the file changed?"),
 ]
 # fmt: on
 
