@@ -85,12 +85,10 @@ def read_urdf(
         InputError: There is no such file, it is not a URDF, or the chain is not one of revolute, continuous,
             prismatic and fixed joints.
     """
-    from lxml import etree
-
     if str(path).lstrip().startswith("<"):
         raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
     path = Path(path)
-    root = _parse(read_bytes(path), path.name)
+    text, root = _parse(read_bytes(path), path.name)
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", frame_values("base", base), 0, False)
     try:
@@ -109,7 +107,7 @@ def read_urdf(
         fixed=fixed,
         estimate=estimate,
         tolerance=tolerance,
-        urdf=UrdfSource(etree.tostring(root.getroottree(), encoding="unicode"), base_link, tip_link),
+        urdf=UrdfSource(text, base_link, tip_link),
         place=place or path.name,
     )
 
@@ -194,8 +192,8 @@ _SAFE: Mapping[str, Any] = {"resolve_entities": False, "load_dtd": False, "no_ne
 """Options of lxml's parser: neither entities nor other files are read."""
 
 
-def _parse(data: bytes, place: str) -> Element:
-    """The root element of an XML file, which may neither refer to other files nor hold entities."""
+def _parse(data: bytes, place: str) -> tuple[str, Element]:
+    """The text, without its declaration, and the root element of an XML file without entities and other files."""
     from lxml import etree
 
     try:
@@ -212,7 +210,7 @@ def _parse(data: bytes, place: str) -> Element:
         raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
     if root.tag != "robot":
         raise InputError(place, f"root element <{root.tag}>", "<robot>")
-    return root
+    return etree.tostring(root.getroottree(), encoding="unicode"), root
 
 
 def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
