@@ -15,7 +15,7 @@ from fg_calib.inputs import Floats, FrozenArrays, InputError, SolverError, as_fi
 from fg_calib.job import Job
 from fg_calib.monitoring import at_nominal
 from fg_calib.observability import Identifiability, Observability, identifiability_of
-from fg_calib.parallel import one_blas_thread, single_threaded
+from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot, without_rigid_motion
 from fg_calib.statistics import (
@@ -135,11 +135,10 @@ class Assessment(FrozenArrays):
             without is unknown.
 
         Raises:
-            InputError: The function raised something, or returned no figures, or not as many of every robot.
+            InputError: The function raised something, or returned no figures.
         """
-        figures = _CheckedFunction(function)
-        value, whole = figures(self.robot), self.whole
-        G = whole.derivative(figures)
+        value, whole = _figures(function, self.robot), self.whole
+        G = whole.derivative(lambda robot: _figures(function, robot))
         if fitted:
             if len(value) % 3:
                 raise InputError("function", f"{len(value)} figures", "points, shape (n, 3), where errors are fitted")
@@ -175,29 +174,18 @@ class Assessment(FrozenArrays):
         return not self.verdict.errors
 
 
-class _CheckedFunction:
-    """A function of a robot that a user gave: an exception, or a value without figures, becomes one line."""
+def _figures(function: Callable[[Robot], ArrayLike], robot: Robot) -> Floats:
+    """The value of a function of a robot that a user gave, shape (n,).
 
-    def __init__(self, function: Callable[[Robot], ArrayLike]) -> None:
-        self._function = function
-        self._n: int | None = None
-
-    def __call__(self, robot: Robot) -> Floats:
-        """Its value, shape (n,).
-
-        Raises:
-            InputError: It raised something, or its value is no figures, or more or fewer than before.
-        """
-        try:
-            value = self._function(robot)
-        except Exception as error:
-            message = f"{type(error).__name__}: {error}".rstrip(": ")
-            raise InputError("function", f"raised {message}", "figures of any robot") from error
-        figures = as_figures("function", value, "a number or an array of them").ravel()
-        self._n = figures.size if self._n is None else self._n
-        if figures.size != self._n:
-            raise InputError("function", f"{figures.size} figures, {self._n} before", "as many of every robot")
-        return figures
+    Raises:
+        InputError: It raised something, or its value is no figures.
+    """
+    try:
+        value = function(robot)
+    except Exception as error:
+        message = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise InputError("function", f"raised {message}", "figures of any robot") from error
+    return as_figures("function", value, "a number or an array of them").ravel()
 
 
 @checked
@@ -227,6 +215,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
 
 
 @checked
+@single_threaded
 def assess(solution: Solution) -> Assessment:
     """Covariance, goodness of fit, residuals, identifiability and verdict of a solution.
 
@@ -243,13 +232,8 @@ def assess(solution: Solution) -> Assessment:
     Raises:
         ProblemError: The graph of the solution's problem has factors that are not its own.
     """
-    check_graph(solution.problem)
-    with one_blas_thread:
-        return _assess(solution)
-
-
-def _assess(solution: Solution) -> Assessment:
     problem = solution.problem
+    check_graph(problem)
     spread = spread_of(solution)
     whole = with_left_out(solution, spread)
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")

@@ -6,8 +6,6 @@ found = calibrate_jobs(["arm1.yaml", "arm2.yaml"], executor)
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import time
@@ -207,18 +205,17 @@ def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None
     Raises:
         InputError: The folder cannot be written.
     """
-    heads = ["name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds"]
-    rms = {f"rms {kind} [{unit}]": kind for job in jobs for kind, unit in job.units.items()}
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([*heads, *rms, "rows", "reason"])
-    for job in jobs:
-        values = [getattr(job, head) for head in heads] + [job.rms.get(kind) for kind in rms.values()]
-        table.writerow([*values, job.rows, "; ".join(job.reasons)])
+    import polars as pl
+
+    heads = ("name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds")
+    kinds = {kind: unit for job in jobs for kind, unit in job.units.items()}
+    columns = {head: [getattr(job, head) for job in jobs] for head in heads}
+    columns |= {f"rms {kind} [{unit}]": [job.rms.get(kind) for job in jobs] for kind, unit in kinds.items()}
+    columns |= {"rows": [job.rows for job in jobs], "reason": ["; ".join(job.reasons) for job in jobs]}
 
     def write(into: Path) -> None:
         write_text(into / "jobs.json", json.dumps(jobs_document(jobs, seconds), indent=1, allow_nan=False) + "\n")
-        write_text(into / "jobs.csv", text.getvalue())
+        pl.DataFrame(columns).write_csv(into / "jobs.csv")
 
     fill_folder(folder, write, JOBS_FILES)
 

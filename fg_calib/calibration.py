@@ -29,12 +29,12 @@ from fg_calib.inputs import (
     InputError,
     Options,
     SolverError,
+    as_figures,
     as_floats,
     check_names,
     check_number,
     checked,
     listed,
-    shape_of,
     shown,
 )
 from fg_calib.io import (
@@ -42,7 +42,6 @@ from fg_calib.io import (
     UNSTATED,
     ResidualFile,
     Result,
-    Run,
     configuration_frame,
     fill_folder,
     is_folder,
@@ -157,17 +156,15 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
 
 def _with_first_sigmas(m: Measurements) -> Measurements:
     """Sigmas for what was measured without any, as the noise to be estimated starts from."""
-    shape = (m.n_configurations, 3)
     first: dict[str, Any] = {}
     for name, measured in (("position", m.position), ("orientation", m.rotation)):
         if measured is not None and getattr(m, f"sigma_{name}") is None:
-            first[f"sigma_{name}"] = np.full(shape, getattr(UNSTATED, name))
+            first[f"sigma_{name}"] = np.full((m.n_configurations, 3), getattr(UNSTATED, name))
     if m.pairs is not None:
-        of_pairs: dict[str, Any] = {
-            f"sigma_{name}": np.where(np.isnan(sigma), getattr(UNSTATED, name), sigma)
-            for name, sigma in (("distance", m.pairs.sigma_distance), ("angle", m.pairs.sigma_angle))
-        }
-        first["pairs"] = replace(m.pairs, **of_pairs)
+        given: dict[str, Any] = {"distance": m.pairs.sigma_distance, "angle": m.pairs.sigma_angle}
+        first["pairs"] = replace(
+            m.pairs, **{f"sigma_{k}": np.nan_to_num(s, nan=getattr(UNSTATED, k)) for k, s in given.items()}
+        )
     return replace(m, **first)
 
 
@@ -268,17 +265,19 @@ class Calibration:
         Raises:
             InputError: The folder cannot be written, or the calibration was itself loaded from one.
         """
-        solution, assessed = self._assessed
+        joint_errors = self.assessment.estimates.joint_errors
         tables = {"configurations.csv": self.configurations}
         if residuals != "none":
             tables[f"residuals.{residuals}"] = self.residuals
-        if assessed.estimates.joint_errors is not None:
-            tables["joints.csv"] = joint_frame(assessed.estimates.joint_errors, solution)
-        drawn = self.report_data
-        pages = {"report.html": build_page(drawn)} if report else {}
-        pages |= draw_figures(drawn) if figures else {}
+        if joint_errors is not None:
+            tables["joints.csv"] = joint_frame(joint_errors, self.solution)
         known = {name: table for name, table in tables.items() if table is not None}
-        write_calibration(Path(folder), self.result, self.robot, known, pages)
+        write_calibration(Path(folder), self.result, self.robot, known, self._pages(report=report, figures=figures))
+
+    def _pages(self, *, report: bool, figures: bool) -> dict[str, str]:
+        """The text of the page and of its figures, by file."""
+        pages = {"report.html": build_page(self.report_data)} if report else {}
+        return pages | (draw_figures(self.report_data) if figures else {})
 
     @cached_property
     def configurations(self) -> pl.DataFrame | None:
@@ -306,20 +305,9 @@ class Calibration:
         return ReportData(self.result, self.robot, self.posterior, self.configurations, self.residuals)
 
     @property
-    def joint_noise(self) -> Floats | None:
-        """1 sigma of joint readings, as specified or estimated, shape (n_joints,), [rad] or [m]; None if unknown."""
-        sigma = self.result.sigma_joint
-        return sigma if np.any(sigma > 0.0) else None
-
-    @property
     def nominal(self) -> Robot:
         """The robot that it began with."""
         return self.robot.with_values([p.nominal for p in self.result.parameters])
-
-    @property
-    def runs(self) -> tuple[Run, ...]:
-        """The runs that it came from, and itself."""
-        return (*self.result.history, self.result.run)
 
     @property
     def calibrated(self) -> Calibrated:
@@ -402,20 +390,19 @@ class Calibration:
             SolverError: GTSAM could not solve a step at all.
         """
         self._require_trust()
-        history = self.runs
-        growth = growth or {}
-        new, days = _date_and_days(date, history[-1].date, needed=bool(growth))
+        history, names = (*self.result.history, self.result.run), listed("changed", changed)
+        new, days = _date_and_days(date, self.result.date)
+        if growth and days is None:
+            raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
         table, inputs = self._rows(rows, pairs, like)
         counted = {mark for run in history for mark in run.rows}
         for one in table.tables:
             if counted_before(one, counted):
-                source = one.measurements.source
-                raise InputError(source, "its rows are in the calibration already", "new rows")
-        names = listed("changed", changed)
+                raise InputError(one.measurements.source, "its rows are in the calibration already", "new rows")
         found = updated(
             self.calibrated,
             table,
-            growth={name: size * float(np.sqrt(days)) for name, size in growth.items()},
+            growth={name: size * float(np.sqrt(days or 0.0)) for name, size in (growth or {}).items()},
             changed=names,
             anchors_stay=anchors_stay,
         )
@@ -448,10 +435,8 @@ class Calibration:
             inputs = {file.name: digest for file, digest in files.items()}
             return Rows.of([table], [like or path.name], options), inputs
         if pairs is not None or like is not None:
-            raise InputError("pairs" if pairs else "like", "given beside rows that say it themselves", "none")
-        new, inputs = given, {}
-        if isinstance(new, Path | str):
-            new = read_job(new)
+            raise InputError("pairs" if pairs else "like", "given with rows that say it themselves", "none")
+        new, inputs = read_job(given) if isinstance(given, Path | str) else given, {}
         if isinstance(new, Job):
             if names_of(new.robot.parameters) != names_of(robot.parameters) or new.robot.convention != robot.convention:
                 expected = f"that of the result, {robot.name}"
@@ -469,7 +454,7 @@ class Calibration:
         Raises:
             InputError: The calibration was loaded.
         """
-        return self._assessed[0]
+        return self._computed()[0]
 
     @property
     def assessment(self) -> Assessment:
@@ -478,10 +463,9 @@ class Calibration:
         Raises:
             InputError: The calibration was loaded.
         """
-        return self._assessed[1]
+        return self._computed()[1]
 
-    @property
-    def _assessed(self) -> tuple[Solution, Assessment]:
+    def _computed(self) -> tuple[Solution, Assessment]:
         if self.assessed is None:
             found = "it was loaded from a folder, which holds no solution and no assessment"
             raise InputError("calibration", found, hint="calibrate again to have them")
@@ -502,7 +486,7 @@ class Calibration:
             InputError: There is no such parameter.
         """
         given = self.result.covariance
-        names = given.names if names is None else names if isinstance(names, str) else listed("covariance", names)
+        names = given.names if names is None else listed("covariance", names)
         check_names("covariance", names, list(self.parameters))
         every = np.zeros((len(given.names) + 1,) * 2)  # the last one stands for what is fixed
         every[:-1, :-1] = given.matrix.reshape(len(given.names), len(given.names))
@@ -543,8 +527,7 @@ class Calibration:
         Raises:
             InputError: The readings are of other joints, or there is no measurement frame.
         """
-        shape_of("readings", readings, f"(n, {self.robot.n_joints})")
-        q = as_floats("readings", np.atleast_2d(readings), f"(n, {self.robot.n_joints})")
+        q = _as_readings("readings", readings, self.robot)
         return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table) if world else None))
 
     def table_in_world(self, number: int | None = None) -> int:
@@ -603,21 +586,28 @@ def predict(
     found = calibration if isinstance(calibration, Calibration) else Calibration.load(calibration)
     if found.result.evaluated_only:
         raise InputError(found.result.robot, "the arm was only evaluated: nothing was estimated", "a calibration")
-    there = found.measured if measured is None else _readings("measured", measured, found)
+    there = found.measured if measured is None else _possible_readings("measured", measured, found.robot)
     if there is None:
         place, expected = str(found.folder or "calibration"), "configurations.csv, or `measured`"
         raise InputError(place, "nothing says what was measured", expected)
-    at = None if readings is None else _readings("readings", readings, found)
-    model = ToolPoseUncertainty.of(found.posterior, there, found.joint_noise)
+    at = None if readings is None else _possible_readings("readings", readings, found.robot)
+    joint_noise = found.result.sigma_joint if np.any(found.result.sigma_joint > 0.0) else None
+    model = ToolPoseUncertainty.of(found.posterior, there, joint_noise)
     return predict_errors(found.robot, model, there, at, fitted=found.result.free_of_frame, limit=limit)
 
 
-def _readings(name: str, given: ArrayLike, found: Calibration) -> Floats:
-    """Readings that were given, checked."""
-    readings = as_floats(name, np.atleast_2d(np.asarray(given)), f"(n, {found.robot.n_joints})")
+def _as_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:
+    """Readings of one or many configurations, shape (n, n_joints)."""
+    shape = f"(n, {robot.n_joints})"
+    return as_floats(name, np.atleast_2d(as_figures(name, given, f"numbers of shape {shape}")), shape)
+
+
+def _possible_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:
+    """Readings of at least one configuration, within the limits."""
+    readings = _as_readings(name, given, robot)
     if not len(readings):
         raise InputError(name, "no configurations", "one or more")
-    check_readings(readings, found.robot, name)
+    check_readings(readings, robot, name)
     return readings
 
 
@@ -668,14 +658,13 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
         InputError: There is no such calibration, it is damaged, or the folder cannot be written.
     """
     found = Calibration.load(path)
-    assert found.folder is not None
-    texts = {"report.html": build_page(found.report_data), **(draw_figures(found.report_data) if figures else {})}
+    texts = found._pages(report=True, figures=figures)
 
     def write(into: Path) -> None:
         for name, text in texts.items():
             write_text(into / name, text)
 
-    fill_folder(found.folder if folder is None else Path(folder), write, {name: RESULT_FILES[name] for name in texts})
+    fill_folder(Path(folder or found.folder or ""), write, {name: RESULT_FILES[name] for name in texts})
 
 
 def _with_priors(robot: Robot, result: Result) -> Robot:
@@ -723,32 +712,21 @@ def _knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
     Raises:
         InputError: It is that of another robot.
     """
-    width = len(saved.columns) + len(saved.at)
-
-    def at(one: SavedKnowledge, nominal: Knowledge | None = None) -> Knowledge:
-        return Knowledge(
-            robot=robot.with_values(one.parameters),
-            unknowns=saved.unknowns,
-            at=one.at,
-            rows=one.rows.reshape(len(one.rows), width),
-            right=one.right,
-            views=saved.views,
-            nominal=nominal,
-        )
-
-    found = at(saved, None if saved.nominal is None else at(saved.nominal))
+    nominal = None if saved.nominal is None else _knowledge(robot, saved.nominal)
+    fields = {name: getattr(saved, name) for name in ("unknowns", "at", "rows", "right", "views")}
+    found = Knowledge(robot=robot.with_values(saved.parameters), nominal=nominal, **fields)
     if found.variables.names != saved.columns or len(saved.at) != SIZE * len(saved.unknowns):
         raise InputError(
             "result.json: carried", "information on other parameters than those estimated", "that of one run"
         )
-    return found
+    return replace(found, rows=saved.rows.reshape(len(saved.rows), len(found.scales)))
 
 
-def _date_and_days(given: str | None, before: str, *, needed: bool) -> tuple[str, float]:
-    """A date as it is written, now if None, and the days to it from the date before.
+def _date_and_days(given: str | None, before: str) -> tuple[str, float | None]:
+    """A date as it is written, now if None, and the days to it from the date before; None where that is not known.
 
     Raises:
-        InputError: It is no date or before the other, or the other is not known although it is needed.
+        InputError: It is no date, or a day or more before the other.
     """
     try:
         date = datetime.now(UTC) if given is None else datetime.fromisoformat(given)
@@ -756,11 +734,9 @@ def _date_and_days(given: str | None, before: str, *, needed: bool) -> tuple[str
         raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
     text = date.isoformat(timespec="seconds") if given is None else date.isoformat()
     if not before:
-        if needed:
-            raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
-        return text, 0.0
+        return text, None
     first, second = (d if d.tzinfo else d.replace(tzinfo=UTC) for d in (datetime.fromisoformat(before), date))
     days = (second - first).total_seconds() / 86400.0
-    if days < 0.0 and (date.tzinfo or days <= -1.0):  # a date without a time zone may be of the same day
+    if days <= -1.0:  # a date without a time zone may be of the same day
         raise InputError("date", f"{text} is before the calibration, {before}", "a later one")
     return text, max(days, 0.0)

@@ -29,6 +29,7 @@ ORDINARY = f"a number no larger than {MOST_SIZE:g}; sigmas and tolerances no les
 
 EXAMPLES = {
     "Generator": "numpy.random.default_rng(0)",
+    "Limits": "Limits(position=5e-4)",
     "Job": "read_job('job.yaml')",
     "Measurements": "Measurements.from_arrays(...)",
     "Noise": "Noise(position=1e-3)",

@@ -167,24 +167,12 @@ def as_figures(name: str, given: object, expected: str) -> Floats:
     array = as_array(name, given, "iufO", expected)
     words = array.dtype.kind == "O" and any(isinstance(value, str | bytes | bool | np.bool_) for value in array.ravel())
     try:
-        if not words and not _holds_flags(given):
-            return np.array(array, dtype=np.float64)
+        figures = None if words else np.array(array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
-        pass
-    raise InputError(name, f"found {_shown(given)}", expected)
-
-
-def _holds_masks(given: object) -> bool:
-    return isinstance(given, list | tuple) and any(
-        isinstance(one, np.ma.MaskedArray) or one is np.ma.masked or _holds_masks(one) for one in given
-    )
-
-
-def _holds_flags(given: object) -> bool:
-    """Whether True or False stands among the numbers of a list, where numpy makes 1 or 0 of it."""
-    return isinstance(given, list | tuple) and any(
-        isinstance(one, bool | np.bool_) or _holds_flags(one) for one in given
-    )
+        figures = None
+    if figures is None:
+        raise InputError(name, f"found {_shown(given)}", expected)
+    return figures
 
 
 def check_sizes(name: str, floats: Floats, *, missing: bool = False) -> None:
@@ -220,7 +208,7 @@ def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any
     Raises:
         InputError: It is none.
     """
-    if isinstance(given, np.ma.MaskedArray) or _holds_masks(given):
+    if isinstance(given, np.ma.MaskedArray):
         raise InputError(name, "found a masked array", f"{expected}; nan where something was not measured")
     if isinstance(given, Iterator):
         raise InputError(name, f"found a {type(given).__name__}", expected, "list(...) makes a list of it")
@@ -252,21 +240,13 @@ def as_frame(name: str, given: Any) -> Any | None:
     """A frame of polars or pandas whose names are different without blanks around them; None of what is no frame.
 
     Raises:
-        InputError: A name stands there twice, or a lazy frame cannot be collected.
+        InputError: A name stands there twice.
     """
-    lazy = hasattr(type(given), "collect")
-    if not lazy and not hasattr(given, "columns"):
+    frame = given.collect() if hasattr(type(given), "collect") else given
+    if not hasattr(frame, "columns"):
         return None
-    if lazy:
-        try:
-            given = given.collect()
-        except BaseException as error:  # a panic of polars' Rust is no Exception
-            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-                raise
-            first = str(error).strip().partition("\n")[0]
-            raise InputError(name, f"a lazy frame that cannot be collected: {first}") from None
-    check_different(name, list(given.columns))
-    return given
+    check_different(name, list(frame.columns))
+    return frame
 
 
 def check_different(name: str, columns: Iterable[object]) -> None:

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any, Literal
 from fg_calib.inputs.arguments import check, check_fields, check_names, check_number, check_type, listed
 from fg_calib.inputs.errors import InputError
 
-MODELS: dict[str, str] = {
-    "pose": "pose",
-    "position": "pose",
-    "orientation": "pose",
-    "distance": "pair",
-    "rotation": "pair",
-    "distance-rotation": "pair",
+POSE_MODELS = {"pose": (True, True), "position": (False, True), "orientation": (True, False)}
+"""Whether a model uses orientations and positions."""
+
+PAIR_MODELS = {"distance": (True, False), "rotation": (False, True), "distance-rotation": (True, True)}
+"""Whether a model uses distances and angles of pairs."""
+
+MODELS = {
+    **dict.fromkeys(POSE_MODELS, "pose"),
+    **dict.fromkeys(PAIR_MODELS, "pair"),
     "anchor": "anchor",
     "plane": "plane",
     "board": "board",
@@ -81,21 +83,6 @@ class Pairing:
 
     def __str__(self) -> str:
         return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
-
-
-PAIR_MODELS: dict[Model, tuple[bool, bool]] = {
-    "distance": (True, False),
-    "rotation": (False, True),
-    "distance-rotation": (True, True),
-}
-"""Whether a model uses distances and angles of pairs."""
-
-POSE_MODELS: dict[Model, tuple[bool, bool]] = {
-    "pose": (True, True),
-    "position": (False, True),
-    "orientation": (True, False),
-}
-"""Whether a model uses orientations and positions."""
 
 
 LIMITED: dict[str, Literal["m", "rad"]] = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad"}

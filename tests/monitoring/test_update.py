@@ -159,7 +159,7 @@ def test_an_update_says_what_it_came_from():
     calibration, true, rng = calibrated(8)
     updated = calibration.update(measured(true, 6, rng), date="2026-12-24")
     assert updated.result.date.startswith("2026-12-24")
-    assert [run.date for run in updated.runs] == [calibration.result.date, updated.result.date]
+    assert [run.date for run in updated.result.history] == [calibration.result.date]
     assert updated.result.parameters[10].nominal == calibration.result.parameters[10].nominal
     assert updated.result.n_residuals == 36
 

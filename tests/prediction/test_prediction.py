@@ -80,14 +80,14 @@ def test_joint_noise_moves_the_tool_as_differences_say(calibrated):
 
 
 def test_joint_noise_is_that_of_the_measurements(calibrated):
-    assert calibrated[0].joint_noise is None
+    assert not np.any(calibrated[0].result.sigma_joint)
     rng = np.random.default_rng(10)
     robot = small_arm(tolerance=LARGE)
     q = rng.uniform(-2.0, 2.0, (20, 4))
     m = Measurements.from_arrays(q, position=pose(robot, q).position, sigma_position=1e-4, sigma_joint=JOINTS)
     problem = build_problem(robot, m, model="position")
     found = Calibration.of(solution := solve(problem), assess(solution))
-    assert found.joint_noise == pytest.approx(JOINTS, rel=1e-15)
+    assert found.result.sigma_joint == pytest.approx(JOINTS, rel=1e-15)
 
 
 def test_drawn_configurations_are_within_the_limits_and_the_worst_is_one_of_them(calibrated, monkeypatch):

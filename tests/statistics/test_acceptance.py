@@ -69,7 +69,7 @@ def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
         ({"positon": 1e-3}, "accept: unknown limit 'positon', expected one of position, orientation, distance, angle"),
         ({"position": 0.0}, "accept: position: found 0.0, expected a finite number above 0"),
         ({"position": True}, "accept: position: found True, expected a finite number above 0"),
-        ("0.5 mm", "accept: found '0.5 mm', expected limits by name"),
+        ("0.5 mm", "accept: found '0.5 mm', expected a Limits, such as Limits(position=5e-4)"),
     ],
 )
 def test_wrong_limits_are_one_line(accept, message):
