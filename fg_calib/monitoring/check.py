@@ -164,10 +164,9 @@ def _judge(
     held = at.placed.errors()
     rms = {kind: pooled([one for one in held if one.kind == kind]) for kind in dict.fromkeys(one.kind for one in held)}
     noise = {kind: one.noise for kind, one in rms.items()}
-    names = {f.hypothesis.names for f in likely}
-    likely = hypotheses.merge_alike(at, likely, noise)
-    alike = names - {f.hypothesis.names for f in likely}
-    found = [f for f in found if f.hypothesis.names not in alike]
+    merged = hypotheses.merge_alike(at, likely, noise)
+    alike = {f.hypothesis.names for f in likely} - {f.hypothesis.names for f in merged}
+    likely, found = merged, [f for f in found if f.hypothesis.names not in alike]
     limit = {kind: value for kind in LIMITED if (value := getattr(limits, kind)) is not None}
     of_noise = calibrated.noise_degrees or np.inf  # noise that was estimated may itself be off
     p_value = upper_probability(at.chi2 / at.dof, at.dof, of_noise) if at.dof > 0 else None
@@ -229,9 +228,9 @@ def _reasons(
 ) -> tuple[list[str], list[str]]:
     """Why the calibration is not good any more, and cautions."""
     reasons, cautions = [], []
-    for kind, limit in limits.items():
-        one = rms.get(kind)
-        if one is None or one.n < LEAST or one.after <= limit:
+    for kind, one in rms.items():
+        limit = limits.get(kind, np.inf)
+        if one.n < LEAST or one.after <= limit:
             continue
         if one.after**2 - one.noise**2 <= limit**2:
             cautions.append(f"{kind}: the specified noise hides whether the arm is within the limit")
@@ -239,9 +238,8 @@ def _reasons(
     change = next((f for f in likely if f.hypothesis.kind != "row"), None)
     excess = float(np.sqrt(at.chi2 / at.dof))
     if change is not None:
-        sizes = dict(
-            zip(("orientation", "position"), hypotheses.rms_motion(hypotheses.motion(at, change)).tolist(), strict=True)
-        )
+        turn, shift = hypotheses.rms_motion(hypotheses.motion(at, change)).tolist()
+        sizes = {"orientation": turn, "position": shift}
         far = [kind for kind, size in sizes.items() if size > limits.get(kind, np.inf)]
         where = f"; over the whole workspace {_shown(sizes[far[0]], far[0])} RMS" if far else ""
         if far or not limits or change.hypothesis.kind == "frame":
@@ -266,10 +264,8 @@ def _explanations(found: Sequence[HypothesisTest], likely: Sequence[HypothesisTe
     if not likely:
         return ()
     names, scale = {f.hypothesis.names for f in likely}, likely[0].scale
-    others = [
-        f for f in found if f.hypothesis.names not in names and not any(hypotheses.is_part_of(g, f) for g in likely)
-    ]
-    shown = [*likely, *sorted(others, key=lambda f: f.left)[:ALSO_SHOWN]]
+    others = [f for f in sorted(found, key=lambda f: f.left) if f.hypothesis.names not in names]
+    shown = [*likely, *[f for f in others if not any(hypotheses.is_part_of(g, f) for g in likely)][:ALSO_SHOWN]]
 
     def explanation(f: HypothesisTest) -> Explanation:
         excluded = {g.hypothesis.names: hypotheses.excludes(f, g, scale) for g in shown if g is not f}

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 from scipy import special
@@ -220,12 +220,11 @@ def named_changes(v: Variables) -> dict[str, Floats]:
 
 def pairs_of_zeros(hypotheses: Sequence[ChangeHypothesis]) -> list[ChangeHypothesis]:
     """Two zeros together."""
-    zeros = [one for one in hypotheses if one.kind == "zero"]
-    return [
-        replace(a, names=a.names + b.names, kind="zeros", units=a.units + b.units,
-                columns=np.hstack([a.columns, b.columns]), directions=np.hstack([a.directions, b.directions]))
-        for a, b in combinations(zeros, 2)
-    ]  # fmt: skip
+    found = []
+    for a, b in combinations([one for one in hypotheses if one.kind == "zero"], 2):
+        columns, directions = (np.hstack(of) for of in ((a.columns, b.columns), (a.directions, b.directions)))
+        found.append(ChangeHypothesis(a.names + b.names, "zeros", a.units + b.units, columns, directions))
+    return found
 
 
 def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
@@ -410,9 +409,9 @@ def advise_configurations(rows: Linear, likely: Sequence[HypothesisTest], probab
         if sigma[0] < LEAST_DIFFERENCE:
             return None
     one, other = (changes[i] for i in pair)
-    shift = (motion(rows, one, q[chosen]) - motion(rows, other, q[chosen]))[:, 1]
+    apart = np.linalg.norm((motion(rows, one, q[chosen]) - motion(rows, other, q[chosen]))[:, 1], axis=1)
     between = one.hypothesis.names, other.hypothesis.names
-    return Advice(q[chosen], between, np.linalg.norm(shift, axis=1), np.array(sigma), needed, sigma[-1] >= needed)
+    return Advice(q[chosen], between, apart, np.array(sigma), needed, sigma[-1] >= needed)
 
 
 def _least_difference(
@@ -430,13 +429,11 @@ def _least_difference(
     fitted = np.linalg.pinv(gram[:n, :n] * np.outer(scale, scale), rcond=1e-13, hermitian=True) * np.outer(scale, scale)
     S = gram[n:, n:] - gram[n:, :n] @ fitted @ gram[:n, n:]
     found = {}
-    for i, at in enumerate(spans):
-        for j, other in enumerate(spans):
-            if i != j:
-                d = changes[i].change
-                t = S[np.ix_(other, at)] @ d
-                left = d @ S[np.ix_(at, at)] @ d - t @ np.linalg.pinv(S[np.ix_(other, other)], rcond=1e-12) @ t
-                found[i, j] = float(left)
+    for i, j in permutations(range(len(spans)), 2):
+        at, other, d = spans[i], spans[j], changes[i].change
+        t = S[np.ix_(other, at)] @ d
+        left = d @ S[np.ix_(at, at)] @ d - t @ np.linalg.pinv(S[np.ix_(other, other)], rcond=1e-12) @ t
+        found[i, j] = float(left)
     pair = min(found, key=found.__getitem__)
     return found[pair], pair
 

@@ -214,15 +214,12 @@ def _of_rows(m: Measurements) -> Words:
     """Hashes of what was measured at, and between, configurations."""
     given = [v for v in (m.position, m.rotation, m.length, m.image, *m.columns.values()) if v is not None]
     values = [v.reshape(len(m.readings), -1) for v in given]
-    labels = [m.labels[kind.name] for kind in LANDMARKS.values() if kind.name in m.labels]
-    named = [(label.names, label.index) for label in labels] + (
-        [] if m.groups is None else [(m.groups.names, m.groups.index)]
-    )
-    measured = np.any([np.isfinite(v).all(axis=1) for v in values], axis=0) | (
-        m.groups is not None and m.groups.index >= 0
-    )
-    codes = [np.array([*(zlib.crc32(name.encode()) for name in names), 0], dtype=np.uint64)[i] for names, i in named]
-    found = [_hash(m.readings, *values, *codes)[np.broadcast_to(measured & ~m.test, len(m.readings))]]
+    labels = [*(m.labels.get(kind.name) for kind in LANDMARKS.values()), m.groups]
+    named = [one for one in labels if one is not None]
+    codes = [np.array([*(zlib.crc32(n.encode()) for n in of.names), 0], dtype=np.uint64)[of.index] for of in named]
+    touched = np.zeros(len(m.readings), dtype=np.bool_) if m.groups is None else m.groups.index >= 0
+    measured = np.any([touched, *(np.isfinite(v).all(axis=1) for v in values)], axis=0)
+    found = [_hash(m.readings, *values, *codes)[measured & ~m.test]]
     if m.pairs is not None:
         ends, pairs = _hash(m.readings), m.pairs
         found.append(_hash(ends[pairs.a], ends[pairs.b], pairs.distance, pairs.angle)[~pairs.test])

@@ -104,30 +104,29 @@ def _require_determined(robot: Robot, kept: Sequence[str]) -> None:
 
 
 def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]) -> Knowledge:
-    """What is known of an arm that may have changed since, the tolerances among it."""
-    wandered, free = _growth(known, growth), _changes(known, changed)
-    grown = known.grown(np.hstack([wandered, free]), np.arange(wandered.shape[1] + free.shape[1]) >= wandered.shape[1])
+    """What is known of an arm that may have changed since, the tolerances among it.
+
+    Growth of a parameter's name counts before that of its kind.
+    """
+    kinds = {p.name: tolerance_kind(p) or "" for p in known.robot.parameters}
+    names, free = known.variables.names, dict.fromkeys(changed, 1.0)
+    of_kinds = sorted({kinds[name] for name in names if kinds[name]})
+    for key, given, possible in (
+        ("growth", growth, [*names, *of_kinds]),
+        ("changed", changed, list(named_changes(known.variables))),
+    ):
+        for name in given:
+            if name not in possible:
+                hint = did_you_mean(name, possible, NEAR)
+                raise InputError(key, f"unknown parameter {name!r}", known_names(possible), hint)
+    sigma = {name: growth.get(name, growth.get(kinds[name], 0.0)) for name in names}
+    wandered = _columns(known, {name: size for name, size in sigma.items() if size > 0.0})
+    columns = np.hstack([wandered, _columns(known, free)])
+    grown = known.grown(columns, np.arange(columns.shape[1]) >= wandered.shape[1])
     if known.nominal is None:
         return grown
-    free = _changes(known.nominal, changed)
-    return replace(grown, nominal=known.nominal.grown(free, np.ones(free.shape[1], dtype=np.bool_)))
-
-
-def _growth(known: Knowledge, growth: Mapping[str, float]) -> Floats:
-    """Changes of 1 sigma of growth as columns of what is known; that of a name counts before that of its kind."""
-    of_kind = {p.name: tolerance_kind(p) or "" for p in known.robot.parameters}
-    names = known.variables.names
-    for key in growth:
-        _check_name("growth", key, [*names, *sorted({of_kind[name] for name in names if of_kind[name]})])
-    sigma = {name: growth.get(name, growth.get(of_kind[name], 0.0)) for name in names}
-    return _columns(known, {name: size for name, size in sigma.items() if size > 0.0})
-
-
-def _changes(known: Knowledge, changed: Sequence[str]) -> Floats:
-    """Directions of what has changed as columns of what is known."""
-    for name in changed:
-        _check_name("changed", name, list(named_changes(known.variables)))
-    return _columns(known, dict.fromkeys(changed, 1.0))
+    columns = _columns(known.nominal, free)
+    return replace(grown, nominal=known.nominal.grown(columns, np.ones(columns.shape[1], dtype=np.bool_)))
 
 
 def _columns(known: Knowledge, sizes: Mapping[str, float]) -> Floats:
@@ -135,8 +134,3 @@ def _columns(known: Knowledge, sizes: Mapping[str, float]) -> Floats:
     of, n = named_changes(known.variables), known.variables.n_columns
     columns = np.hstack([np.zeros((n, 0)), *(size * of[name] for name, size in sizes.items())])
     return np.pad(columns, ((0, len(known.at)), (0, 0)))
-
-
-def _check_name(key: str, name: str, possible: Sequence[str]) -> None:
-    if name not in possible:
-        raise InputError(key, f"unknown parameter {name!r}", known_names(possible), did_you_mean(name, possible, NEAR))
