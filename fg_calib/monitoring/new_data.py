@@ -15,21 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from fg_calib import graph
 from fg_calib.diagnostics import basis_of
-from fg_calib.graph import (
-    Knowledge,
-    Problem,
-    Solution,
-    at_parameters,
-    coordinates_of,
-    problem_at,
-    solve,
-    start_of,
-    tables_of,
-    unknown_prior_rows,
-    variables_of,
-    with_factors,
-)
 from fg_calib.inputs import Booleans, Floats, Integers, Options, ProblemError
 from fg_calib.measurements import INSTRUMENTS, Dataset, KnownPoint, Table, build_dataset
 from fg_calib.monitoring.prior_information import Calibrated
@@ -59,7 +46,7 @@ class Rows:
             like: Of each the name of the calibration's table that it is like.
             options: Of the calibration.
         """
-        parts = [(part, name) for t, name in zip(tables, like, strict=True) for part in tables_of([t], options)]
+        parts = [(part, name) for t, name in zip(tables, like, strict=True) for part in graph.tables_of([t], options)]
         return cls(tuple(part for part, _ in parts), tuple(name for _, name in parts))
 
     def all_train(self) -> Rows:
@@ -71,7 +58,7 @@ class Rows:
         tables = (t.tested_on(which) for t, which in zip(self.tables, configurations, strict=True))
         return replace(self, tables=tuple(tables))
 
-    def held_at(self, known: Knowledge | None) -> tuple[Table, ...]:
+    def held_at(self, known: graph.Knowledge | None) -> tuple[Table, ...]:
         """The tables with targets and anchors held where they were found to be."""
         found = {} if known is None else {name: known.place(name) for name in known.unknowns}
 
@@ -82,7 +69,7 @@ class Rows:
 
         return tuple(map(held, self.tables))
 
-    def free_of(self, known: Knowledge | None) -> tuple[Table, ...]:
+    def free_of(self, known: graph.Knowledge | None) -> tuple[Table, ...]:
         """The tables with targets and anchors to be estimated of which the calibration says where they are."""
         stays = () if known is None else {name for _, name in known.unknowns}
         return tuple(replace(t, known={n: at for n, at in t.known.items() if n not in stays}) for t in self.tables)
@@ -100,8 +87,8 @@ class Placed:
     """
 
     calibrated: Calibrated
-    solution: Solution
-    problem: Problem
+    solution: graph.Solution
+    problem: graph.Problem
     pinned: tuple[tuple[str, str], ...]
 
     def errors(self) -> tuple[HeldOut, ...]:
@@ -126,19 +113,21 @@ def place_new_data(calibrated: Calibrated, rows: Rows, values: Floats) -> Placed
     options = replace(calibrated.fixed_options, gauge="none", encoder="propagated", loss="none", prefer=())
     state, arm = calibrated.noise_of(rows.like), robot.with_estimated([])
     data = build_dataset(arm, rows.held_at(known))
-    v = variables_of(arm, data, options)
-    x = start_of(arm, data, v)
-    held = with_factors(problem_at(arm, data, options, v, x), x, state)
+    v = graph.variables_of(arm, data, options)
+    x = graph.start_of(arm, data, v)
+    held = graph.with_factors(graph.problem_at(arm, data, options, v, x), x, state)
     if not held.n_residuals:
         raise ProblemError(data.source, "no row takes part", "rows that model and options use")
-    solution, arm = solve(held), robot.with_estimated(names_of(robot.parameters))
+    solution, arm = graph.solve(held), robot.with_estimated(names_of(robot.parameters))
     problem = started(arm, build_dataset(arm, rows.free_of(known)), options, values, solution)
     seen, of = () if known is None else known.unknowns, problem.data.landmarks
-    pinned = tuple(name for name in seen if coordinates_of(problem.variables, of, name) is not None)
+    pinned = tuple(name for name in seen if graph.coordinates_of(problem.variables, of, name) is not None)
     return Placed(calibrated, solution, problem, pinned)
 
 
-def started(arm: Robot, data: Dataset, options: Options, values: Floats, fit: Solution, **more: Any) -> Problem:
+def started(
+    arm: Robot, data: Dataset, options: Options, values: Floats, fit: graph.Solution, **more: Any
+) -> graph.Problem:
     """The problem of new rows, started at the arm as it was calibrated and at what was fitted to the rows.
 
     Args:
@@ -149,12 +138,12 @@ def started(arm: Robot, data: Dataset, options: Options, values: Floats, fit: So
         fit: The fit of the same rows with the arm held.
         more: What else the problem has.
     """
-    v = variables_of(arm, data, options)
+    v = graph.variables_of(arm, data, options)
     x, there = v.nominal(), v.coordinates >= 0
     x[v.robot_span], x[v.frame_span] = values, fit.parameters[v.frame_span]
-    x[v.coordinates[there]] = at_parameters(fit.problem, fit.parameters).coordinates[there]
-    made = problem_at(arm, data, options, v, x, **more)
-    return with_factors(made, x, replace(made.state, factors=fit.problem.state.factors))
+    x[v.coordinates[there]] = graph.at_parameters(fit.problem, fit.parameters).coordinates[there]
+    made = graph.problem_at(arm, data, options, v, x, **more)
+    return graph.with_factors(made, x, replace(made.state, factors=fit.problem.state.factors))
 
 
 @dataclass(frozen=True)
@@ -219,8 +208,8 @@ def linearise_new_data(at: Placed) -> Linear:
     wide = v.n_columns + v.n_nuisance
     every = problem.rows.states.whiten(problem.rows.private(v.at(problem.start)))
     J, r = every[:, :wide], every[:, wide]
-    stated, J_stated = unknown_prior_rows(v, problem.start)
-    places = [coordinates_of(v, problem.data.landmarks, name) for name in at.pinned]
+    stated, J_stated = graph.unknown_prior_rows(v, problem.start)
+    places = [graph.coordinates_of(v, problem.data.landmarks, name) for name in at.pinned]
     pinned = np.array([place for place in places if place is not None], dtype=np.int64).ravel()
     pinned = pinned - v.nuisance_span.start + v.n_columns
     unit, known, information = np.eye(wide), np.zeros((wide, 0)), np.zeros((0, 0))
@@ -247,7 +236,7 @@ def linearise_new_data(at: Placed) -> Linear:
     )
 
 
-def ends_of_rows(problem: Problem) -> Integers:
+def ends_of_rows(problem: graph.Problem) -> Integers:
     """The configurations of each row that is whitened by its private noise, -1 for no second one, shape (n, 2)."""
     found = []
     for part in problem.rows.parts:

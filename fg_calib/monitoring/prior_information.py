@@ -16,21 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph import (
-    JOINT_NOISE,
-    SIZE,
-    STAYING,
-    Knowledge,
-    Name,
-    NoiseName,
-    NoiseState,
-    Problem,
-    Solution,
-    coordinates_of,
-    eliminate,
-    prior_rows,
-    square_root,
-)
+from fg_calib import graph
 from fg_calib.inputs import Floats, Options
 from fg_calib.measurements import LANDMARKS, Measurements, Table
 from fg_calib.observability import ObservedQuantities
@@ -62,13 +48,13 @@ class Calibrated:
 
     robot: Robot
     values: Floats
-    knowledge: Knowledge | None
+    knowledge: graph.Knowledge | None
     options: Options
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     noise_degrees: float | None = None
 
     @cached_property
-    def information(self) -> Knowledge | None:
+    def information(self) -> graph.Knowledge | None:
         """What rows and tolerances say."""
         if self.knowledge is None or not self.options.has_priors:
             return self.knowledge
@@ -85,23 +71,23 @@ class Calibrated:
         """Its options, noise and prior sigmas as they were found."""
         return replace(self.options, estimate_noise=False, estimate_tolerance=None)
 
-    def noise_of(self, like: Sequence[str]) -> NoiseState:
+    def noise_of(self, like: Sequence[str]) -> graph.NoiseState:
         """The noise of new tables: as it was found, of the only table if there was one.
 
         Args:
             like: Of each table the name of the calibration's table that it is like.
         """
-        factors: dict[NoiseName, float] = {}
+        factors: dict[graph.NoiseName, float] = {}
         of_tables = {name: kinds for name, kinds in self.noise.items() if name}
         if "joint" in self.noise.get("", {}):
-            factors[JOINT_NOISE] = self.noise[""]["joint"]
+            factors[graph.JOINT_NOISE] = self.noise[""]["joint"]
         for number, name in enumerate(like):
             kinds = of_tables.get(name) or (next(iter(of_tables.values())) if len(of_tables) == 1 else {})
             factors |= {(number, kind): factor for kind, factor in kinds.items()}
-        return NoiseState(factors=factors)
+        return graph.NoiseState(factors=factors)
 
 
-def knowledge_of(solution: Solution) -> Knowledge | None:
+def knowledge_of(solution: graph.Solution) -> graph.Knowledge | None:
     """What the rows of a solution say of the arm, targets and anchors, with what was known before.
 
     Tolerances of the arm are not counted among it, said places of targets and anchors are. Parameters that were left
@@ -123,7 +109,7 @@ def knowledge_of(solution: Solution) -> Knowledge | None:
     return replace(_known_at(problem, solution.parameters, with_loss=True), views=views, nominal=nominal)
 
 
-def at_nominal(problem: Problem, before: Floats) -> tuple[Problem, Floats]:
+def at_nominal(problem: graph.Problem, before: Floats) -> tuple[graph.Problem, Floats]:
     """A problem and the parameter vector at which one asks what its rows, and those before, determine.
 
     Args:
@@ -142,7 +128,7 @@ def at_nominal(problem: Problem, before: Floats) -> tuple[Problem, Floats]:
     return replace(problem, knowledge=known), x
 
 
-def _known_at(problem: Problem, x: Floats, *, with_loss: bool) -> Knowledge:
+def _known_at(problem: graph.Problem, x: Floats, *, with_loss: bool) -> graph.Knowledge:
     """What the rows of a problem, and those before, say, linearised at a parameter vector."""
     v = problem.variables
     robot = v.robot.with_values(x[v.robot_span])
@@ -153,26 +139,28 @@ def _known_at(problem: Problem, x: Floats, *, with_loss: bool) -> Knowledge:
     columns = [place - v.nuisance_span.start + v.n_columns for place in places.values()]
     wide = np.arange(A.shape[1])
     kept = np.concatenate([wide[: v.n_robot_columns], *columns, wide[v.n_columns + v.n_nuisance :]])
-    left = eliminate(A[:, np.concatenate([kept, np.setdiff1d(wide, kept)])], b, len(kept))
+    left = graph.eliminate(A[:, np.concatenate([kept, np.setdiff1d(wide, kept)])], b, len(kept))
     at = [x[place] for place in places.values()]
     if before is not None:
         at += [before.place(name) for name in unseen]
-    return Knowledge.of_rows(robot, [*places, *unseen], np.concatenate([np.zeros(0), *at]), left.A, left.b)
+    return graph.Knowledge.of_rows(robot, [*places, *unseen], np.concatenate([np.zeros(0), *at]), left.A, left.b)
 
 
-def _staying(problem: Problem) -> list[Name]:
+def _staying(problem: graph.Problem) -> list[graph.Name]:
     unknowns = problem.data.landmarks
-    return [name for name in unknowns.keys if name[0] in STAYING]
+    return [name for name in unknowns.keys if name[0] in graph.STAYING]
 
 
-def _place(problem: Problem, name: Name) -> NDArray[np.int64] | None:
-    return coordinates_of(problem.variables, problem.data.landmarks, name)
+def _place(problem: graph.Problem, name: graph.Name) -> NDArray[np.int64] | None:
+    return graph.coordinates_of(problem.variables, problem.data.landmarks, name)
 
 
-def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss: bool) -> tuple[Floats, Floats]:
+def _rows(
+    problem: graph.Problem, parameters: Floats, unseen: list[graph.Name], *, with_loss: bool
+) -> tuple[Floats, Floats]:
     """All rows but the arm's tolerances, by the problem's columns, then by those of what was known and is not seen."""
-    v, extra = problem.variables, SIZE * len(unseen)
-    B = square_root(replace(problem, knowledge=None), parameters, with_loss=with_loss)
+    v, extra = problem.variables, graph.SIZE * len(unseen)
+    B = graph.square_root(replace(problem, knowledge=None), parameters, with_loss=with_loss)
     wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]])]
     known = problem.knowledge
     if known is not None:
@@ -183,7 +171,7 @@ def _rows(problem: Problem, parameters: Floats, unseen: list[Name], *, with_loss
     return every[:, :-1], every[:, -1]
 
 
-def with_tolerances(known: Knowledge, nominal: Floats, tolerances: dict[str, float]) -> Knowledge:
+def with_tolerances(known: graph.Knowledge, nominal: Floats, tolerances: dict[str, float]) -> graph.Knowledge:
     """Knowledge with the arm's tolerances about its nominal values as rows of their own.
 
     Args:
@@ -194,7 +182,7 @@ def with_tolerances(known: Knowledge, nominal: Floats, tolerances: dict[str, flo
     parameters = tuple(replace(p, tolerance=tolerances.get(p.name)) for p in known.robot.parameters)
     robot = replace(known.robot, parameters=parameters).with_values(nominal)
     variables = replace(known.variables, robot=robot, priors=True)
-    r, J = prior_rows(variables, np.append(known.robot.nominal, np.zeros(6)))
+    r, J = graph.prior_rows(variables, np.append(known.robot.nominal, np.zeros(6)))
     return known.with_rows(np.hstack([J, np.zeros((len(J), len(known.at)))]), r)
 
 

@@ -23,19 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.graph import (
-    RANK_TOLERANCE,
-    SIGNAL_FLOOR,
-    SUPPORT_TOLERANCE,
-    NormalSystem,
-    Problem,
-    Solution,
-    Variables,
-    correlation,
-    determined,
-    linear_system,
-    prior_rows,
-)
+from fg_calib import graph
 from fg_calib.inputs import Floats, FrozenArrays
 from fg_calib.robot import Robot
 
@@ -56,7 +44,7 @@ class TangentCovariance(FrozenArrays):
         loose_at_nominal: The same at the nominal parameters.
     """
 
-    variables: Variables
+    variables: graph.Variables
     parameters: Floats
     tangent: Floats
     loose: Floats
@@ -84,7 +72,9 @@ class TangentCovariance(FrozenArrays):
         with np.errstate(invalid="ignore"):
             size = np.linalg.norm(scaled, axis=1)
             shares = [np.linalg.norm(scaled @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)]
-            found: NDArray[np.bool_] = (shares[0] > SUPPORT_TOLERANCE * size) & (shares[1] > SUPPORT_TOLERANCE * size)
+            found: NDArray[np.bool_] = (shares[0] > graph.SUPPORT_TOLERANCE * size) & (
+                shares[1] > graph.SUPPORT_TOLERANCE * size
+            )
         return found
 
     def named(self) -> Floats:
@@ -130,7 +120,7 @@ class Spread(TangentCovariance):
     excess: float
 
 
-def spread_of(solution: Solution) -> Spread:
+def spread_of(solution: graph.Solution) -> Spread:
     """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.
 
     Parameters that were left out to fix the gauge count as known; see `with_left_out`. Where nothing determines frames,
@@ -142,15 +132,15 @@ def spread_of(solution: Solution) -> Spread:
     `robust.Effect`.
     """
     problem, variables = solution.problem, solution.problem.variables
-    system = linear_system(problem, solution.parameters, with_loss=True)
+    system = graph.linear_system(problem, solution.parameters, with_loss=True)
     nominal = system
     if solution.before is not solution.parameters:
-        nominal = linear_system(problem, solution.before, with_loss=True)
+        nominal = graph.linear_system(problem, solution.before, with_loss=True)
     rank, half, scales = system.rank, system.root, variables.prior_scales
     loose, loose_at_nominal = system.directions[rank:], nominal.directions[nominal.rank :]
     held = held_frames(loose, loose_at_nominal, scales, variables.n_robot_columns)
     root = np.hstack([half, held])
-    added = correlation(problem, solution.parameters)
+    added = graph.correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
     return Spread(
         variables=variables,
@@ -180,12 +170,12 @@ def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot
     """
     at_nominal, here = loose_at_nominal / scales, loose / scales
     U, s, _ = np.linalg.svd(at_nominal[:, :n_robot])
-    of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= SUPPORT_TOLERANCE].T @ at_nominal
+    of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= graph.SUPPORT_TOLERANCE].T @ at_nominal
     turned: Floats = of_frames @ here.T @ here
-    return (turned * scales).T / SIGNAL_FLOOR
+    return (turned * scales).T / graph.SIGNAL_FLOOR
 
 
-def covariance_of_rows(variables: Variables, parameters: Floats, rows: Floats) -> TangentCovariance:
+def covariance_of_rows(variables: graph.Variables, parameters: Floats, rows: Floats) -> TangentCovariance:
     """The covariance that whitened rows and the robot's tolerances make, both at one parameter vector.
 
     Args:
@@ -193,14 +183,14 @@ def covariance_of_rows(variables: Variables, parameters: Floats, rows: Floats) -
         parameters: The parameter vector.
         rows: Derivatives in the core, nuisances eliminated, shape (m, n_columns).
     """
-    r, J = prior_rows(variables, parameters)
+    r, J = graph.prior_rows(variables, parameters)
     priors, square_root = np.column_stack([J, r]), np.pad(rows, ((0, 0), (0, 1)))
-    system = NormalSystem(square_root, variables.n_columns, variables.prior_scales, priors)
+    system = graph.NormalSystem(square_root, variables.n_columns, variables.prior_scales, priors)
     loose = _orthonormal(system.directions[system.rank :], variables.scales)
     return TangentCovariance(variables, parameters, system.covariance, loose, loose)
 
 
-def with_left_out(solution: Solution, spread: Spread) -> Spread:
+def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
     """The covariance of all parameters, those among them that were left out to fix the gauge: see the module's head.
 
     Where prior sigmas were estimated, what is not known of these is added.
@@ -233,7 +223,7 @@ def with_left_out(solution: Solution, spread: Spread) -> Spread:
     )
 
 
-def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
+def _errors(problem: graph.Problem, parameters: Floats) -> tuple[Floats, Floats]:
     """How the error of the estimate comes about, in the columns of all parameters, left-out ones among them.
 
     Args:
@@ -250,9 +240,9 @@ def _errors(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     by_name = dict(zip(whole.names, derivative.T, strict=True))
     left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
     N = np.array(left_out).reshape(-1, whole.n_columns).T
-    J = linear_system(replace(problem, variables=whole), parameters).left.A
+    J = graph.linear_system(replace(problem, variables=whole), parameters).left.A
     U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
-    rank = determined(s)
+    rank = graph.determined(s)
     G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))
     return M, M @ G - N
 
@@ -262,5 +252,5 @@ def _orthonormal(directions: Floats, scales: Floats) -> Floats:
     scaled = directions / scales
     scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
     _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    basis: Floats = Vt[s > RANK_TOLERANCE * s.max(initial=0.0)]
+    basis: Floats = Vt[s > graph.RANK_TOLERANCE * s.max(initial=0.0)]
     return basis

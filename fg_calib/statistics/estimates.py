@@ -12,16 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.graph import (
-    Problem,
-    Solution,
-    Variables,
-    at_parameters,
-    corrections_of,
-    joint_errors,
-    linear_system,
-    pose_of,
-)
+from fg_calib import graph
 from fg_calib.inputs import Floats, FrozenArrays, Integers
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
@@ -162,7 +153,7 @@ class Estimates:
         return self.frames[0] if self.frames else None
 
 
-def estimates_at(solution: Solution, spread: Spread, whole: Spread, observability: Observability) -> Estimates:
+def estimates_at(solution: graph.Solution, spread: Spread, whole: Spread, observability: Observability) -> Estimates:
     """All estimates of a solution with their sigmas.
 
     Args:
@@ -179,7 +170,9 @@ def estimates_at(solution: Solution, spread: Spread, whole: Spread, observabilit
     )
 
 
-def estimate_frames(variables: Variables, parameters: Floats, whole: TangentCovariance) -> tuple[FrameEstimate, ...]:
+def estimate_frames(
+    variables: graph.Variables, parameters: Floats, whole: TangentCovariance
+) -> tuple[FrameEstimate, ...]:
     """Every measurement frame that was estimated.
 
     Args:
@@ -189,7 +182,7 @@ def estimate_frames(variables: Variables, parameters: Floats, whole: TangentCova
     """
     found, columns = [], np.eye(len(whole.tangent))[whole.variables.n_robot_columns :]
     for k, v in enumerate(variables.frames):
-        world_T_base = pose_of(parameters[v.places])
+        world_T_base = graph.pose_of(parameters[v.places])
         quaternion = Rotation.from_matrix(world_T_base.rotation().matrix()).as_quat(canonical=True)
         sigma = np.sqrt(np.diag(whole.covariance(columns[6 * k : 6 * k + 6])))
         found.append(FrameEstimate(world_T_base.translation(), quaternion, sigma))
@@ -197,7 +190,7 @@ def estimate_frames(variables: Variables, parameters: Floats, whole: TangentCova
 
 
 def _parameters(
-    solution: Solution, spread: Spread, whole: Spread, observability: Observability
+    solution: graph.Solution, spread: Spread, whole: Spread, observability: Observability
 ) -> tuple[ParameterEstimate, ...]:
     problem, estimated = solution.problem, spread.variables.names
     classes = dict(zip(observability.names, observability.classes, strict=True))
@@ -206,7 +199,7 @@ def _parameters(
     for group in observability.relative if problem.whole is not None else ():
         combinations |= group.combinations([name for name in group.parameters if name in estimated])
     of_combinations = dict(zip(estimated, np.sqrt(np.diag(spread.named())), strict=False)) if combinations else {}
-    corrections = corrections_of(problem.robot, solution.parameters[problem.variables.robot_span])
+    corrections = graph.corrections_of(problem.robot, solution.parameters[problem.variables.robot_span])
     return tuple(
         ParameterEstimate(
             name=p.name,
@@ -229,14 +222,14 @@ def finite(sigma: float) -> float | None:
     return float(sigma) if np.isfinite(sigma) else None
 
 
-def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...]:
+def _landmarks(solution: graph.Solution, whole: Spread) -> tuple[LandmarkEstimate, ...]:
     """Landmarks; their sigma comes from the parameters, which they follow, and from their own rows."""
     problem = solution.problem
     unknowns = problem.data.landmarks
     if not unknowns.names:
         return ()
-    at = at_parameters(problem, solution.parameters)
-    left = linear_system(replace(problem, variables=whole.variables), solution.parameters).left
+    at = graph.at_parameters(problem, solution.parameters)
+    left = graph.linear_system(replace(problem, variables=whole.variables), solution.parameters).left
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
     names, found = unknowns.keys, []
     for i, (_, name) in enumerate(names):
@@ -259,7 +252,7 @@ def _landmarks(solution: Solution, whole: Spread) -> tuple[LandmarkEstimate, ...
     return tuple(found)
 
 
-def _n_rows(problem: Problem) -> Integers:
+def _n_rows(problem: graph.Problem) -> Integers:
     """Number of train measurements that each landmark takes part in, shape (n_landmarks,)."""
     unknowns = problem.data.landmarks
     counts = np.zeros(len(unknowns.names), dtype=np.int64)
@@ -269,7 +262,7 @@ def _n_rows(problem: Problem) -> Integers:
     return counts
 
 
-def _joint_errors(solution: Solution) -> JointErrors | None:
+def _joint_errors(solution: graph.Solution) -> JointErrors | None:
     problem, data = solution.problem, solution.problem.data
     if not problem.joints_estimated:
         return None
@@ -277,10 +270,10 @@ def _joint_errors(solution: Solution) -> JointErrors | None:
     sigma = problem.sigma_joint[joints]
     rows, slots = problem.rows.configurations, problem.rows.slots
     share, of_joints = np.zeros((len(rows), problem.robot.n_joints)), slots < problem.robot.n_joints
-    variance = linear_system(problem, solution.parameters).z_variance.reshape(len(rows), -1)
+    variance = graph.linear_system(problem, solution.parameters).z_variance.reshape(len(rows), -1)
     share[:, slots[of_joints]] = 1.0 - variance[:, of_joints]  # of its prior variance, by which an error varies
     share = share[:, joints]
-    error = joint_errors(problem, solution.parameters)[np.ix_(rows, joints)]
+    error = graph.joint_errors(problem, solution.parameters)[np.ix_(rows, joints)]
     with np.errstate(invalid="ignore", divide="ignore"):
         studentised = np.where(share > LEAST_SHARE, error / (sigma * np.sqrt(share)), np.nan)
     size = np.nan_to_num(np.abs(studentised))

@@ -54,21 +54,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from fg_calib.graph import (
-    RANK_TOLERANCE,
-    Problem,
-    Solution,
-    ToleranceScale,
-    ToleranceScales,
-    Variables,
-    correlation,
-    eliminate,
-    linear_system,
-    prior_rows,
-    solve,
-    unknown_prior_rows,
-    with_factors,
-)
+from fg_calib import graph
 from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, SharedScale, checked
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Parameter, Robot, tolerance_kind
@@ -99,7 +85,9 @@ QUANTILE = 1.959963984540054
 
 @checked
 @single_threaded
-def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Solution] = solve) -> Solution:
+def estimate_tolerances(
+    problem: graph.Problem, solve_with: Callable[[graph.Problem], graph.Solution] = graph.solve
+) -> graph.Solution:
     """Estimate the parameters and, with them, a scale on the prior sigmas of each group.
 
     Args:
@@ -122,7 +110,7 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
     group = np.array([groups.index(name) for name in names], dtype=np.int64)
     members = tuple(tuple(p.name for p, k in zip(parameters, group, strict=True) if k == j) for j in range(len(groups)))
 
-    def refit(theta: Floats) -> tuple[Solution, Floats, tuple[Floats, EstimatedScales, Floats]]:
+    def refit(theta: Floats) -> tuple[graph.Solution, Floats, tuple[Floats, EstimatedScales, Floats]]:
         solution = solve_with(_with_scales(problem, by, dict(zip(groups, np.exp(theta).tolist(), strict=True))))
         corrections, follow = _corrections(solution, specified, np.exp(theta)[group], group)
         found = fit_scales(corrections)
@@ -130,8 +118,10 @@ def estimate_tolerances(problem: Problem, solve_with: Callable[[Problem], Soluti
 
     solution, (theta, found, follow) = settle(refit, len(groups), SETTLED, "tolerances")
     figures = (v.tolist() for v in (*np.exp([theta, *found.interval]), found.mean.determined))
-    scales = tuple(ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
-    return replace(solution, estimated_tolerances=ToleranceScales(scales, follow @ found.added_covariance @ follow.T))
+    scales = tuple(graph.ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
+    return replace(
+        solution, estimated_tolerances=graph.ToleranceScales(scales, follow @ found.added_covariance @ follow.T)
+    )
 
 
 @dataclass(frozen=True)
@@ -248,7 +238,7 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
 
 
 def _corrections(
-    solution: Solution, specified: Variables, scale: Floats, group: Integers
+    solution: graph.Solution, specified: graph.Variables, scale: Floats, group: Integers
 ) -> tuple[Corrections, Floats]:
     """What the data say of the corrections in specified prior sigmas, to first order at a solution.
 
@@ -267,18 +257,18 @@ def _corrections(
     """
     problem, at = solution.problem, solution.parameters
     by = specified.prior_scales
-    u, P = prior_rows(specified, at)
+    u, P = graph.prior_rows(specified, at)
     U, s, Vt = np.linalg.svd(P * by)
     back, rest = by[:, None] * (Vt[: len(s)].T / s) @ U.T, by[:, None] * Vt[len(s) :].T
-    J = linear_system(problem, at).left.A
-    left = eliminate(np.hstack([J @ back, J @ rest]), np.zeros(len(J)), len(u))
+    J = graph.linear_system(problem, at).left.A
+    left = graph.eliminate(np.hstack([J @ back, J @ rest]), np.zeros(len(J)), len(u))
     follow = back + rest @ left.follow
     G = left.A.T @ left.A
     g = G @ u + u / scale**2
-    added = correlation(problem, at)
+    added = graph.correlation(problem, at)
     if added is not None:
         values, V = np.linalg.eigh(G + follow.T @ added @ follow)
-        kept = values > RANK_TOLERANCE * values.max(initial=0.0)
+        kept = values > graph.RANK_TOLERANCE * values.max(initial=0.0)
         gain = G @ (V[:, kept] / values[kept]) @ V[:, kept].T
         G, g = gain @ G, gain @ g
     return Corrections(G, g, group), follow
@@ -335,7 +325,7 @@ class PriorFit(FrozenArrays):
     beyond: tuple[Beyond, ...]
 
 
-def judge_priors(solution: Solution, spread: Spread) -> PriorFit | None:
+def judge_priors(solution: graph.Solution, spread: Spread) -> PriorFit | None:
     """Judge corrections against prior sigmas; None without priors.
 
     Args:
@@ -358,16 +348,16 @@ def judge_priors(solution: Solution, spread: Spread) -> PriorFit | None:
     )
 
 
-def _judged_rows(solution: Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats]:
+def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats]:
     """What prior rows are of, those of landmarks last; z, and its covariance A."""
     problem, variables = solution.problem, solution.problem.variables
-    z, P = prior_rows(variables, solution.parameters)
+    z, P = graph.prior_rows(variables, solution.parameters)
     names = [p.name for p in _prior_parameters(variables)]
-    z_places, P_places = unknown_prior_rows(variables, solution.parameters)
+    z_places, P_places = graph.unknown_prior_rows(variables, solution.parameters)
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
         # The places' errors follow those of the core, and what is theirs alone comes on top.
-        left, unknowns = linear_system(problem, solution.parameters, with_loss=True).left, problem.data.landmarks
+        left, unknowns = graph.linear_system(problem, solution.parameters, with_loss=True).left, problem.data.landmarks
         of_core, of_places = P_places[:, : variables.n_columns], P_places[:, variables.n_columns :]
         P = np.vstack([P, of_core + of_places @ left.follow])
         own = np.vstack([np.zeros((len(z), left.rank)), of_places @ left.inverse])
@@ -412,7 +402,7 @@ def _inverse(C: Floats, rows: Integers) -> Floats:
     return out
 
 
-def _prior_parameters(variables: Variables) -> list[Parameter]:
+def _prior_parameters(variables: graph.Variables) -> list[Parameter]:
     """The parameter of each row of `prior_rows`, in their order."""
     owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
     return [p for p in owned if p.tolerance is not None] if variables.priors else []
@@ -423,7 +413,7 @@ def _group_of(robot: Robot, parameter: Parameter, by: SharedScale) -> str:
     return owner if by == "joint" else tolerance_kind(parameter) or f"{owner} angles"
 
 
-def _with_scales(problem: Problem, by: SharedScale, scales: Mapping[str, float]) -> Problem:
+def _with_scales(problem: graph.Problem, by: SharedScale, scales: Mapping[str, float]) -> graph.Problem:
     """The problem from its start, with the tolerances of each group multiplied, those of fixed parameters too.
 
     Args:
@@ -438,4 +428,4 @@ def _with_scales(problem: Problem, by: SharedScale, scales: Mapping[str, float])
         for p in problem.robot.parameters
     )
     robot = replace(problem.robot, parameters=parameters)
-    return with_factors(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))
+    return graph.with_factors(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))

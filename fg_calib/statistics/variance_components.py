@@ -38,20 +38,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from fg_calib.graph import (
-    JOINT_NOISE,
-    NoiseName,
-    Problem,
-    RowNoise,
-    Solution,
-    SolverOptions,
-    WhitenedSeries,
-    block_diagonal,
-    linear_system,
-    relinearized_at,
-    solve,
-    whitener_of,
-)
+from fg_calib import graph
 from fg_calib.inputs import Booleans, Floats, Integers, checked
 from fg_calib.parallel import single_threaded
 
@@ -94,7 +81,7 @@ class NoiseComponents:
         information: T, degrees of freedom in the logarithms of the factors, shape (n, n).
     """
 
-    names: tuple[NoiseName, ...]
+    names: tuple[graph.NoiseName, ...]
     squares: Floats
     expected: Floats
     information: Floats
@@ -105,16 +92,16 @@ class NoiseComponents:
         return 1.0 / max(float(_solve(self.information[np.ix_(chosen, chosen)], np.eye(len(chosen))[-1])[-1]), TINY)
 
 
-def has_joint_noise(problem: Problem) -> bool:
+def has_joint_noise(problem: graph.Problem) -> bool:
     """Whether the noise of joint readings reaches any fitted row."""
     return any(bool(np.any(noise.loading[noise.series.train][:, :, : noise.n_of_joints])) for noise in problem.noises)
 
 
-def noise_components(solution: Solution) -> NoiseComponents:
+def noise_components(solution: graph.Solution) -> NoiseComponents:
     """How much noise of each origin the residuals of a solution show."""
     problem = solution.problem
     names = _origins(problem)
-    system, roots = linear_system(problem, solution.parameters), [_root(problem, name) for name in names]
+    system, roots = graph.linear_system(problem, solution.parameters), [_root(problem, name) for name in names]
     u = system.weighted_residual / np.sqrt(_robust_weights(problem))
     squares = np.array([np.sum((E.T @ u) ** 2) for E in roots])
     expected = np.array([system.trace(E) for E in roots])
@@ -130,19 +117,19 @@ def noise_components(solution: Solution) -> NoiseComponents:
     return NoiseComponents(names, squares, expected, work.T @ system.project(work))
 
 
-def _origins(problem: Problem) -> tuple[NoiseName, ...]:
+def _origins(problem: graph.Problem) -> tuple[graph.NoiseName, ...]:
     """Tables and kinds of the fitted rows, then the joint readings."""
     fitted = [noise for noise in problem.noises if noise.series.used[noise.series.train].any()]
     kinds = dict.fromkeys((noise.series.table, family) for noise in fitted for family in _families(noise))
-    return (*kinds, JOINT_NOISE) if has_joint_noise(problem) else tuple(kinds)
+    return (*kinds, graph.JOINT_NOISE) if has_joint_noise(problem) else tuple(kinds)
 
 
-def _families(noise: RowNoise) -> list[str]:
+def _families(noise: graph.RowNoise) -> list[str]:
     """The kind of noise of each row of a measurement."""
     return [name.partition(".")[0] for name in noise.series.kind.names]
 
 
-def _robust_weights(problem: Problem) -> Floats:
+def _robust_weights(problem: graph.Problem) -> Floats:
     """Robust weight of each row of the linear system, shape (n_rows,)."""
     given, out = problem.state.weights, [np.zeros(0)]
     for part in problem.rows.parts:
@@ -152,7 +139,7 @@ def _robust_weights(problem: Problem) -> Floats:
     return np.concatenate(out)
 
 
-def _root(problem: Problem, name: NoiseName) -> Sparse:
+def _root(problem: graph.Problem, name: graph.NoiseName) -> Sparse:
     """E with E E^T the part of the rows' covariance that noise of one origin makes, shape (n_rows, k)."""
     rows = problem.rows
     found = [_root_of_part(problem.noises[part.series], part, name, rows.shared) for part in rows.parts]
@@ -160,16 +147,18 @@ def _root(problem: Problem, name: NoiseName) -> Sparse:
     return Sparse(scipy.sparse.hstack([private, scipy.sparse.vstack([common for _, common in found])]))
 
 
-def _root_of_part(noise: RowNoise, part: WhitenedSeries, name: NoiseName, shared: Booleans) -> tuple[Sparse, Sparse]:
+def _root_of_part(
+    noise: graph.RowNoise, part: graph.WhitenedSeries, name: graph.NoiseName, shared: Booleans
+) -> tuple[Sparse, Sparse]:
     """How whitened rows follow from noise of one origin: what is private to each measurement, and what is shared."""
-    train, W = noise.series.train, whitener_of(noise, part)
+    train, W = noise.series.train, graph.whitener_of(noise, part)
     of_joints = np.arange(noise.loading.shape[2]) < noise.n_of_joints
     mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
-    origin = of_joints[None] if name == JOINT_NOISE else mine[:, None] & ~of_joints
+    origin = of_joints[None] if name == graph.JOINT_NOISE else mine[:, None] & ~of_joints
     is_state = shared[noise.columns[train]][:, None]
     alone = W @ np.where(origin & ~is_state, noise.loading[train], 0.0)
     own = W @ _square_roots(noise.private_at(train))[:, :, mine]
-    private = block_diagonal(np.concatenate([own, alone] if alone.any() else [own], axis=2))
+    private = graph.block_diagonal(np.concatenate([own, alone] if alone.any() else [own], axis=2))
     return private, noise.errors_at(train, W, origin & is_state)
 
 
@@ -182,7 +171,7 @@ def _square_roots(covariance: Floats) -> Floats:
 
 @checked
 @single_threaded
-def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> Solution:
+def estimate_noise(problem: graph.Problem, options: graph.SolverOptions | None = None) -> graph.Solution:
     """Estimate the parameters and, with them, a factor on the specified noise of each kind.
 
     Args:
@@ -196,7 +185,7 @@ def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> So
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    kept, seconds, asked = frozenset[NoiseName](), 0.0, set[NoiseName]()
+    kept, seconds, asked = frozenset[graph.NoiseName](), 0.0, set[graph.NoiseName]()
     while True:
         solution, degrees = _settle(problem, options, kept)
         seconds += solution.seconds
@@ -206,12 +195,12 @@ def estimate_noise(problem: Problem, options: SolverOptions | None = None) -> So
         name = min(weak, key=lambda name: weak[name])
         asked.add(name)
         as_specified = _scaled(problem, {**solution.problem.state.factors, name: 1.0})
-        if _is_indeterminate(noise_components(solve(as_specified, options)), name, tuple(degrees)):
+        if _is_indeterminate(noise_components(graph.solve(as_specified, options)), name, tuple(degrees)):
             problem, kept = as_specified, kept | {name}
             asked = set(kept)
 
 
-def _is_indeterminate(found: NoiseComponents, name: NoiseName, estimated: Sequence[NoiseName]) -> bool:
+def _is_indeterminate(found: NoiseComponents, name: graph.NoiseName, estimated: Sequence[graph.NoiseName]) -> bool:
     """Whether the residuals say next to nothing of noise of one origin that is as specified."""
     i = found.names.index(name)
     degrees = found.degrees(i, np.array([found.names.index(other) for other in estimated]))
@@ -220,8 +209,8 @@ def _is_indeterminate(found: NoiseComponents, name: NoiseName, estimated: Sequen
 
 
 def _settle(
-    problem: Problem, options: SolverOptions | None, kept: frozenset[NoiseName]
-) -> tuple[Solution, dict[NoiseName, float]]:
+    problem: graph.Problem, options: graph.SolverOptions | None, kept: frozenset[graph.NoiseName]
+) -> tuple[graph.Solution, dict[graph.NoiseName, float]]:
     """Solve and scale the noise until its components are as expected.
 
     Returns:
@@ -230,9 +219,9 @@ def _settle(
     """
     names, factors = _origins(problem), problem.state.factors
 
-    def refit(theta: Floats) -> tuple[Solution, Floats, NoiseComponents]:
+    def refit(theta: Floats) -> tuple[graph.Solution, Floats, NoiseComponents]:
         now = {name: factors.get(name, 1.0) * float(np.exp(t)) for name, t in zip(names, theta, strict=True)}
-        solution = solve(_scaled(problem, now), options)
+        solution = graph.solve(_scaled(problem, now), options)
         found = noise_components(solution)
         return solution, _steps(found, kept), found
 
@@ -243,8 +232,8 @@ def _settle(
 
 
 def settle(
-    refit: Callable[[Floats], tuple[Solution, Floats, Any]], n: int, settled: float, what: str
-) -> tuple[Solution, Any]:
+    refit: Callable[[Floats], tuple[graph.Solution, Floats, Any]], n: int, settled: float, what: str
+) -> tuple[graph.Solution, Any]:
     """Refit with other factors until they settle; steps back are at most half of the last one.
 
     Args:
@@ -269,13 +258,13 @@ def settle(
     return replace(solution, seconds=seconds), rest
 
 
-def _is_estimated(found: NoiseComponents, kept: frozenset[NoiseName]) -> Booleans:
+def _is_estimated(found: NoiseComponents, kept: frozenset[graph.NoiseName]) -> Booleans:
     """Whose noise is estimated: without joint noise what has redundancy enough."""
-    enough = (JOINT_NOISE in found.names) | (found.expected >= LEAST_REDUNDANCY)
+    enough = (graph.JOINT_NOISE in found.names) | (found.expected >= LEAST_REDUNDANCY)
     return enough & np.array([name not in kept for name in found.names], dtype=np.bool_)
 
 
-def _steps(found: NoiseComponents, kept: frozenset[NoiseName]) -> Floats:
+def _steps(found: NoiseComponents, kept: frozenset[graph.NoiseName]) -> Floats:
     """Steps of the logarithms of the factors; 0 of those that are not estimated."""
     q, t = found.squares, found.expected
     free = np.flatnonzero(_is_estimated(found, kept) & ~((q < t) & (t < NEGLIGIBLE)))
@@ -293,11 +282,11 @@ def _solve(T: Floats, b: Floats) -> Floats:
     return out
 
 
-def _scaled(problem: Problem, factors: Mapping[NoiseName, float]) -> Problem:
+def _scaled(problem: graph.Problem, factors: Mapping[graph.NoiseName, float]) -> graph.Problem:
     """The problem from its start, with the specified noise of some kinds multiplied by factors."""
 
-    def scale(p: Problem) -> Problem:
-        return relinearized_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
+    def scale(p: graph.Problem) -> graph.Problem:
+        return graph.relinearized_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
 
     whole = None if problem.whole is None else scale(problem.whole)
     return replace(scale(problem), whole=whole)
