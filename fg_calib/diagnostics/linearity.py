@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.graph import Problem, Solution, at_parameters, linear_system, noises_at, subsampled
+from fg_calib.graph import Problem, Solution, linear_system, noises_at, subsampled
 from fg_calib.inputs import Floats, SolverError
 from fg_calib.robot import forward
 from fg_calib.statistics import Spread
@@ -107,7 +107,7 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
         sqrt_cov: A square root S of the posterior covariance S S^T of the core, shape (n_columns, k).
         rank: Number of determined directions.
     """
-    problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
+    problem, at = solution.problem, solution.problem.variables.at(solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
     n_rows, names, share = 0, list[str](), 0.0
     if not problem.pair_series:

@@ -23,7 +23,6 @@ from fg_calib.graph import (
     Problem,
     Solution,
     SolverOptions,
-    at_parameters,
     directions,
     solve,
     with_factors,
@@ -162,7 +161,7 @@ def _mirrored_landmarks(problem: Problem) -> list[tuple[int, ...]]:
 
 def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
     """The problem with one landmark mirrored and the arm at nominal; None where it has no mirror image."""
-    problem, at, key = solution.problem, at_parameters(solution.problem, solution.parameters), np.array(landmark)
+    problem, at, key = solution.problem, solution.problem.variables.at(solution.parameters), np.array(landmark)
     points, data, variables = list[Floats](), list[Floats](), problem.variables
     for s in problem.data.blocks:
         if s.nuisances.shape[1] == len(key) and type(s.kind).mirrored is not Kind.mirrored:

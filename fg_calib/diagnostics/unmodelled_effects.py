@@ -34,7 +34,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.graph import Problem, Solution, at_parameters, build_variables, prior_rows, unknown_prior_rows
+from fg_calib.graph import Problem, Solution, build_variables, prior_rows, unknown_prior_rows
 from fg_calib.inputs import Floats
 from fg_calib.measurements import Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
@@ -241,7 +241,7 @@ def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
     Returns:
         The fit, the columns of the rows, shape (n_rows, m), and their names, shape (m,).
     """
-    problem, at = solution.problem, at_parameters(solution.problem, solution.parameters)
+    problem, at = solution.problem, solution.problem.variables.at(solution.parameters)
     (chains, core), offsets = with_link_motions(problem, solution.parameters), _offsets(problem)
     errors = [_joint_errors(problem.robot, t.measurements.readings) for t in problem.data.tables]
     columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)

@@ -25,7 +25,6 @@ from .normal_system import (
 )
 from .problem import (
     Problem,
-    at_parameters,
     check_graph,
     correlation,
     directions,
@@ -37,7 +36,6 @@ from .problem import (
     noises_at,
     problem_at,
     relinearized_at,
-    says_where,
     square_root,
     start_of,
     subsampled,
@@ -94,7 +92,6 @@ __all__ = [
     "Variables",
     "WhitenedRows",
     "WhitenedSeries",
-    "at_parameters",
     "block_diagonal",
     "build_problem",
     "build_variables",
@@ -127,7 +124,6 @@ __all__ = [
     "random_problem",
     "reach",
     "relinearized_at",
-    "says_where",
     "solve",
     "square_root",
     "start_of",

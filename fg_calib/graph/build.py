@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.graph.knowledge import coordinates_of
-from fg_calib.graph.normal_system import determined, identifiable_subset
+from fg_calib.graph.normal_system import identifiable_subset
 from fg_calib.graph.problem import (
     Problem,
     linear_system,
@@ -20,11 +19,12 @@ from fg_calib.graph.problem import (
     tables_of,
     variables_of,
 )
-from fg_calib.graph.variables import Variables, preference, prior_rows
+from fg_calib.graph.variables import Variables, preference
 from fg_calib.inputs import (
     Floats,
     FrameKnowledge,
     Gauge,
+    Integers,
     Model,
     Options,
     PairErrors,
@@ -119,20 +119,23 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     if evaluated:
         robot, options, tables = _for_evaluation(robot, options, tables)
     elif options.estimate_tolerance is not None:
-        robot = with_first_tolerances(robot)
+        n, parameters = robot.n_joints, robot.parameters
+        free = [p.tolerance is None and p.estimated and 1 <= p.owner <= n for p in parameters]
+        first = (replace(p, tolerance=FIRST_TOLERANCE) if f else p for p, f in zip(parameters, free, strict=True))
+        robot = replace(robot, parameters=tuple(first))
     data = build_dataset(robot, tables)
     _check_frames(data)
     variables = variables_of(robot, data, options)
     start = start_of(robot, data, variables)
     _check_own_kinds(robot, data, variables, start)
     problem = problem_at(robot, data, options, variables, start, evaluated=evaluated)
-    _check_enough(problem)
+    _check_rows(problem)
     if options.gauge != "keep":
         return problem
     kept = kept_of(problem, options.prefer)
     if not kept:
         found = "the rows determine none of the parameters to estimate"
-        raise ProblemError(_source(problem), found, "rows that some of them act on")
+        raise ProblemError(problem.data.source, found, "rows that some of them act on")
     reduced = robot.with_estimated(kept)
     variables = variables_of(reduced, data, options)
     return problem_at(reduced, data, options, variables, start, whole=problem, evaluated=evaluated)
@@ -159,16 +162,14 @@ def kept_of(problem: Problem, prefer: Sequence[str]) -> list[str]:
 
 def _all_test(table: Table) -> bool:
     """Whether all rows of a table that take part are test rows."""
-    m = table.measurements
-    own = [np.zeros(len(own.data), np.bool_) if own.test is None else np.asarray(own.test) for own in table.own]
-    if table.model is None:
-        rows = np.concatenate(own) if own else np.zeros(0, dtype=np.bool_)
-    elif table.uses_pairs and m.pairs is not None:
-        touches = np.zeros(0, dtype=np.bool_) if m.groups is None else m.test[m.groups.index >= 0]
-        rows = np.concatenate([m.pairs.test, touches, *own])
-    else:
-        rows = np.concatenate([m.test, *own])
-    return bool(rows.all()) and len(rows) > 0
+    m, pairs, none = table.measurements, table.measurements.pairs, np.zeros(0, np.bool_)
+    rows = [np.zeros(len(own.data), np.bool_) if own.test is None else np.asarray(own.test) for own in table.own]
+    if table.model is not None and table.uses_pairs and pairs is not None:
+        rows += [pairs.test, none if m.groups is None else m.test[m.groups.index >= 0]]
+    elif table.model is not None:
+        rows.append(m.test)
+    every = np.concatenate([none, *rows])
+    return bool(every.all()) and len(every) > 0
 
 
 def _for_evaluation(
@@ -241,28 +242,24 @@ def true_problem(
     data = replace(data, landmarks=data.landmarks.with_starts(starts))
     variables = variables_of(robot, data, options)
     start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
-    for name in places:
-        place = coordinates_of(variables, data.landmarks, name)
-        if place is not None:
-            start[place] = places[name]
-    for v, name in zip(variables.frames, frame_names(data, variables), strict=True):
-        if name in places:
-            start[v.places] = places[name]
+    for name, where in _coordinates(data, variables).items():
+        if name in places and np.all(where >= 0):
+            start[where] = places[name]
     return problem_at(robot, data, options, variables, start)
 
 
 def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Floats]:
-    """Coordinates of landmarks by letter and name, and unknown measurement frames, called as `frame_names` says."""
+    """Coordinates of landmarks by letter and name, and unknown measurement frames by X and their table's label."""
     unknowns, coordinates = problem.data.landmarks, problem.variables.at(parameters).coordinates
-    parts = np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]) if unknowns.sizes else []
-    frames = [parameters[v.places] for v in problem.variables.frames]
-    names = [*unknowns.keys, *frame_names(problem.data, problem.variables)]
-    return dict(zip(names, [*parts, *frames], strict=True))
+    places = zip(unknowns.keys, np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]), strict=False)
+    return dict(places) | {("X", problem.data.labels[v.number]): parameters[v.places] for v in problem.variables.frames}
 
 
-def frame_names(data: Dataset, variables: Variables) -> list[tuple[str, str]]:
-    """Letter and name of each unknown measurement frame: it is called as its table."""
-    return [("X", data.labels[v.number]) for v in variables.frames]
+def _coordinates(data: Dataset, variables: Variables) -> dict[tuple[str, str], Integers]:
+    """Where landmarks and unknown frames (see `places_of`) stand in a parameter vector; -1 where not estimated."""
+    parts = np.split(variables.coordinates, np.cumsum(data.landmarks.sizes)[:-1])
+    frames = {("X", data.labels[v.number]): v.places for v in variables.frames}
+    return dict(zip(data.landmarks.keys, parts, strict=False)) | frames
 
 
 @single_threaded
@@ -309,54 +306,9 @@ def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: F
         check_rows(s.kind, Frames(rotation, position), s.data, nuisances, s.source)
 
 
-def _source(problem: Problem) -> str:
-    """What the rows are called in messages."""
-    series = problem.data.blocks
-    return ", ".join(dict.fromkeys(s.source for s in series)) if series else problem.data.source
-
-
-def _check_enough(problem: Problem) -> None:
-    """Whether there are rows at all, and as many as unknowns that random configurations could determine."""
+def _check_rows(problem: Problem) -> None:
+    """Check that a measurement takes part."""
     if problem.n_residuals == 0:
-        _refuse_nothing(problem)
-    n_nuisance = problem.variables.n_nuisance
-    rows = problem.n_residuals + problem.n_priors - n_nuisance
-    table = problem.data.tables[0]
-    if rows >= problem.variables.n_columns or len(problem.data.tables) > 1 or table.model is None:
-        return
-    anywhere = random_problem(problem.robot, table.model, table.frame)
-    priors = prior_rows(problem.variables, problem.start)[1]
-    stacked = np.vstack([linear_system(anywhere, anywhere.start).left.A, priors]) * problem.variables.prior_scales
-    needed = determined(np.linalg.svd(stacked)[1].astype(np.float64), STRUCTURAL_FLOOR)
-    if rows < needed:
-        found = f"{rows + n_nuisance} residuals{' and priors' * (problem.n_priors > 0)}"
-        expected = f"at least {needed + n_nuisance} to determine what model {table.model} can"
-        raise ProblemError(_source(problem), found, expected)
-
-
-def _refuse_nothing(problem: Problem) -> None:
-    table = problem.data.tables[0]
-    touches = table.measurements.groups is not None
-    pairs = table.uses_pairs and not (touches and not problem.pair_series)
-    unit = "pair" if pairs else "touch" if touches else "row"
-    source = table.measurements.source
-    if pairs:
-        measured = table.measurements.pairs
-        source = f"pairs from {source}" if measured is None else measured.source
-    reasons = ", ".join(f"{n} excluded for {reason.replace('_', ' ')}" for reason, n in problem.n_excluded.items() if n)
-    found = f"no {unit} left to fit"
-    if reasons:
-        raise ProblemError(source, f"{found}: {reasons}", f"{unit}s that tell something")
-    if pairs and not problem.pair_series:
-        raise ProblemError(source, f"{found}: none has a measurement that model {table.model} uses")
-    raise ProblemError(source, found, "train rows")
-
-
-def with_first_tolerances(robot: Robot) -> Robot:
-    """The robot whose joints' estimated parameters all have a tolerance: `FIRST_TOLERANCE` where none is stated."""
-    n = robot.n_joints
-    parameters = tuple(
-        replace(p, tolerance=FIRST_TOLERANCE) if p.tolerance is None and p.estimated and 1 <= p.owner <= n else p
-        for p in robot.parameters
-    )
-    return replace(robot, parameters=parameters)
+        reasons = [f"{n} excluded for {reason.replace('_', ' ')}" for reason, n in problem.n_excluded.items() if n]
+        found = ": ".join(["no row left to fit", *filter(None, [", ".join(reasons)])])
+        raise ProblemError(problem.data.source, found, "train rows that the model uses")

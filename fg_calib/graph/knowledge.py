@@ -208,10 +208,6 @@ class Knowledge(FrozenArrays):
 
 def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:
     """Where an unknown's coordinates stand in a parameter vector; None for one that is not there, or not estimated."""
-    names = unknowns.keys
-    if name not in names:
-        return None
-    i = names.index(name)
-    first = sum(unknowns.sizes[:i])
-    place = variables.coordinates[first : first + unknowns.sizes[i]]
-    return place if np.all(place >= 0) else None
+    parts = np.split(variables.coordinates, np.cumsum(unknowns.sizes)[:-1])
+    place = dict(zip(unknowns.keys, parts, strict=False)).get(name)
+    return place if place is not None and np.all(place >= 0) else None

@@ -6,15 +6,15 @@ take part and why the others do not.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from fg_calib.graph.error_states import State, WhitenedRows, all_errors, correlation_of, whitened_rows
+from fg_calib.graph.error_states import WhitenedRows, all_errors, correlation_of, whitened_rows
 from fg_calib.graph.factors import linearize_factors, measurement_factors, prior_factors, with_added
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, POSE_SLOTS, NoiseState, RowNoise, TableState, same_everywhere
@@ -22,7 +22,7 @@ from fg_calib.graph.normal_system import RANK_TOLERANCE, NormalSystem
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, Integers, Options, ProblemError, SolverError, shown
+from fg_calib.inputs import Floats, FrozenArrays, Integers, Options, ProblemError, SolverError
 from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, by_station, start_frames
 from fg_calib.robot import Chain, Parameter, Robot, forward
 
@@ -156,19 +156,6 @@ class Problem(FrozenArrays):
         """
         return ("", *self.data.names)
 
-    def names_of(self, key: int) -> tuple[str, ...]:
-        """Names of a variable's entries, in their order.
-
-        Raises:
-            ProblemError: There is no such variable.
-        """
-        for v in self.variables.items:
-            if isinstance(key, int) and v.key == key:
-                return self.variables.names[v.columns]
-        known = ", ".join(v.symbol for v in self.variables.items)
-        symbol = str(gtsam.Symbol(key)).strip() if isinstance(key, int) and 0 <= key < 2**64 else shown(key)
-        raise ProblemError("key", f"no variable {symbol} of the arm", f"one of {known}")
-
     @property
     def estimated(self) -> list[Parameter]:
         """The robot's estimated parameters, in the order of the columns."""
@@ -263,17 +250,13 @@ class Problem(FrozenArrays):
         return self.rows.counted_as_private
 
     @cached_property
-    def _square_roots(self) -> dict[bytes, Floats]:
-        return {}
+    def _square_roots(self) -> Callable[[bytes], Floats]:
+        rows, variables = self.rows, self.variables
+        return lru_cache(N_REMEMBERED)(lambda x: rows.square_root(variables.at(np.frombuffer(x))))
 
     def square_root(self, parameters: Floats) -> Floats:
         """Rows [A r] with the Gram matrix of the train rows, error states eliminated, all columns."""
-        known, key = self._square_roots, parameters.tobytes()
-        if key not in known:
-            for old in list(known)[: 1 - N_REMEMBERED]:
-                del known[old]
-            known[key] = self.rows.square_root(self.variables.at(parameters))
-        return known[key]
+        return self._square_roots(parameters.tobytes())
 
 
 def with_factors(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
@@ -330,7 +313,7 @@ def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> 
         parameters: The parameter vector.
         fitted: Whether they are the train rows alone; else train and test.
     """
-    data, at, trigs = problem.data, at_parameters(problem, parameters), problem.data.trigs(problem.robot)
+    data, at, trigs = problem.data, problem.variables.at(parameters), problem.data.trigs(problem.robot)
     width = problem.robot.n_joints + POSE_SLOTS * len(data.tables)
     n_errors = width * data.n_configurations
     places = [
@@ -338,15 +321,6 @@ def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> 
         for k, table in enumerate(data.tables)
     ]
     return tuple(RowNoise(s.fitted if fitted else s, places[s.table], problem.state) for s in data.blocks)
-
-
-def at_parameters(problem: Problem, parameters: Floats) -> State:
-    """The arm and the measurements' unknowns at a parameter vector; test rows alone say where the others are."""
-    at = problem.variables.at(parameters)
-    if np.all(at.columns >= 0):
-        return at
-    points = contact_points(problem.data, at.chains, problem.data.trigs(problem.robot))
-    return problem.variables.at(parameters, points)
 
 
 def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
@@ -385,29 +359,16 @@ def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
 
 
 def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
-    """Of each unknown coordinate of a touched point the mean of what touched it, of others the start as given."""
+    """Of each coordinate of a contact point the mean of what touched it, of other landmarks the start as given."""
     found: Floats = data.landmarks.start
     for s in data.blocks:
-        touches = np.flatnonzero(says_where(data, s))
-        if len(touches):
+        if s.kind.is_contact and s.kind.n_nuisances:
+            touches = np.flatnonzero(~s.test)
             p = forward(chains[s.table].without_columns(), trigs[s.table], s.ends[touches, 0]).position
             place = s.nuisances[touches].ravel()
             n, total = np.bincount(place), np.bincount(place, p.ravel())
             found[np.flatnonzero(n)] = total[n > 0] / n[n > 0]
     return found
-
-
-def says_where(data: Dataset, series: MeasurementBlock) -> Booleans:
-    """Which measurements say where points are that start there: touches, test ones where no train row touched.
-
-    Returns:
-        Shape (n,).
-    """
-    if not (series.kind.is_contact and series.kind.n_nuisances):
-        return np.zeros(series.n, dtype=np.bool_)
-    first, start = series.nuisances[:, 0], data.landmarks.start
-    says: Booleans = np.isnan(start[first]) & ~(series.test & np.isin(first, first[~series.test]))
-    return says
 
 
 def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | None = None) -> Problem:

@@ -268,17 +268,11 @@ class Variables(Brief):
         found = np.array(coordinates, dtype=np.int64)
         return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found, others=others)
 
-    def at(self, parameters: Floats, fallback: Floats | None = None) -> State:
-        """The arm and the measurements' unknowns at a parameter vector.
-
-        Args:
-            parameters: The parameter vector.
-            fallback: Values of the unknown coordinates that are not estimated; `others` if None.
-        """
+    def at(self, parameters: Floats) -> State:
+        """The arm and the measurements' unknowns at a parameter vector."""
         estimated = self.coordinates >= 0
-        others = self.others if fallback is None else fallback
         columns = np.where(estimated, self.coordinates - self.nuisance_span.start + self.n_columns, -1)
-        values = np.where(estimated, parameters[self.coordinates], others)
+        values = np.where(estimated, parameters[self.coordinates], self.others)
         chains = tuple(chain.at(parameters) for chain in self.chains)
         return State(chains, values, columns, self.n_columns, self.n_nuisance)
 

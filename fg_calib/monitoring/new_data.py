@@ -141,7 +141,7 @@ def started(
     v = graph.variables_of(arm, data, options)
     x, there = v.nominal(), v.coordinates >= 0
     x[v.robot_span], x[v.frame_span] = values, fit.parameters[v.frame_span]
-    x[v.coordinates[there]] = graph.at_parameters(fit.problem, fit.parameters).coordinates[there]
+    x[v.coordinates[there]] = fit.problem.variables.at(fit.parameters).coordinates[there]
     made = graph.problem_at(arm, data, options, v, x, **more)
     return graph.with_factors(made, x, replace(made.state, factors=fit.problem.state.factors))
 

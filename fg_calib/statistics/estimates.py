@@ -228,7 +228,7 @@ def _landmarks(solution: graph.Solution, whole: Spread) -> tuple[LandmarkEstimat
     unknowns = problem.data.landmarks
     if not unknowns.names:
         return ()
-    at = graph.at_parameters(problem, solution.parameters)
+    at = problem.variables.at(solution.parameters)
     left = graph.linear_system(replace(problem, variables=whole.variables), solution.parameters).left
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
     names, found = unknowns.keys, []

@@ -15,7 +15,7 @@ import scipy.sparse
 from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
-from fg_calib.graph import PRIVATE_SHARE, Problem, RowNoise, at_parameters, felt, linear_system, reach, says_where
+from fg_calib.graph import PRIVATE_SHARE, Problem, RowNoise, felt, linear_system, reach
 from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
@@ -121,9 +121,6 @@ class ResidualCovariance:
 class RowModel:
     """What the rows of every block follow from at the estimate.
 
-    Landmarks are estimated, known, or, where test rows alone touched them, the mean of what touched them: at B e with e
-    those rows without the landmark. With N the derivatives in such landmarks, `N B e` is added to the rows.
-
     Args:
         problem: The problem.
         parameters: The estimate.
@@ -131,7 +128,7 @@ class RowModel:
     """
 
     def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
-        self._at = at_parameters(problem, parameters)
+        self._at = problem.variables.at(parameters)
         self._noises, self._n = noises, problem.variables.n_columns
         left = linear_system(problem, parameters).left
         of_landmarks, width = np.hstack([left.follow, left.inverse]), self._n + left.rank
@@ -142,23 +139,11 @@ class RowModel:
         core, landmarks = np.split(felt(problem, parameters, self._common), [self._n])
         self._felt = np.eye(width, self._n) @ core + of_landmarks.T @ landmarks
         blocks, unknowns = problem.data.blocks, problem.data.landmarks
-        self._means = [says_where(problem.data, s) & ~estimated[s.nuisances].any(axis=1) for s in blocks]
         located = estimated | np.repeat(
             np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes
         )
-        for s, touches in zip(blocks, self._means, strict=True):
-            located[s.nuisances[touches].ravel()] = True
         self._nowhere: list[Booleans] = [np.any(~located[s.nuisances], axis=1) for s in blocks]
-        counts = [s.n * s.kind.residual_dim * touches.any() for s, touches in zip(blocks, self._means, strict=True)]
-        self._first = max((noise.place.n_errors for noise in noises), default=0) + np.cumsum([0, *counts])
-        self._averaged = Sparse((n, int(self._first[-1])))
-        for number in (number for number, touches in enumerate(self._means) if touches.any()):
-            rows = np.flatnonzero(self._means[number])
-            J, _, L, _ = self._given_landmarks(number, rows)
-            place = blocks[number].nuisances[rows].ravel()
-            B = Sparse((1.0 / np.bincount(place)[place], (place, np.arange(len(place)))), shape=(n, len(place)))
-            self._follow[:, : self._n] += np.asarray(B @ J)
-            self._averaged = self._averaged + B @ L
+        self._n_errors = max((noise.place.n_errors for noise in noises), default=0)
 
     def is_plain(self, number: int) -> bool:
         """Whether rows of a block follow from the core and private noise alone."""
@@ -173,7 +158,7 @@ class RowModel:
         """No rows."""
         n = self._follow.shape[1]
         P = np.zeros((0, 2 * n if len(self._common) else n))
-        return ResidualCovariance(np.zeros(0), Sparse((0, int(self._first[-1]))), P, np.zeros((0, 0)))
+        return ResidualCovariance(np.zeros(0), Sparse((0, self._n_errors)), P, np.zeros((0, 0)))
 
     def of_all(self, covariance: Floats) -> Floats:
         """The covariance of core and landmarks' errors, of that of the core: shape (n_all, n_all)."""
@@ -186,16 +171,12 @@ class RowModel:
         if N.shape[1]:
             nowhere = np.repeat(self._nowhere[number][rows], len(P) // max(len(rows), 1))
             P = P + np.where(nowhere, np.nan, 0.0)[:, None] + N @ self._follow
-            L = L + N @ self._averaged
         P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
         return ResidualCovariance(private, L, P, np.zeros((0, 0)))
 
     def _given_landmarks(self, number: int, rows: Integers) -> tuple[Floats, Floats, Sparse, Sparse]:
-        """J, private variance and L of rows were their landmarks known; derivatives in these, sparse.
-
-        The noise of touches whose mean a point is stands among L, after the errors of configurations.
-        """
-        noise, width = self._noises[number], int(self._first[-1])
+        """J, private variance and L of rows were their landmarks known; derivatives in these, sparse."""
+        noise = self._noises[number]
         J = residuals.linearise(noise.rows_at(rows), self.chain(number))[1]
         n, h = J.shape[:2]
         in_landmarks = J[:, :, self._n :]
@@ -204,12 +185,6 @@ class RowModel:
         N = Sparse((in_landmarks.ravel(), (row, place)), shape=(n * h, len(self._follow)))
         private = noise.variance[rows].ravel()
         L = noise.errors_at(rows)
-        L = Sparse((L.data, L.indices, L.indptr), shape=(n * h, width))
-        mean = np.flatnonzero(np.repeat(self._means[number][rows], h))
-        if len(mean):
-            column = self._first[number] + (rows[:, None] * h + np.arange(h)).ravel()[mean]
-            L = L + Sparse((np.sqrt(private[mean]), (mean, column)), shape=L.shape)
-            private[mean] = 0.0
         return J[:, :, : self._n].reshape(n * h, -1), private, L, N
 
 

@@ -169,11 +169,7 @@ def test_what_cannot_be_solved_is_refused_in_one_line():
     )
     still = planar_pairs([0.0, 0.0])
     assert refused(planar_robot(), still, model="rotation") == (
-        "pairs.csv: no pair left to fit: 2 excluded for same configuration, expected pairs that tell something"
-    )
-    few = replace(measure(paper_robot(), 10, rng), source="poses.csv")
-    assert refused(paper_robot(), few, model="distance-rotation") == (
-        "pairs from poses.csv: 18 residuals, expected at least 23 to determine what model distance-rotation can"
+        "measurements: no row left to fit: 2 excluded for same configuration, expected train rows that the model uses"
     )
 
 

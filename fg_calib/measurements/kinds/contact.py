@@ -19,9 +19,7 @@ from fg_calib.measurements import (
 )
 from fg_calib.robot import kernels
 
-POINT = LandmarkKind(
-    "L", "point", "the unknown contact points", "Contact points (in the base frame), mm", must_be_fitted=False
-)
+POINT = LandmarkKind("L", "point", "the unknown contact points", "Contact points (in the base frame), mm")
 
 
 class SamePoint(Coincidence):
