@@ -78,7 +78,7 @@ def test_it_has_residuals_goodness_and_predictions():
     solution = solve(build_problem(robot, table))
     uncertainty = assess(solution)
     rows, fit = uncertainty.fit.residuals, uncertainty.fit.goodness
-    assert set(rows.kind) == {"anchor"}
+    assert rows.families == ("anchor",)
     assert (int(rows.used.sum()), int(rows.test.sum())) == (60, 30)
     (kind,) = fit.kinds
     assert (kind.kind, kind.unit, kind.n) == ("anchor", "m", 60)
