@@ -74,39 +74,12 @@ def decoded(content: bytes, name: str) -> str:
     raise InputError(f"{name}:{line}", found, "UTF-8 text", "is it UTF-16, Latin-1 or Windows text? save it as UTF-8")
 
 
-def exists(path: Path) -> bool:
-    """Whether there is a file or folder; False for a name that no file can have."""
-    with suppress(OSError, ValueError):
-        return path.exists()
-    return False
-
-
-def is_folder(path: Path) -> bool:
-    """Whether there is a folder; False for a name that no folder can have."""
-    with suppress(OSError, ValueError):
-        return path.is_dir()
-    return False
+exists, is_folder = os.path.exists, os.path.isdir
+"""Whether there is a file, a folder; False for a name that nothing can have."""
 
 
 def _short(path: str) -> str:
     return path if len(path) <= 120 else f"{path[:117]}..."
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary file, which replaces `path` when the block ends well and vanishes when it does not.
-
-    Raises:
-        InputError: The folder does not exist or may not be written to.
-    """
-    if not is_folder(path.parent):
-        raise InputError(_short(str(path)), f"there is no folder {path.parent}")
-    try:
-        with TemporaryDirectory(prefix=".fg-calib-", dir=path.parent, ignore_cleanup_errors=True) as made:
-            yield Path(made, path.name)  # on the same disk, where a move is atomic
-            os.replace(Path(made, path.name), path)
-    except OSError as error:
-        raise InputError(str(path), f"cannot be written: {error.strerror or error}") from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -115,8 +88,15 @@ def write_text(path: Path, text: str) -> None:
     Raises:
         InputError: The folder does not exist or may not be written to.
     """
-    with replacing(path) as temporary:
-        temporary.write_bytes(text.encode())
+    content = text.encode()
+    if not is_folder(path.parent):
+        raise InputError(_short(str(path)), f"there is no folder {path.parent}")
+    try:
+        with TemporaryDirectory(prefix=".fg-calib-", dir=path.parent, ignore_cleanup_errors=True) as made:
+            Path(made, path.name).write_bytes(content)
+            os.replace(Path(made, path.name), path)  # on the same disk, where a move is atomic
+    except OSError as error:
+        raise InputError(str(path), f"cannot be written: {error.strerror or error}") from None
 
 
 def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, bytes] | None = None) -> None:

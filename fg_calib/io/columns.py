@@ -32,7 +32,7 @@ from fg_calib.inputs import (
     check_number,
     did_you_mean,
 )
-from fg_calib.io.atomic import decoded, read_bytes, replacing, require_own
+from fg_calib.io.atomic import decoded, read_bytes, require_own, write_text
 from fg_calib.io.yaml import number_hint, shown
 from fg_calib.measurements import INSTRUMENTS
 from fg_calib.measurements import Column as ColumnSet
@@ -422,5 +422,4 @@ def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None
 
     given = {name: np.asarray(values) for name, values in columns.items() if values is not None}
     frame = pl.DataFrame(given).with_columns(pl.lit(None).alias(name) for name in columns if name not in given)
-    with replacing(Path(path)) as temporary:
-        frame.select(*columns).write_csv(temporary)
+    write_text(Path(path), frame.select(*columns).write_csv())

@@ -107,6 +107,7 @@ class _TableKeys(Schema):
 
 class _Entry(_TableKeys):
     table: FilePath
+    model: Model
 
 
 _CHOICES = ("prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
@@ -260,10 +261,7 @@ def _entries(given: Mapping[str, Any], file: _JobKeys, place: str) -> list[tuple
     defaults = {key: given[key] for key in _TableKeys.model_fields if key in given and key != "noise"}
     for number, one in enumerate([{"table": listed}] if isinstance(listed, str) else listed, start=1):
         where = place if isinstance(listed, str) else f"{place}: measurement {number}"
-        entry = validate(_Entry, defaults | one if isinstance(one, dict) else one, where)
-        if entry.model is None:
-            raise InputError(where, "missing key 'model'")
-        entries.append((where, entry))
+        entries.append((where, validate(_Entry, defaults | one if isinstance(one, dict) else one, where)))
     return entries
 
 
@@ -277,7 +275,7 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
         robot: Its robot.
         folder: Where paths start.
     """
-    model, of_job = entry.model or "", place.partition(": measurement")[0]
+    model, of_job = entry.model, place.partition(": measurement")[0]
     noise, _ = _noise(file.noise, file.units, robot, f"{of_job}: noise")
     own, estimated = _noise(entry.noise, entry.units, robot, f"{place}: noise")
     if estimated:

@@ -11,14 +11,13 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import yaml
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from fg_calib import inputs
 from fg_calib.inputs import (
     LEAST_SIZE,
     MOST_SIZE,
-    ORDINARY,
     AngleUnit,
     InputError,
     LengthUnit,
@@ -27,47 +26,19 @@ from fg_calib.inputs import (
 )
 from fg_calib.io.atomic import read_text
 
+Number = Annotated[float, Field(strict=True, ge=-MOST_SIZE, le=MOST_SIZE)]
+"""A finite number."""
 
-def _refuse_bool(value: object) -> object:
-    """YAML's `yes` and `true` are no numbers, although Python's are."""
-    if isinstance(value, bool):
-        raise PydanticCustomError("float_type", "a bool")
-    if isinstance(value, str) and "_" in value:  # Python's own way of writing digits
-        raise PydanticCustomError("float_parsing", "a number")
-    return value
-
-
-def _refuse_no_path(value: object) -> object:
-    if not isinstance(value, str) or not value:
-        raise PydanticCustomError("path", "no path")
-    return value
-
-
-def _refuse_huge(value: float) -> float:
-    if math.isfinite(value) and abs(value) > MOST_SIZE:
-        raise PydanticCustomError("absurd", "absurd")
-    return value
-
-
-def _refuse_absurd(value: float) -> float:
-    if 0.0 < value < LEAST_SIZE:
-        raise PydanticCustomError("absurd", "absurd")
-    return _refuse_huge(value)
-
-
-Number = Annotated[float, BeforeValidator(_refuse_bool), AfterValidator(_refuse_huge)]
-"""A finite number, or text that reads as one: PyYAML takes `1e-3` for text."""
-
-Bound = Annotated[float, Field(allow_inf_nan=True), BeforeValidator(_refuse_bool), AfterValidator(_refuse_huge)]
+Bound = Annotated[float, Field(strict=True, allow_inf_nan=True)]
 """A number, or infinity."""
 
-Positive = Annotated[float, Field(gt=0), BeforeValidator(_refuse_bool), AfterValidator(_refuse_absurd)]
+Positive = Annotated[float, Field(strict=True, gt=0, le=MOST_SIZE)]
 """A finite number above 0."""
 
-NotNegative = Annotated[float, Field(ge=0), BeforeValidator(_refuse_bool), AfterValidator(_refuse_absurd)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, le=MOST_SIZE)]
 """A finite number, 0 or more."""
 
-FilePath = Annotated[str, BeforeValidator(_refuse_no_path)]
+FilePath = Annotated[str, Field(min_length=1)]
 """The path of a file."""
 
 MOST = 10_000_000
@@ -75,9 +46,6 @@ MOST = 10_000_000
 
 Count = Annotated[int, Field(ge=0, le=MOST, strict=True)]
 """A whole number, 0 or more."""
-
-Seed = Annotated[int, Field(ge=0, lt=2**63, strict=True)]
-"""What random numbers begin with."""
 
 
 def refuse_unknown_keys(*known: str) -> Callable[[object], object]:
@@ -151,7 +119,7 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
             hint = did_you_mean(first["input"], _options(first))
         case "string_type" if isinstance(first["input"], bool):
             hint = "text such as no, on or true stands in quotes"
-        case "float_parsing":
+        case "float_type":
             hint = number_hint(first["input"])
     more = f" (and {len(misfits) - n} more)" * (len(misfits) > n)
     return InputError(_place(place, at), found + more * (not expected), expected + more * bool(expected), hint)
@@ -192,10 +160,9 @@ def _expected(misfit: ErrorDetails) -> str:
 
 
 _EXPECTED = {
-    **dict.fromkeys(("float_type", "float_parsing", "finite_number"), "a finite number"),
+    **dict.fromkeys(("float_type", "finite_number"), "a finite number"),
     **dict.fromkeys(("list_type", "tuple_type"), "a list"),
     **dict.fromkeys(("model_type", "dict_type", "dataclass_type", "model_attributes_type"), "a mapping"),
-    "absurd": ORDINARY,
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "a whole number"),
     "string_type": "text",
     **dict.fromkeys(("bool_type", "bool_parsing"), "true or false"),
@@ -204,7 +171,7 @@ _EXPECTED = {
     "less_than": "a number below {lt:g}",
     "less_than_equal": "a number not above {le:g}",
     "greater_than_equal": "a number not below {ge:g}",
-    "path": "a path",
+    "string_too_short": "a path",
     "too_short": "at least {min_length} in the list",
     "too_long": "at most {max_length} in the list",
 }
@@ -228,16 +195,11 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path.name}:{line}", f"half a character, {half[0]}", "the character itself")
     try:
         mapping = yaml.load(text, Loader)
-    except RecursionError:
-        raise InputError(path.name, "nested too deeply", "a mapping, key: value") from None
     except yaml.MarkedYAMLError as error:
         place = path.name if error.problem_mark is None else f"{path.name}:{error.problem_mark.line + 1}"
         raise InputError(place, error.problem or "not YAML", hint=error.context or "") from None
-    except (ValueError, LookupError, AttributeError, TypeError, OverflowError) as error:
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(path.name, f"not YAML: {error}") from None
-    except yaml.reader.ReaderError as error:
-        line = text[: error.position].count("\n") + 1
-        raise InputError(f"{path.name}:{line}", f"character {error.character:#04x}", "printable text") from None
     if not isinstance(mapping, dict):
         found = "an empty file" if mapping is None else f"found {shown(mapping)}"
         hint = "is it a URDF? its name ends in .urdf" if text.lstrip().startswith("<") else ""
@@ -367,10 +329,12 @@ def quantity(given: object, unit: str, units: Units | None, place: str) -> float
         expected = f"a number with one of {', '.join(known)}"
         raise InputError(place, f"found {shown(given)}", expected, did_you_mean(name, known))
     try:
-        return validate(_Figure, {"figure": number}, "").figure * known[name]
-    except InputError as error:
-        expected = f"{error.expected}, with its unit{'' if units is None else ' or without'}"
-        raise InputError(place, f"found {shown(given)}", expected, error.hint) from None
+        figure = float(number) if isinstance(number, str) and "_" not in number else number
+        return validate(_Figure, {"figure": figure}, "").figure * known[name]
+    except (InputError, ValueError) as error:
+        expected = getattr(error, "expected", "a number")
+        expected += f", with its unit{'' if units is None else ' or without'}"
+        raise InputError(place, f"found {shown(given)}", expected, number_hint(number)) from None
 
 
 class _Figure(Schema):
