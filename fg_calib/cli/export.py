@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, say, show, show_json
-from fg_calib.inputs import escaped
+from fg_calib.inputs import InputError, escaped
 
 Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
 At = Literal["workspace", "measured"]
@@ -25,7 +25,6 @@ def export(
     at: Annotated[At, option("--at", None, "Of zeros: fitted over the limits, or where measured.")] = "workspace",
     tool: Annotated[Tool, option("--tool", None, "Of zeros: the controller's tool.")] = "calibrated",
     far: Annotated[bool, option("--far", None, "Of dh and mdh: be exact, however far frames are.")] = False,
-    calibration_elements: Annotated[bool, option("--calibration-elements", None, "Of urdf: zeros in it.")] = False,
     ur_base: Annotated[UrBase | None, option("--ur-base", None, "Of ur: ur_description's name of the base.")] = None,
     ur_hash: Annotated[str | None, option("--ur-hash", "HASH", "Of ur: the controller's own hash.")] = None,
     base_link: BaseLink = None,
@@ -34,7 +33,6 @@ def export(
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""
     from fg_calib.calibration import Calibration
-    from fg_calib.exports import measured_configurations
     from fg_calib.exports.export import export as export_arm
     from fg_calib.io import is_folder, read_robot, require_absent
 
@@ -46,9 +44,11 @@ def export(
     if out is not None:
         require_absent(out.parent, [out.name])
     found = Calibration.load(arm) if is_result else read_robot(arm, base_link=base_link, tip_link=tip_link)
-    choices = {"far": far, "calibration_elements": calibration_elements, "ur_base": ur_base, "ur_hash": ur_hash}
+    choices = {"far": far, "ur_base": ur_base, "ur_hash": ur_hash}
     before = None if nominal is None else read_robot(nominal, base_link=base_link, tip_link=tip_link)
-    q = measured_configurations(arm) if at == "measured" else None
+    q = found.measured if isinstance(found, Calibration) and at == "measured" else None
+    if at == "measured" and q is None:
+        raise InputError(str(arm), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
     made = export_arm(found, to, nominal=before, configurations=q, tool=tool, **choices)  # type: ignore[arg-type]
     if out is not None:
         made.write(out)

@@ -1,6 +1,3 @@
-from .export import Export, measured_configurations
+from .export import Export
 
-__all__ = [
-    "Export",
-    "measured_configurations",
-]
+__all__ = ["Export"]

@@ -347,10 +347,8 @@ def transform(**values: float) -> Floats:
         axis = AXIS_OF_KIND[kind]
         if axis < Axis.RX:
             T[:3, 3] += value * T[:3, axis]
-            continue
-        i, j = (axis - Axis.RX + 1) % 3, (axis - Axis.RX + 2) % 3  # it turns i towards j
-        c, s = np.cos(value), np.sin(value)
-        T[:3, [i, j]] = np.stack([c * T[:3, i] + s * T[:3, j], c * T[:3, j] - s * T[:3, i]], axis=1)
+        else:
+            T[:3, :3] = T[:3, :3] @ Rotation.from_euler("xyz"[axis - Axis.RX], value).as_matrix()
     return T
 
 

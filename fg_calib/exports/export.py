@@ -29,14 +29,13 @@ from fg_calib.exports.urdf import (
     BASE_LINK,
     TOOL_LINK,
     UrBase,
-    calibrated_urdf,
     dumped,
     new_urdf,
     tesseract_text,
     ur_kinematics,
 )
-from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
-from fg_calib.io import Units, require_absent, robot_text, write_text
+from fg_calib.inputs import InputError, as_floats, checked, printable, shown
+from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, Robot, frame_values
 
 ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
@@ -108,21 +107,11 @@ class Export:
 
 @dataclass(frozen=True)
 class _Arm:
-    """What is exported: the calibrated arm, the arm as drawn where that is known, and the comments for its file."""
+    """What is exported: the calibrated arm, its nominal robot where that is known, and the comments for its file."""
 
     robot: Robot
     nominal: Robot | None
     comments: tuple[str, ...]
-
-    def nominal_for(self, what: str) -> Robot:
-        """The arm as drawn.
-
-        Raises:
-            InputError: It is not known.
-        """
-        if self.nominal is None:
-            raise InputError(what, "an arm without the one as drawn", "a RESULT of calibrate, or a nominal robot")
-        return self.nominal
 
 
 @checked
@@ -134,7 +123,6 @@ def export(
     configurations: ArrayLike | None = None,
     tool: ToolOfZeros = "calibrated",
     far: bool = False,
-    calibration_elements: bool = False,
     ur_base: UrBase | None = None,
     ur_hash: str | None = None,
 ) -> Export:
@@ -144,13 +132,12 @@ def export(
         arm: A calibration, or a robot.
         to: `urdf`, `ur` (kinematics for ROS' ur_description), `tesseract` (calibration of joint origins), `dh`, `mdh`,
             `hayati` (tables in mm and deg), `zeros` (joint zeros alone), `yaml` (this package's robot file).
-        nominal: The robot as drawn; a calibration has it.
+        nominal: The nominal robot; a calibration has it.
         configurations: Of `zeros`: where the fit is wanted, shape (n, n_joints), [rad] (prismatic: [m]); all over the
             joint limits if None.
         tool: Of `zeros`: the tool that the controller works with: as calibrated, as it is set there on its own and the
-            tool of a calibration is often an instrument's target; or as drawn, so that zeros make up for it.
+            tool of a calibration is often an instrument's target; or nominal, so that zeros make up for it.
         far: Of `dh` and `mdh`: take common normals of nearly parallel axes however far away they are, and be exact.
-        calibration_elements: Of `urdf`: write what is a joint's zero into `<calibration rising="...">`.
         ur_base: Of `ur`: which frame of ur_description the arm's base is; `base_link` if that is its name in a URDF,
             else `base`, the controller's.
         ur_hash: Of `ur`: the controller's own hash, for which the driver asks.
@@ -161,12 +148,12 @@ def export(
     """
     found = _arm_of(arm, nominal)
     given: dict[str, Any] = {"configurations": configurations is not None, "tool": tool != "calibrated", "far": far}
-    given |= {"calibration_elements": calibration_elements, "ur_base": ur_base, "ur_hash": ur_hash}
+    given |= {"ur_base": ur_base, "ur_hash": ur_hash}
     for name, value in given.items():
         if value not in (None, False) and to not in _FORMATS_OF[name]:
             raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
     formats: dict[str, Callable[[], Export]] = {
-        "urdf": lambda: _urdf(found, calibration_elements),
+        "urdf": lambda: _urdf(found),
         "ur": lambda: _ur(found, ur_base, ur_hash),
         "tesseract": lambda: _tesseract(found),
         "zeros": lambda: _zeros(found, tool, configurations),
@@ -210,8 +197,9 @@ def _arm_of(arm: Robot | Calibration, nominal: Robot | None) -> _Arm:
 
 
 _FORMATS_OF: Mapping[str, tuple[str, ...]] = {
-    **{"configurations": ("zeros",), "tool": ("zeros",), "far": ("dh", "mdh")},
-    **{"calibration_elements": ("urdf",), "ur_base": ("ur",), "ur_hash": ("ur",)},
+    **dict.fromkeys(("configurations", "tool"), ("zeros",)),
+    **dict.fromkeys(("ur_base", "ur_hash"), ("ur",)),
+    "far": ("dh", "mdh"),
 }
 """The formats for which an option means something."""
 
@@ -237,18 +225,11 @@ def _frames_outside(robot: Robot, start: str, end: str) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _urdf(arm: _Arm, calibration_elements: bool) -> Export:
+def _urdf(arm: _Arm) -> Export:
     robot = arm.robot
     if robot.urdf is not None:
-        nominal = arm.nominal_for("calibration_elements") if calibration_elements else None
         notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
-        if nominal is not None:
-            if nominal.convention != "urdf":
-                raise InputError("nominal", f"a robot of convention {nominal.convention}", "the URDF as drawn")
-            notes += ("what reads it must add `rising` of <calibration> to readings, or the arm lacks that",)
-        return Export("urdf", robot.name, calibrated_urdf(robot, nominal), notes)
-    if calibration_elements:
-        raise InputError("calibration_elements", "an arm that is no URDF", "an arm that was read from a URDF")
+        return Export("urdf", robot.name, urdf_text(robot.urdf.text, joint_origins(robot)), notes)
     notes = (
         f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",
         "URDF knows no slide without limits, which has 1000 m here, and no turn with one limit, which has none",
@@ -290,13 +271,8 @@ def _tesseract(arm: _Arm) -> Export:
 
 def _error_words(found: PoseErrors) -> str:
     """Errors in mm and deg."""
-    position, rotation = (
-        f"{_MM_DEG.from_si(rms, unit):.4g} {_MM_DEG.name(unit)} RMS, {_MM_DEG.from_si(most, unit):.4g} at most"
-        for rms, most, unit in (
-            (found.position_rms, found.position_max, "m"),
-            (found.rotation_rms, found.rotation_max, "rad"),
-        )
-    )
+    position = f"{1e3 * found.position_rms:.4g} mm RMS, {1e3 * found.position_max:.4g} at most"
+    rotation = f"{np.rad2deg(found.rotation_rms):.4g} deg RMS, {np.rad2deg(found.rotation_max):.4g} at most"
     return f"position {position}; orientation {rotation}"
 
 
@@ -334,9 +310,10 @@ def _yaml(arm: _Arm) -> Export:
 
 
 def _zeros(arm: _Arm, tool: ToolOfZeros, configurations: ArrayLike | None) -> Export:
-    robot, nominal = arm.robot, arm.nominal_for("zeros")
-    if tool == "calibrated":
-        nominal = with_frames_of(nominal, robot, (robot.n_joints + 1,))
+    robot, start = arm.robot, arm.nominal
+    if start is None:
+        raise InputError("zeros", "an arm without its nominal robot", "a RESULT of calibrate, or a nominal robot")
+    nominal = with_frames_of(start, robot, (robot.n_joints + 1,)) if tool == "calibrated" else start
     at = {"workspace": drawn(robot, N_JUDGED, 1)}
     fitted = drawn(robot, N_FITTED, 0)
     if configurations is not None:
@@ -348,15 +325,13 @@ def _zeros(arm: _Arm, tool: ToolOfZeros, configurations: ArrayLike | None) -> Ex
     before = {name: errors(nominal, robot, q) for name, q in at.items()}
     after = {name: errors(nominal, robot, q, zeros) for name, q in at.items()}
     notes = [
-        "joint zeros, all else as drawn: zero is what to add to a joint's reading (angle = reading + zero);",
+        "joint zeros, all else nominal: zero is what to add to a joint's reading (angle = reading + zero);",
         "it is subtracted from what is commanded, and from a stored encoder offset (angle = encoder - offset)",
         f"fitted at {len(fitted)} configurations {'within the joint limits' if configurations is None else 'given'}",
     ]
-    if _frame_words(robot, robot.n_joints + 1) != (
-        as_drawn := _frame_words(arm.nominal_for("zeros"), robot.n_joints + 1)
-    ):
-        words = as_drawn if tool == "nominal" else _frame_words(robot, robot.n_joints + 1)
-        notes.append(f"with the tool as {'drawn' if tool == 'nominal' else 'calibrated'}: {words or 'none'} (mm, deg)")
+    tools = {which: _frame_words(one, robot.n_joints + 1) for which, one in (("nominal", start), ("calibrated", robot))}
+    if tools["nominal"] != tools["calibrated"]:
+        notes.append(f"with the {tool} tool: {tools[tool] or 'none'} (mm, deg)")
     for name in at:
         where = "over the joint limits" if name == "workspace" else "at the configurations given"
         notes += [f"before, {where}: {_error_words(before[name])}", f"after, {where}: {_error_words(after[name])}"]
@@ -370,18 +345,3 @@ def _zeros(arm: _Arm, tool: ToolOfZeros, configurations: ArrayLike | None) -> Ex
     }
     text = _commented((*arm.comments, *notes), dumped(document))
     return Export("zeros", robot.name, text, tuple(notes), details=details)
-
-
-def measured_configurations(path: Path | str) -> Floats:
-    """The configurations that a saved calibration was measured at, shape (n, n_joints), [rad] (prismatic: [m]).
-
-    Args:
-        path: The folder that `calibrate --out` wrote, or its `result.json`.
-
-    Raises:
-        InputError: There are none, or they are damaged.
-    """
-    found = Calibration.load(path).measured
-    if found is None:
-        raise InputError(str(path), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
-    return found

@@ -32,10 +32,9 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.exports.dh import Links, in_table, inverse, links_of, rigid, row_transform, transform
+from fg_calib.exports.dh import Links, in_table, links_of, row_transform, transform
 from fg_calib.inputs import Floats, InputError
-from fg_calib.io import ROUNDING, joint_origins, urdf_text
-from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_of_matrix, frame_values
+from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_values
 
 FARTHEST_SLIDE = 1000.0
 """Limit of a slide without one, [m]: URDF knows no slide without limits."""
@@ -69,18 +68,10 @@ def urdf_joints(robot: Robot) -> list[UrdfJoint]:
         InputError: A joint's value is more than its reading plus a constant.
     """
     links: Links = links_of(robot)
-    names = {joint.name for joint in robot.joints}
-    joints = [UrdfJoint(_free("base_frame", names), None, FIRST_LINK, links.base)]
+    joints = [UrdfJoint("base_frame", None, FIRST_LINK, links.base)]
     for i, joint in enumerate(robot.joints):
         joints.append(UrdfJoint(joint.name, joint, f"link_{i + 1}", links.between[i]))
-    return [*joints, UrdfJoint(_free("tool_frame", names), None, TOOL_LINK, links.between[-1] @ links.tool)]
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """A name that is not taken."""
-    while name in taken:
-        name += "_"
-    return name
+    return [*joints, UrdfJoint("tool_frame", None, TOOL_LINK, links.between[-1] @ links.tool)]
 
 
 def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
@@ -139,68 +130,9 @@ def _limit(joint: Joint) -> list[dict[str, str]]:
     return [{"lower": lower, "upper": upper, "effort": "0", "velocity": "0"}]
 
 
-def zeros_of_origins(nominal: Robot, calibrated: Robot) -> tuple[dict[str, float], dict[str, dict[str, float]]]:
-    """What of the corrections of a URDF's origins is one of joint zeros, and the origins with all but that.
-
-    With C = O^-1 O' the correction of an origin, O' the calibrated one, the turn about the joint's axis in it is split
-    off: O' J(q) = (O' J(zero)^-1) J(q + zero). Of a turn C with the quaternion (w, v) it is 2 atan2(v.axis, w); of a
-    slide the shift along its axis.
-
-    Args:
-        nominal: The arm as drawn, of a URDF.
-        calibrated: The same arm calibrated.
-
-    Returns:
-        Zeros by joint, [rad] or [m], and origins by joint and kind.
-    """
-    zeros: dict[str, float] = {}
-    origins: dict[str, dict[str, float]] = {}
-    all_drawn, all_found = joint_origins(nominal), joint_origins(calibrated)
-    for i, joint in enumerate(calibrated.joints):
-        drawn, found = all_drawn[joint.name], all_found[joint.name]
-        zeros[joint.name], origins[joint.name] = 0.0, found
-        if all(abs(drawn[kind] - found[kind]) <= ROUNDING for kind in drawn):
-            continue
-        before, after = frame_matrix(drawn), frame_matrix(found)
-        axis = _axis(calibrated, i)
-        C = inverse(before) @ after
-        if joint.prismatic:
-            zero = float(axis @ C[:3, 3])
-            motion = rigid(np.eye(3), zero * axis)
-        else:
-            x, y, z, w = Rotation.from_matrix(C[:3, :3]).as_quat(canonical=True)
-            zero = float(2.0 * np.arctan2(np.array([x, y, z]) @ axis, w))
-            motion = rigid(Rotation.from_rotvec(zero * axis).as_matrix(), np.zeros(3))
-        rest = after @ inverse(motion)
-        zeros[joint.name] = zero
-        origins[joint.name] = frame_of_matrix(rest)
-    return zeros, origins
-
-
 def frame_matrix(values: Mapping[str, float]) -> Floats:
     """A frame from its values by kind, shape (4, 4)."""
     return transform(**{kind: values.get(kind, 0.0) for kind in FRAME_KINDS})
-
-
-def _axis(robot: Robot, index: int) -> Floats:
-    """The axis of a URDF's joint in its own frame, in the sense of the URDF, shape (3,)."""
-    at = next(i for i, e in enumerate(robot.elements) if e.joint == index)
-    yaw, pitch = robot.elements[at - 2], robot.elements[at - 1]  # constants that turn z onto the axis
-    return transform(yaw=yaw.constant, pitch=pitch.constant)[:3, 2]
-
-
-def calibrated_urdf(robot: Robot, nominal: Robot | None) -> str:
-    """The URDF that an arm came from, calibrated; nothing but origins differs.
-
-    Args:
-        robot: The calibrated arm.
-        nominal: The arm as drawn, where corrections of joint zeros are to stand in `<calibration>`; else None.
-    """
-    text = "" if robot.urdf is None else robot.urdf.text
-    if nominal is None:
-        return urdf_text(text, joint_origins(robot))
-    zeros, origins = zeros_of_origins(nominal, robot)
-    return urdf_text(text, origins, zeros)
 
 
 # --- ROS and Tesseract ------------------------------------------------------------------------------------------------

@@ -149,7 +149,7 @@ def joint_origins(robot: Robot) -> dict[str, dict[str, float]]:
     return {j.name: {kind: values[f"{j.name}.{kind}"] for kind in FRAME_KINDS} for j in robot.joints}
 
 
-def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapping[str, float] | None = None) -> str:
+def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
     """A URDF with other origins of some joints; comments and other elements stay.
 
     A number of `<origin>` that is the one wanted but for `ROUNDING` stays, an attribute of such numbers as written.
@@ -157,8 +157,6 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
     Args:
         text: The URDF, as it was read.
         origins: By joint x, y, z, roll, pitch and yaw, [m] and [rad].
-        zeros: By joint what is to be added to its reading, [rad] or [m]: it is added to `rising` of the joint's
-            `<calibration>`, which it gets if it has none.
     """
     from lxml import etree
 
@@ -167,9 +165,6 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]], zeros: Mapp
         name = joint.get("name", "")
         if name in origins:
             _set(joint, "origin", {key: [origins[name][kind] for kind in kinds] for key, kinds in _ORIGIN.items()})
-        if zeros is not None and abs(zeros.get(name, 0.0)) > ROUNDING:
-            rising = sum(_figures(_attribute(joint, "calibration", "rising", "0")))
-            _set(joint, "calibration", {"rising": [rising + zeros[name]]})
     return f'<?xml version="1.0"?>\n{etree.tostring(root.getroottree(), encoding="unicode")}\n'
 
 

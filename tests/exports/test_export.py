@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import yaml
-from exported import ARMS, TREE, UR10, column, matrix, off, pin_poses, seven, ur10, yourdfpy_poses
+from exported import ARMS, TREE, UR10, matrix, off, pin_poses, seven, ur10, yourdfpy_poses
 from oracle import dh_joint, frame, tool_pose
 from scipy.spatial.transform import Rotation
 from sparing import as_case
@@ -223,29 +223,6 @@ def test_tesseracts_origins_put_into_the_urdf_give_the_tool_poses(arm, tmp_path)
     assert np.abs(found - ours(arm, q)).max() < EXACT
 
 
-# --- URDF -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("backwards", [False, True])
-def test_zeros_in_calibration_elements_and_origins_are_together_the_arm(backwards, tmp_path):
-    nominal = column(tmp_path, backwards)
-    robot = off(nominal)
-    text = export(robot, "urdf", nominal=nominal, calibration_elements=True).text
-    (tmp_path / "out.urdf").write_text(text)
-    back = read_urdf(tmp_path / "out.urdf", base_link=robot.urdf.base_link, tip_link=robot.urdf.tip_link)
-    rising = {line.split('"')[1]: float(line.split('rising="')[1].split('"')[0]) for line in _joint_lines(text)}
-    zeros = np.array([rising[joint.name] for joint in robot.joints])
-    assert np.abs(zeros).min() > 0.0
-    q = drawn(robot, 100, 6)
-    assert np.abs(ours(back, q + zeros) - ours(robot, q)).max() < EXACT
-    assert np.abs(ours(back, q) - ours(robot, q)).max() > 1e-5
-
-
-def _joint_lines(text):
-    parts = text.split("<joint ")[1:]
-    return [part for part in parts if "rising" in part]
-
-
 # --- joint zeros ------------------------------------------------------------------------------------------------------
 
 
@@ -302,7 +279,7 @@ def test_zeros_are_the_best_there_are():
 UR = ur10()
 MISTAKES = {
     "ur of seven joints": [seven(), {}, "seven: 7 joints, 0 of which slide, expected six joints that turn"],
-    "zeros of no drawing": [UR, {}, "zeros: an arm without the one as drawn, expected a RESULT of calibrate"],
+    "zeros of no drawing": [UR, {}, "zeros: an arm without its nominal robot, expected a RESULT of calibrate"],
     "zeros of another drawing": [UR, {"nominal": seven()}, "nominal: seven has other joints, expected q1, q2"],
     "urdf of a name that XML cannot hold": [
         Robot.from_dh([[0, 0, 0, 0]], names=["a\x1b"]),

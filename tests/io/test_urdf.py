@@ -11,7 +11,7 @@ from tolerances import rounding
 
 from fg_calib.inputs import InputError
 from fg_calib.io.robot_file import read_robot, write_robot
-from fg_calib.io.urdf import read_urdf, urdf_text, write_urdf
+from fg_calib.io.urdf import read_urdf, write_urdf
 from fg_calib.robot.model import Joint
 
 TREE = """\
@@ -133,17 +133,6 @@ def test_a_urdf_is_written_as_it_was_but_for_the_numbers_of_origins(tmp_path, en
     expected = expected.replace("<origin />", '<origin rpy="1e-07 0.0 0.0"/>')
     assert canonical((tmp_path / "out.urdf").read_bytes()) == canonical(expected)
     assert read_urdf(tmp_path / "out.urdf").parameters == robot.with_values(values).parameters
-
-
-def test_zeros_are_added_to_what_a_joint_is_calibrated_by():
-    odd = ODD.partition("?>\n")[2]
-    text = odd.replace('falling="0.5"', 'rising="0.5" falling="0"')
-    expected = odd.replace('<calibration falling="0.5"/>', '<calibration falling="0.5" rising="0.25"/>')
-    expected = expected.replace('type="continuous">', 'type="continuous"><calibration rising="-0.5"/>')
-    found = urdf_text(odd, {}, {"l1": 0.25, "<l2>": -0.5})
-    assert canonical(found.encode()) == canonical(expected.encode())
-    found = urdf_text(text, {}, {"l1": 0.25})
-    assert canonical(found.encode()) == canonical(text.replace('rising="0.5"', 'rising="0.75"').encode())
 
 
 def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
