@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
-from fg_calib.simulation import instrument_keys, is_filled_in, table_columns, to_fill_in
+from fg_calib.simulation import instrument_keys, table_columns, to_fill_in
 
 SCHEMA = "fg-calib/design/1"
 
@@ -205,13 +206,12 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     job = ("robot.yaml", "calibration.yaml") if measured else ()
     names = (_DOCUMENT, CONFIGURATIONS, "design.svg", *filled, *job, *([urdf] if urdf else []))
     earlier = _files_before(folder)
-    for name in earlier:
-        if name.endswith(".csv") and name != CONFIGURATIONS and is_filled_in(folder / name):
+    for name, digest in earlier.items():
+        if name.endswith(".csv") and exists(folder / name) and _digest(folder / name) != digest:
             raise InputError(str(folder / name), "a table that has been filled in", "another folder")
 
     def write(into: Path) -> None:
         write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
-        write_text(into / _DOCUMENT, tables.json_text(design_document(design) | {"files": names}))
         write_charts(into, {"design": [draw_design(design)]})
         for name, columns in filled.items():
             write_csv(into / name, columns)
@@ -221,6 +221,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
             then = _CALIBRATE if design.pool.before is None else _UPDATE
             write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, measured, units))
+        files = {_DOCUMENT: ""} | {file.name: _digest(file) for file in into.iterdir()}
+        write_text(into / _DOCUMENT, tables.json_text(design_document(design) | {"files": files}))
 
     fill_folder(
         folder, write, {name: b"" if name in earlier else b"none" for name in dict.fromkeys((*names, *earlier))}
@@ -228,14 +230,18 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     return names
 
 
-def _files_before(folder: Path) -> list[str]:
-    """Names of the files of an earlier design in a folder; none where there was none."""
+def _digest(path: Path) -> str:
+    return sha256(read_text(path).encode()).hexdigest()
+
+
+def _files_before(folder: Path) -> dict[str, str]:
+    """Names of the files of an earlier design in a folder, with their digests; none where there was none."""
     path = folder / _DOCUMENT
     with suppress(ValueError, TypeError, KeyError, AttributeError, InputError):  # none, or changed manually
         document = json.loads(read_text(path)) if exists(path) else {}
         if document["schema"] == SCHEMA:
-            return [name for name in document["files"] if Path(name).name == name]
-    return []
+            return {name: digest for name, digest in document["files"].items() if Path(name).name == name}
+    return {}
 
 
 def _is_touched(table: Table) -> bool:

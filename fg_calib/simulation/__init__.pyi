@@ -17,7 +17,7 @@ from .scenario import (
 )
 from .simulator import Simulation, simulate
 from .views import Candidates, draw_candidates
-from .write import instrument_keys, is_filled_in, table_columns, to_fill_in, write_simulation
+from .write import instrument_keys, table_columns, to_fill_in, write_simulation
 
 __all__ = [
     "MOST_DRAWN",
@@ -37,7 +37,6 @@ __all__ = [
     "TargetViews",
     "draw_candidates",
     "instrument_keys",
-    "is_filled_in",
     "link_points",
     "read_scenario",
     "simulate",

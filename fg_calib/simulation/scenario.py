@@ -491,16 +491,10 @@ class Spot:
     tolerance: LengthFromZero | None = None
 
 
-class _SpotInFile(Schema):
-    x: Number
-    y: Number
-    z: Number
-    tolerance: NotNegative | None = None
-
-
 def _spot(given: Any, _: FileContext) -> dict[str, Any]:
-    file = validate(_SpotInFile, given, "")
-    return {"xyz": (file.x, file.y, file.z), "tolerance": file.tolerance}
+    """A point as its coordinates, those missing 0, with what is known of it."""
+    xyz = given if not isinstance(given, Mapping) else {key: v for key, v in given.items() if key != "tolerance"}
+    return {"xyz": xyz} | ({"tolerance": given["tolerance"]} if xyz is not given and "tolerance" in given else {})
 
 
 @schema
@@ -675,20 +669,16 @@ class Errors:
     values: Mapping[str, Number]
 
 
-class _ErrorsInFile(Schema):
-    uniform: dict[str, NotNegative] | None = None
-    normal: dict[str, NotNegative] | None = None
-    values: dict[str, Number] | None = None
-
-
 def _errors(given: Any, context: FileContext) -> Errors:
     if given == {"normal": "tolerance"}:
         for p in context.robot.parameters:
             if p.estimated and p.tolerance is None:
                 raise InputError("normal", f"{p.name} of the robot has no tolerance", "one for all that is estimated")
         return Errors("normal", {p.name: p.tolerance for p in context.robot.parameters if p.tolerance is not None})
-    file = validate(_ErrorsInFile, given, "")
-    law, values = _the_one_of({key: getattr(file, key) for key in _ErrorsInFile.model_fields})
+    laws = ("uniform", "normal", "values")
+    given = refuse_unknown_keys(*laws)(given)
+    law, values = _the_one_of({key: given.get(key) for key in laws})
+    values = _read(dict[str, Number], values, law, context)
     values = {key: value * context.factor(unit_of_key(key)) for key, value in values.items()}
     return Errors(cast("Any", law), values_by_name(context.robot, values, law))
 

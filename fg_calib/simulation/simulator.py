@@ -419,8 +419,8 @@ class Measuring:
         assert i.camera is not None
         assert i.corners is not None
         points = b[:, :, None] + np.einsum("nkij,cj->nkci", R[:, :, :, :2], i.corners)
-        image = i.camera.image(points.reshape(-1, 3))[0].reshape(*points.shape[:3], 2)
-        k, which, corner = np.nonzero(_in_image(i.camera, points, image) & faced[:, :, None])
+        image, seen = project(i.camera, points)
+        k, which, corner = np.nonzero(seen & faced[:, :, None])
         self._require_seen(k)
         m = self.rows(
             k,
@@ -472,19 +472,15 @@ class Measuring:
         return Placement(base_R_camera.T, -base_R_camera.T @ (middle - 2.5 * radius * ahead))
 
 
-def _in_image(camera: Camera, points: Floats, image: Floats) -> Booleans:
-    """Whether points in the camera's frame, shape (..., 3), are in front of it and in its image, shape (..., 2).
+def project(camera: Camera, points: Floats) -> tuple[Floats, Booleans]:
+    """Images of points in the camera's frame, shape (..., 3), and whether they are in front of it and in its image.
 
-    The distortion's polynomial is not monotonic far from the axis, and would bring into the image what is far outside.
+    The distortion's polynomial turns back far from the axis, and would bring into the image what is far outside.
     """
-    ahead = points[..., 2] > 0.0
-    within = np.all((image >= 0.0) & (image <= [2.0 * camera.cx, 2.0 * camera.cy]), axis=-1)
-    z = np.where(ahead, points[..., 2], 1.0)
-    square = np.sum((points[..., :2] / z[..., None]) ** 2, axis=-1)  # of r, which must grow all the way to the point
-    s = square[..., None] * np.linspace(0.1, 1.0, 10)
-    growing = 1.0 + s * (3.0 * camera.k1 + s * (5.0 * camera.k2 + s * 7.0 * camera.k3)) > 0.0
-    seen: Booleans = ahead & within & growing.all(axis=-1)
-    return seen
+    image, J = camera.image(points.reshape(-1, 3))
+    within = np.all((image >= 0.0) & (image <= [2.0 * camera.cx, 2.0 * camera.cy]), axis=1)
+    seen: Booleans = (points[..., 2] > 0.0) & (within & (np.linalg.det(J[:, :, :2]) > 0.0)).reshape(points.shape[:-1])
+    return image.reshape(*points.shape[:-1], 2), seen
 
 
 def merge_truths(tables: list[Table], truths: list[Truth], source: str) -> tuple[tuple[Table, ...], Truth]:

@@ -22,8 +22,8 @@ from fg_calib.simulation.scenario import BoardViews, Configurations, GivenReadin
 
 Words = NDArray[np.str_]
 
-Draw = Callable[[int], tuple[Floats, Words]]
-"""Draws configurations, shape (n, n_joints), with why each is rejected, "" where it is not."""
+Draw = Callable[[int, int], tuple[Floats, Words]]
+"""Draws n configurations after m others, shape (n, n_joints), with why each is rejected, "" where it is not."""
 
 REASONS = (
     *("outside the joint limits", "not seen", "out of range", "outside the region", "out of reach", "in a box"),
@@ -103,7 +103,7 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
     while len(taken) < n and asked < most and (len(taken) or asked < hopeless):
         share = len(taken) / asked if len(taken) else 1.0
         k = int(1.1 * (n - len(taken)) / share) + 10 if asked else min(n, MAX_DRAWN_IN_VAIN)
-        readings, reason = draw(min(k, MAX_DRAWN_AT_ONCE, most - asked))
+        readings, reason = draw(min(k, MAX_DRAWN_AT_ONCE, most - asked), asked)
         good = np.flatnonzero(reason == "")
         reason[good[enters(robot, readings[good], of.keep_out)]] = "in a box"
         good = np.flatnonzero(reason == "")
@@ -122,40 +122,27 @@ def _draw(robot: Robot, of: Configurations, generator: np.random.Generator, plac
         case BoardViews():
             return _views(robot, of, generator, f"{place}: board")
         case TargetViews():
-            return lambda k: _target(robot, of, generator, k)
+            return lambda k, _: _target(robot, of, generator, k)
         case RandomReadings():
-            return lambda k: (random_readings(robot, k, generator), np.full(k, "", dtype=WORD))
+            return lambda k, _: (random_readings(robot, k, generator), np.full(k, "", dtype=WORD))
         case GivenReadings():
-            return _rows(robot, of.readings, place)
-
-
-def _rows(robot: Robot, readings: Floats, place: str) -> Draw:
-    """The rows of a table, one after the other."""
-    rows = as_floats(f"{place}: table", readings, f"(n, {robot.n_joints})")
-    outside: Booleans = np.any(outside_limits(rows, robot), axis=1)
-    first = 0
-
-    def draw(k: int) -> tuple[Floats, Words]:
-        nonlocal first
-        chosen = slice(first, first + k)
-        first += k
-        return rows[chosen], np.where(outside[chosen], "outside the joint limits", "").astype(WORD)
-
-    return draw
+            rows = as_floats(f"{place}: table", of.readings, f"(n, {robot.n_joints})")
+            outside = np.any(outside_limits(rows, robot), axis=1)
+            reason = np.where(outside, "outside the joint limits", "").astype(WORD)
+            return lambda k, asked: (rows[asked : asked + k], reason[asked : asked + k].copy())
 
 
 def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, place: str) -> Draw:
     """Views of a board: the first that is drawn is A."""
     near: Floats | None = None  # what self-motion is held to
-    first = True
 
-    def draw(k: int) -> tuple[Floats, Words]:
-        nonlocal near, first
+    def draw(k: int, asked: int) -> tuple[Floats, Words]:
+        nonlocal near
+        first = asked == 0
         rotation, position = view_board(replace(views, count=k - 1 if first else k), generator)
         if first and views.self_motion == "held":
             near = _require_reached(solve_inverse(robot, position[:1], rotation[:1], generator=generator), place)[0]
         rotation, position = rotation[-k:], position[-k:]
-        first = False
         seen = sees_board(views, rotation, position)
         R, p = rotation[seen], position[seen]
         found = solve_inverse(robot, p, R, near=near, generator=generator, n_starts=N_STARTS, n_steps=N_STEPS)
@@ -306,15 +293,14 @@ def _reach_views(robot: Robot, views: BoardViews, generator: np.random.Generator
         InputError: One of the poses was not reached.
     """
     rotation, position = view_board(views, generator)
-    if views.self_motion == "random":
-        return _require_reached(solve_inverse(robot, position, rotation, generator=generator), place)
-    first = _require_reached(solve_inverse(robot, position[:1], rotation[:1], generator=generator), place)
-    others = solve_inverse(robot, position[1:], rotation[1:], generator=generator, near=first[0])
-    return np.concatenate([first, _require_reached(others, place, 1)])
+    near: Floats | None = None
+    if views.self_motion == "held":
+        near = _require_reached(solve_inverse(robot, position[:1], rotation[:1], generator=generator), place)[0]
+    return _require_reached(solve_inverse(robot, position, rotation, generator=generator, near=near), place)
 
 
-def _require_reached(found: Inverse, place: str, first: int = 0) -> Floats:
-    """The solutions for views of a board, numbered from `first`; A is 0.
+def _require_reached(found: Inverse, place: str) -> Floats:
+    """The solutions for views of a board.
 
     Raises:
         InputError: One of the poses was not reached.
@@ -322,12 +308,8 @@ def _require_reached(found: Inverse, place: str, first: int = 0) -> Floats:
     missed = np.flatnonzero(~found.reached)
     if len(missed) == 0:
         return found.readings
-    names = ["A" if k == 0 else f"view {k}" for k in (first + missed[:12]).tolist()]
     nearest = missed[np.argmin(found.miss_position[missed])]
     by = f"{found.miss_position[nearest]:.3g} m and {np.rad2deg(found.miss_rotation[nearest]):.3g} deg"
-    raise InputError(
-        place,
-        f"{len(missed)} of {first + len(found.readings)} views not reached within the joint limits ("
-        f"{', '.join(names)}{', ...' * (len(missed) > 12)}): the nearest one is missed by {by}",
-        hint="move the board nearer or widen the limits",
-    )
+    reason = f"{len(missed)} of {len(found.readings)} views not reached within the joint limits"
+    hint = "move the board nearer or widen the limits"
+    raise InputError(place, f"{reason}: the nearest one is missed by {by}", hint=hint)

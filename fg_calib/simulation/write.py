@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, checked
 from fg_calib.io import NOISE_UNITS, Units, fill_folder, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
-from fg_calib.robot import Robot
+from fg_calib.robot import Robot, yaw_pitch_roll
 from fg_calib.simulation.scenario import Placement, Plane, Spot, frame_knowledge
 from fg_calib.simulation.simulator import Simulation
 
@@ -26,7 +25,7 @@ Columns = Mapping[str, Any]
 _FIRST_WORDS = "# fg-calib simulate "
 """How the job of a simulation begins."""
 
-MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv")
+MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv", *GENERIC_COLUMNS)
 """Columns of measured values."""
 
 
@@ -69,9 +68,8 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
 
     urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
     names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
-    earlier = ("poses.csv", *(f"{name}{ending}" for name in robots for ending in (".yaml", ".urdf")))
     job = {"calibration.yaml": _FIRST_WORDS.encode()}
-    fill_folder(folder, write, job | dict.fromkeys((*earlier, *names), b"") | job)
+    fill_folder(folder, write, job | dict.fromkeys(names, b"") | job)
     return tuple(names)
 
 
@@ -134,24 +132,6 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
     return dict(columns) | measured | joints
 
 
-def is_filled_in(path: Path) -> bool:
-    """Whether something was written into a table that was to be filled in; a file that is no such table counts.
-
-    Args:
-        path: The file, which need not exist.
-    """
-    import polars as pl
-
-    if not path.exists():
-        return False
-    try:
-        table = pl.read_csv(path, infer_schema=False)
-    except (pl.exceptions.PolarsError, OSError):
-        return True
-    groups = (table.select(f"^({pattern})$") for pattern in (r"q\d+", "|".join(MEASURED)))
-    return not any(of.width and sum(of.null_count().row(0)) == of.width * of.height for of in groups)
-
-
 # --- the job ----------------------------------------------------------------------------------------------------------
 
 
@@ -211,17 +191,12 @@ def _entry(table: Table, units: Units) -> dict[str, Any]:
 def _noise(m: Measurements, units: Units) -> dict[str, float]:
     """The sigmas of a simulated table: one a kind."""
     between = _pairs(m)
-    sigmas = {
-        **{"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma_point},
-        **{"distance": m.sigma_length, "pixel": m.sigma_pixel, **m.sigmas},
-        **({} if between is None else {"distance": between[0].sigma_distance, "angle": between[0].sigma_angle}),
-    }
+    sigmas = {kind: m.sigma(kind) for kind in NOISE_UNITS}
+    if between is not None:
+        sigmas |= {"distance": between[0].sigma_distance, "angle": between[0].sigma_angle}
     specified = {kind: float(s.flat[0]) for kind, s in sigmas.items() if s is not None and np.isfinite(s).any()}
-    return {
-        kind: units.from_si(specified[kind], unit) if unit in ("m", "rad") else specified[kind]
-        for kind, unit in NOISE_UNITS.items()
-        if kind in specified
-    }
+    of_unit = {kind: (sigma, NOISE_UNITS[kind]) for kind, sigma in specified.items()}
+    return {kind: units.from_si(s, unit) if unit in ("m", "rad") else s for kind, (s, unit) in of_unit.items()}
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------
@@ -235,11 +210,9 @@ def _place(landmark: Any, units: Units) -> Any:
     """Where a landmark truly is, as a scenario would state it, in a file's units."""
     match landmark:
         case Placement():
-            with warnings.catch_warnings():  # at a pitch of 90 degrees yaw is 0: as good as any
-                warnings.simplefilter("ignore")
-                angles = Rotation.from_matrix(landmark.rotation.copy()).as_euler("xyz")
-            rpy = {k: units.from_si(float(v), "rad") for k, v in zip(("roll", "pitch", "yaw"), angles, strict=True)}
-            return _xyz(landmark.position, units) | rpy
+            yaw, pitch, roll = yaw_pitch_roll(landmark.rotation)
+            angles = {"roll": roll, "pitch": pitch, "yaw": yaw}
+            return _xyz(landmark.position, units) | {k: units.from_si(float(v), "rad") for k, v in angles.items()}
         case Spot():
             return _xyz(landmark.xyz, units)
         case Plane():

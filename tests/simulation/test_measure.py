@@ -16,7 +16,7 @@ from fg_calib import InputError, calibrate, read_job, simulate
 from fg_calib.initialization import Camera
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.simulation import Instrument, Placement, RandomReadings, Spot, write_simulation
-from fg_calib.simulation.simulator import _in_image
+from fg_calib.simulation.simulator import project
 
 
 @cache
@@ -131,7 +131,7 @@ def test_a_lens_whose_distortion_turns_back_shows_nothing_beyond():
     """r (1 - 0.3 r^2) grows up to r = 1.05."""
     camera = Camera(fx=300, fy=300, cx=640, cy=480, k1=-0.3)
     points = np.array([[0.95, 0.0, 1.0], [1.2, 0.0, 1.0], [-0.5, 0.2, 1.0], [0.0, 0.0, -1.0]])
-    assert _in_image(camera, points, camera.image(points)[0]).tolist() == [True, False, True, False]
+    assert project(camera, points)[1].tolist() == [True, False, True, False]
 
 
 @pytest.mark.slow

@@ -253,6 +253,6 @@ def test_a_scenario_that_makes_no_sense_is_one_line(shipped):
         simulate(replace(shipped, errors=Errors("uniform", {"b": 1.0})))
     with pytest.raises(InputError, match=r"poses: noise: orientation: found none, expected 1 sigma, for model pose$"):
         simulate(replace(shipped, noise=Noise(1e-3, None)))
-    missed = r"1 of 2 views not reached within the joint limits \(view 1\): the nearest one is missed by [\d.]+ m"
+    missed = r"1 of 2 views not reached within the joint limits: the nearest one is missed by [\d.]+ m"
     with pytest.raises(InputError, match=f"^space-robot: configurations: board: {missed}"):
         simulate(replace(shipped, configurations=BoardViews(PLACE, 1, radius=30.0)))
