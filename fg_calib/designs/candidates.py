@@ -59,7 +59,6 @@ class Pool(Brief):
         tables: What it would measure at all candidates.
         problem: The problem of these tables.
         readings: Of each pose, shape (n_poses, n_joints), [rad] (prismatic: [m]).
-        group: The instrument whose own pose each is; "" where all others measure.
         pose_of: The pose of each configuration of the problem, shape (n_configurations,); `REFERENCE` or `NONE`.
         rows: Rows that each pose would add.
         given: Poses that were measured already, or will be anyway.
@@ -72,7 +71,6 @@ class Pool(Brief):
     tables: tuple[Table, ...]
     problem: Problem
     readings: Floats
-    group: NDArray[np.str_]
     pose_of: Integers
     rows: PoseRows
     given: Integers
@@ -111,11 +109,8 @@ class Pool(Brief):
             pairing: How pairs are formed instead.
         """
         names = self.problem.data.names[: self.problem.data.n_configurations]
-        of_pose: dict[int, list[int]] = {}
-        for k, number in enumerate(self.pose_of.tolist()):
-            of_pose.setdefault(number, []).append(k)
-        wanted = [*self.references.tolist(), *(k for number in poses.tolist() for k in of_pose.get(number, []))]
-        order = {names[k]: place for place, k in enumerate(wanted)}
+        wanted = np.concatenate([self.references, *(np.flatnonzero(self.pose_of == number) for number in poses)])
+        order = {names[k]: place for place, k in enumerate(wanted.tolist())}
         found = [_between_used(select_rows(table, order), known=self.before is not None) for table in self.tables]
         for number, table in enumerate(found):
             if number in self.formed:
@@ -265,31 +260,42 @@ def build_pool(
         n = data.n_configurations
         reason = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
         raise InputError("candidates", reason, "more configurations")
-    names = [_split_name(name) for name in data.names[: data.n_configurations]]
-    references = find_references(problem, scenario.source)
-    kept = np.setdiff1d(np.arange(len(names)), references)
-    pose_of = np.full(len(names), REFERENCE)
-    pose_of[kept] = np.arange(len(kept))
     n_given = 0 if given is None else len(given)
-    if n_given and not any(name == "" and k < n_given for name, k in names):
+    names = [_split_name(name) for name in data.names[: data.n_configurations]]
+    among_given = np.array([name == "" and k < n_given for name, k in names])
+    if n_given and not among_given.any():
         raise InputError("given", "configurations at which nothing is measured", "a job with what was touched")
-    return Pool(
-        scenario=scenario,
-        tables=tables,
-        problem=problem,
-        readings=data.readings[kept],
-        group=np.array([names[k][0] for k in kept], dtype=np.str_),
-        pose_of=pose_of,
-        rows=gather_rows(problem, pose_of, references, alone=before is None),
-        given=np.array([pose_of[k] for k in kept if names[k][0] == "" and names[k][1] < n_given], dtype=np.int64),
-        found=found,
-        before=before,
-        formed={
-            k: (i.model, i.pairing or Pairing())
-            for k, i in enumerate(scenario.instruments)
-            if i.model in PAIR_MODELS and i.sockets is None
-        },
-    )
+    formed = {
+        k: (i.model, i.pairing or Pairing())
+        for k, i in enumerate(scenario.instruments)
+        if i.model in PAIR_MODELS and i.sockets is None
+    }
+    more = {"scenario": scenario, "tables": tables, "found": found, "before": before, "formed": formed}
+    pool = pool_of(problem, np.arange(len(names)), scenario.source, alone=before is None, **more)
+    given_poses = pool.pose_of[among_given & (pool.pose_of >= 0)]
+    return replace(pool, given=given_poses)
+
+
+def pool_of(problem: Problem, poses: Integers, source: str, *, alone: bool = True, **more: Any) -> Pool:
+    """The pool of some configurations of a problem, without references that pairs share.
+
+    Args:
+        problem: The problem.
+        poses: The configurations.
+        source: Name of the scenario or the job, for messages.
+        alone: See `gather_rows`.
+        more: Other fields.
+
+    Raises:
+        InputError: Pairs without one reference pose.
+    """
+    references = _find_references(problem, source)
+    poses = np.setdiff1d(poses, references)
+    pose_of = np.full(problem.data.n_configurations, NONE)
+    pose_of[references], pose_of[poses] = REFERENCE, np.arange(len(poses))
+    rows = gather_rows(problem, pose_of, references, alone=alone)
+    fields = {"scenario": None, "tables": problem.data.tables, "given": np.zeros(0, dtype=np.int64)} | more
+    return Pool(problem=problem, readings=problem.data.readings[poses], pose_of=pose_of, rows=rows, **fields)
 
 
 def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Floats | None) -> tuple[Table, ...]:
@@ -307,7 +313,7 @@ def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Flo
     return simulate(_nominal(scenario, readings), exact=True).tables
 
 
-def find_references(problem: Problem, source: str) -> Integers:
+def _find_references(problem: Problem, source: str) -> Integers:
     """Configurations that all pairs of a table have in common.
 
     Raises:

@@ -70,17 +70,11 @@ def _worst(w: Floats) -> Floats:
 
 _Formula = Callable[[Floats], Floats]
 
-_LOG_DET: tuple[_Formula, _Formula] = _log_det, lambda w: w**-0.5
-_SMALLEST: tuple[_Formula, _Formula] = _of_variances(lambda w: -(w[-1] ** -0.5)), _worst
-
 FORMULAS: dict[Criterion, tuple[_Formula, _Formula]] = {
-    "I": (_trace, np.ones_like),
-    "D": _LOG_DET,
-    "A": (_trace, np.ones_like),
-    "E": _SMALLEST,
-    "O1": _LOG_DET,
+    **dict.fromkeys(("I", "A"), (_trace, np.ones_like)),
+    **dict.fromkeys(("D", "O1"), (_log_det, lambda w: w**-0.5)),
+    **dict.fromkeys(("E", "O3"), (_of_variances(lambda w: -(w[-1] ** -0.5)), _worst)),
     "O2": (_of_variances(lambda w: -((w[0] / w[-1]) ** 0.5)), _worst),
-    "O3": _SMALLEST,
     "O4": (_of_variances(lambda w: -(w[0] ** 0.5) / w[-1]), _worst),
     "O5": (_of_variances(lambda w: np.sum(w**0.5, axis=0)), lambda w: w**-0.25),
 }

@@ -165,16 +165,12 @@ def design(
     tell("looking for candidates")
     pool = _build_pool(of, candidates, given, n_candidates, draw["candidates"])
     readings = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
-    wanted = Task(readings, _needs_fit(pool) if fitted is None else fitted, lever)
+    blind_to_base = ObservedQuantities.of_tables(pool.problem.data.tables).blind_to_base
+    wanted = Task(readings, blind_to_base if fitted is None else fitted, lever)
     if wanted.fitted and len(readings) < MIN_FITTED:
         found = f"{len(readings)} configuration{'s' * (len(readings) > 1)}, of which a rigid fit leaves next to nothing"
         raise InputError("task", found, f"{MIN_FITTED} or more, or errors in the base frame")
     return design_from_pool(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
-
-
-def _needs_fit(pool: Pool) -> bool:
-    """Whether nothing that is measured says where the base is, so that errors count after the best rigid fit."""
-    return ObservedQuantities.of_tables(pool.problem.data.tables).blind_to_base
 
 
 def _build_pool(

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.assessment import solve_job
-from fg_calib.designs.candidates import NONE, REFERENCE, Pool, find_references
-from fg_calib.designs.information import gather_rows
+from fg_calib.designs.candidates import Pool, pool_of
 from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
@@ -67,23 +66,10 @@ def pool_of_rows(problem: Problem, source: str) -> Pool:
     Raises:
         InputError: Pairs without one reference pose.
     """
-    data, references = problem.data, find_references(problem, source)
-    used = np.concatenate([data.places[s.table][s.ends[s.train]].ravel() for s in data.blocks])
-    poses = np.setdiff1d(used, references)
-    which = np.full(data.n_configurations, NONE)  # test rows
-    which[references], which[poses] = REFERENCE, np.arange(len(poses))
-    readings = data.readings[poses]
-    return Pool(
-        scenario=None,
-        tables=data.tables,
-        problem=problem,
-        readings=readings,
-        group=np.full(len(readings), ""),
-        pose_of=which,
-        rows=gather_rows(problem, which, references),
-        given=np.zeros(0, dtype=np.int64),
-        found={"": Candidates(readings, len(readings), {})},
-    )
+    data = problem.data
+    train = np.concatenate([data.places[s.table][s.ends[s.train]].ravel() for s in data.blocks])
+    pool = pool_of(problem, train, source)
+    return replace(pool, found={"": Candidates(pool.readings, len(pool.readings), {})})
 
 
 def scenario_of(problem: Problem, configurations: Configurations | None = None, source: str = "job") -> Scenario:
@@ -173,21 +159,21 @@ def _noise_of(problem: Problem, number: int) -> Noise:
     """Specified noise of a table's train rows, times the factors where noise was estimated."""
     table = problem.data.tables[number]
     m, formed = table.measurements, dict[str, str]()
-    S = None if m.covariance is None else np.sqrt(np.diagonal(m.covariance, axis1=1, axis2=2))
-    sigmas = {"orientation": m.sigma_orientation, "position": m.sigma_position, "distance": m.sigma_length}
-    sigmas |= {"point": m.sigma_point, "pixel": m.sigma_pixel}
-    sigmas |= {} if S is None else {"orientation": S[:, :3], "position": S[:, 3:]}
-    used = {kind: sigma[~m.test] for kind, sigma in sigmas.items() if sigma is not None}
+    kinds = ("orientation", "position", "distance", "point", "pixel", *m.sigmas)
+    sigmas = {kind: sigma[~m.test] for kind in kinds if (sigma := m.sigma(kind)) is not None}
+    if m.covariance is not None:
+        S = np.sqrt(np.diagonal(m.covariance, axis1=1, axis2=2))[~m.test]
+        sigmas |= {"orientation": S[:, :3], "position": S[:, 3:]}
     if m.groups is not None:
-        used["distance"] = m.groups.pairs.sigma_distance
+        sigmas["distance"] = m.groups.pairs.sigma_distance
     elif table.model in PAIR_MODELS:
         formed = {"position": "distance", "orientation": "angle"}
     specified: dict[str, Any] = {}
-    for kind, sigma in used.items():
+    for kind, sigma in sigmas.items():
         if np.isfinite(sigma).any():
             factor = problem.state.factors.get((number, formed.get(kind, kind)), 1.0)
             specified[kind] = factor * float(np.sqrt(np.nanmean(np.square(sigma))))
-    return Noise(**specified)
+    return Noise().updated(**specified)
 
 
 def _seen(boards: Mapping[str, Floats], tool: Floats) -> dict[str, Any]:

@@ -86,7 +86,8 @@ def gather_rows(
     whole, private, which = _derivatives(problem, pose_of, references)
     n_shared = whole.shape[1] - n_columns
     stacked = _stack(np.hstack([whole, private]), which, n_poses)
-    rows = _whiten(stacked[:, :, : whole.shape[1]], stacked[:, :, whole.shape[1] :])
+    J, L = np.split(stacked, [whole.shape[1]], axis=2)  # whitened by the covariance 1 + L L^T of a pose's rows
+    rows = np.linalg.solve(np.linalg.cholesky(np.eye(J.shape[1]) + L @ np.swapaxes(L, 1, 2)), J)
     fixed = [np.pad(prior_rows(v, problem.start)[1], ((0, 0), (0, v.n_nuisance)))]
     if alone:
         fixed.append(unknown_prior_rows(v, problem.start)[1])
@@ -146,14 +147,6 @@ def _compress(rows: Floats) -> Floats:
     kept = s > _LOST_SHARE * s.max(initial=0.0)
     out: Floats = s[kept, None] * Vt[kept]
     return out
-
-
-def _whiten(rows: Floats, loadings: Floats) -> Floats:
-    """Rows of covariance 1 + L L^T, whitened, shapes (n, h, m) and (n, h, k)."""
-    if not loadings.any():
-        return rows
-    C = np.eye(rows.shape[1]) + loadings @ np.swapaxes(loadings, 1, 2)
-    return np.linalg.solve(np.linalg.cholesky(C), rows)
 
 
 # --- the system to choose from ---

@@ -117,7 +117,7 @@ def _poses(design: Design) -> Shown:
 def _notes(design: Design) -> Iterator[str]:
     for name, one in design.pool.found.items():
         yield f"candidates{f' of {name}' if name else ''}: {one.reasons()}"
-    for name in sorted(set(design.pool.group.tolist()).difference(design.group.tolist(), [""])):
+    for name in sorted(set(design.pool.found).difference(design.group.tolist(), [""])):
         yield f"{name}: none of its own poses was chosen, and it gets no table"
     yield from map(str, missing_motions(design.pool.robot))
     travel = math.degrees(design.travel), math.degrees(design.travel_before)

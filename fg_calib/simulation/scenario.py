@@ -820,9 +820,8 @@ def _complete(entries: Sequence[dict[str, Any]], source: str, folder: Path) -> l
         model = str(entry.get("model"))
         unnamed[model] += "name" not in entry
         name = model if unnamed[model] == 1 else f"{model}_{unnamed[model]}"
-        camera = dict[str, Any]()
+        found.append({"name": name} | entry)
         if "camera" in entry:
-            read, fixed = camera_in(entry["camera"], f"{source}: instrument {number}: camera", folder)
-            camera = {"camera": read, "fixed": fixed}
-        found.append({"name": name} | entry | camera)
+            place = f"{source}: instrument {number}: camera"
+            found[-1]["camera"], found[-1]["fixed"] = camera_in(entry["camera"], place, folder)
     return found

@@ -127,9 +127,8 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
         columns: The columns.
         touched: Whether something is touched: the joint readings are measured then.
     """
-    measured = {name: None for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)}
-    joints = {name: None for name in columns if touched and re.fullmatch(r"q\d+", name)}
-    return dict(columns) | measured | joints
+    empty = [name for name, v in columns.items() if name in MEASURED and np.any(np.asarray(v) != 0.0)]
+    return {**columns, **dict.fromkeys([*empty, *(c for c in columns if touched and re.fullmatch(r"q\d+", c))])}
 
 
 # --- the job ----------------------------------------------------------------------------------------------------------

@@ -91,7 +91,7 @@ def test_all_poses_together_hold_what_their_problem_holds(kind):
     expected = information_of(pool.problem)
     found = without_last(of_poses(pool.rows), len(expected))
     assert apart(expected, found) < rounding()
-    assert len(pool.rows.rows) == len(pool.readings) == len(pool.group) == pool.pose_of.max() + 1
+    assert len(pool.rows.rows) == len(pool.readings) == pool.pose_of.max() + 1
 
 
 @pytest.mark.parametrize("kind", kinds("formed lengths"))
