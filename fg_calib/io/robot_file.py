@@ -50,6 +50,7 @@ from fg_calib.robot import (
     Parameter,
     Robot,
     RobotBuilder,
+    names_of,
     tolerance_kind,
 )
 
@@ -79,7 +80,7 @@ def _si(kind: str, value: float, units: Units, place: str) -> float:
     Raises:
         InputError: An angle in rad is one in deg.
     """
-    unit = _unit_of_kind(kind)
+    unit = unit_of_key(kind)
     if units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
         raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
     return value * units.factor(unit)
@@ -112,10 +113,8 @@ class _Robot(Schema):
         Raises:
             InputError: A tolerance is too small.
         """
-        tolerance = {
-            key: self.units.sigma(value, unit_of_key(key), f"{place}: tolerance: {key}")
-            for key, value in self.tolerance.items()
-        }
+        sigma, where = self.units.sigma, f"{place}: tolerance"
+        tolerance = {key: sigma(value, unit_of_key(key), f"{where}: {key}") for key, value in self.tolerance.items()}
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
@@ -159,13 +158,10 @@ def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str 
     if path.suffix.lower() == ".xacro":
         hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
         raise InputError(path.name, "a file of xacro", "a URDF", hint)
-    mapping = read_yaml(path)
-    if "urdf" in mapping:
-        links = {"base_link": base_link, "tip_link": tip_link}
-        return robot_from_mapping(mapping | {k: v for k, v in links.items() if v is not None}, path.name, path.parent)
-    if base_link is not None or tip_link is not None:
-        raise InputError(path.name, "a robot without links", "a URDF", "base_link and tip_link name links of one")
-    return robot_from_mapping({"name": path.stem} | mapping, path.name, path.parent)
+    mapping, links = read_yaml(path), {"base_link": base_link, "tip_link": tip_link}
+    name = {} if "urdf" in mapping else {"name": path.stem}
+    given = name | mapping | {key: link for key, link in links.items() if link is not None}
+    return robot_from_mapping(given, path.name, path.parent)
 
 
 def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> Robot:
@@ -259,49 +255,37 @@ def robot_text(
     units, base, tool = units or Units(), robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
     mapping: dict[str, Any] = {"name": robot.name}
     if robot.urdf is None:
-        mapping |= {"convention": robot.convention, "units": _Flow(asdict(units))}
+        mapping |= {"convention": robot.convention, "units": asdict(units)}
         mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
     else:
         mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
-        mapping |= {"units": _Flow(asdict(units))}
+        mapping |= {"units": asdict(units)}
     for key, owned in (("base", base), ("tool", tool)):
         frame = [robot.parameters[i] for i in owned]
-        mapping |= {key: _Flow((p.kind, units.from_si(p.nominal, p.unit)) for p in frame if p.nominal != 0.0)}
+        mapping |= {key: {p.kind: units.from_si(p.nominal, p.unit) for p in frame if p.nominal != 0.0}}
     of_frames = [robot.parameters[i] for i in (*base, *tool)]
-    of_joints = [p for p in robot.parameters if p not in of_frames]
     mapping |= {
-        "fixed": tuple(p.name for p in of_joints if not p.estimated),
-        "estimate": tuple(p.name for p in of_frames if p.estimated),
-        "tolerance": _Flow(_tolerances(robot, units)),
+        "fixed": [p.name for p in robot.parameters if p not in of_frames and not p.estimated],
+        "estimate": [p.name for p in of_frames if p.estimated],
+        "tolerance": _tolerances(robot, units),
     }
     mapping = {key: value for key, value in mapping.items() if value or key == "joints"}
     if robot.urdf is None:
-        _check_same(robot, robot_from_mapping(mapping, place or robot.name, Path()), place or robot.name)
-    return str(yaml.dump(mapping, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=math.inf))
-
-
-def _check_same(robot: Robot, written: Robot, place: str) -> None:
-    """Check that what is written is the robot: base, joints of one convention and tool are all that a file can hold.
-
-    Raises:
-        InputError: It has other elements or parameters.
-    """
-    robots = (robot, written)
-    parameters, elements = ([[p.name for p in one.parameters] for one in robots], [len(one.elements) for one in robots])
-    if parameters[0] != parameters[1] or elements[0] != elements[1]:
-        expected = "base, joints of one convention, tool: all that a robot file can say"
-        raise InputError(place, "the robot has elements or parameters of its own", expected)
-
-
-def _unit_of_kind(kind: str) -> str:
-    """`m` or `rad`: the unit of a kind of parameter."""
-    return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
+        place = place or robot.name
+        written = robot_from_mapping(mapping, place, Path())
+        if names_of(robot.parameters) != names_of(written.parameters) or len(robot.elements) != len(written.elements):
+            expected = "base, joints of one convention, tool: all that a robot file can say"
+            raise InputError(place, "the robot has elements or parameters of its own", expected)
+    text = yaml.dump(
+        mapping, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf
+    )
+    return str(text)
 
 
 def unit_of_key(key: str) -> str:
-    """The unit of a tolerance by kind (`a`, `tool`) or by name (`alpha3`, `elbow.yaw`)."""
+    """The unit, `m` or `rad`, of a kind of parameter (`a`, `tool`) or of one by its name (`alpha3`, `elbow.yaw`)."""
     kind = re.sub(r".*\.|\d+$", "", key)
-    return _unit_of_kind(kind) if kind in AXIS_OF_KIND else "m"
+    return "rad" if kind in AXIS_OF_KIND and AXIS_OF_KIND[kind] >= Axis.RX else "m"
 
 
 def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
@@ -318,15 +302,11 @@ def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
 
 def _tolerances(robot: Robot, units: Units) -> dict[str, float]:
     """Tolerances by kind where all parameters of the kind share one, by name elsewhere."""
-    by_kind: dict[str | None, set[float | None]] = {}
-    for p in robot.parameters:
-        by_kind.setdefault(tolerance_kind(p), set()).add(p.tolerance)
-    tolerances = {}
-    for p in robot.parameters:
+    kinds, tolerances = [tolerance_kind(p) for p in robot.parameters], {}
+    for p, kind in zip(robot.parameters, kinds, strict=True):
         if p.tolerance is not None:
-            kind = tolerance_kind(p)
-            shared = kind is not None and len(by_kind[kind]) == 1
-            tolerances[kind if kind and shared else p.name] = units.from_si(p.tolerance, p.unit)
+            alike = {other.tolerance for other, its in zip(robot.parameters, kinds, strict=True) if its == kind}
+            tolerances[kind if kind and len(alike) == 1 else p.name] = units.from_si(p.tolerance, p.unit)
     return tolerances
 
 
@@ -335,14 +315,11 @@ class _Flow(dict[str, Any]):
 
 
 class _Dumper(yaml.SafeDumper):
-    """The safe dumper, with rows, frames and names on one line."""
+    """The safe dumper, with a row of joints on one line."""
 
     yaml_implicit_resolvers = Loader.yaml_implicit_resolvers  # quotes what reads as a number
 
 
 _Dumper.add_representer(
     _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
-)
-_Dumper.add_representer(
-    tuple, lambda dumper, names: dumper.represent_sequence("tag:yaml.org,2002:seq", names, flow_style=True)
 )

@@ -33,16 +33,15 @@ if TYPE_CHECKING:
 ResidualFile = Literal["csv", "parquet", "none"]
 """How single residuals are written, if at all."""
 
+FIGURES = ("accuracy", "joints", "parameters", "correlations", "residuals", "workspace")
+
 RESULT_FILES = {
     "result.json": b'{\n "schema": "fg-calib/result/',
     "residuals.csv": b"kind,a,b,split,used,excluded,",
     "residuals.parquet": b"PAR1",
     "configurations.csv": b"id,split,q1,",
     "report.html": b"<!DOCTYPE html>",
-    **{
-        f"{name}.svg": b"<svg"
-        for name in ("accuracy", "joints", "parameters", "correlations", "residuals", "workspace")
-    },
+    **dict.fromkeys((f"{name}.svg" for name in FIGURES), b"<svg"),
     "joints.csv": b"id,joint,unit,reading,estimate,",
     "robot_calibrated.yaml": b"",
     "robot_calibrated.urdf": b"",
