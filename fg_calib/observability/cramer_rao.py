@@ -41,7 +41,6 @@ from fg_calib.inputs import (
     Options,
     PairErrors,
     Pairing,
-    check,
     check_names,
     checked,
 )
@@ -127,18 +126,17 @@ def cramer_rao(
         pair_errors: `shared`: the exact noise of pairs; `independent`: pairs are weighted as if independent.
 
     Raises:
-        InputError: An unknown parameter, one whose error enters without a tolerance, a choice that tables make.
+        InputError: An unknown parameter, one whose error enters without a tolerance, or no model.
         ProblemError: A table lacks what its model needs.
     """
     names = tuple(p.name for p in robot.parameters if p.estimated)
     check_names("kept", () if kept is None else kept, names, "or fixed parameter")
     k = np.array([kept is None or name in kept for name in names])
     if isinstance(measurements, Measurements):
-        chosen = check("model", model, Model)
-        problem = predicted_problem(robot, measurements, chosen, frame=frame, pairing=pairing, pair_errors=pair_errors)
+        problem = predicted_problem(
+            robot, measurements, str(model), frame=frame, pairing=pairing, pair_errors=pair_errors
+        )
     else:
-        if (model, pairing, frame) != (None, None, "known"):
-            raise InputError("model, pairing, frame", "one of them with tables", "none: each table has its own")
         problem = true_problem(robot, measurements, Options("pose", gauge="none", pair_errors=pair_errors))
     J = named_triangle(problem, problem.start)  # (m, n_names)
     sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])

@@ -149,9 +149,7 @@ def observe_configurations(
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     problem = predicted_problem(robot, measurements, model, frame=frame, pairing=pairing)
     if not problem.rows.parts:
-        if measurements.test.all():
-            raise ProblemError(measurements.source, "test rows alone", "train rows: test rows are never fitted")
-        raise ProblemError(measurements.source, "no row takes part", "configurations that differ")
+        raise ProblemError(measurements.source, "no train row takes part", "train rows, of configurations that differ")
     return replace(identifiability_of(problem, problem.start, "practical", prefer), model=model)
 
 

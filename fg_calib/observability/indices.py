@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,7 +116,6 @@ class Observability(FrozenArrays):
         condition_number: Of the determined part.
         sigma: 1 sigma of the independent and the kept parameters, the others being held at nominal, [m] and [rad].
             That of a kept parameter is the sigma of the combination it stands for.
-        correlation: Correlations of the same parameters, shape (n_kept, n_kept).
         correlations: Pairs of those that are correlated by more than `CORRELATED`, strongest first.
         weak: Directions among those with a signal-to-noise ratio below `WEAK`, weakest first.
     """
@@ -131,7 +130,6 @@ class Observability(FrozenArrays):
     indices: dict[str, Figure]
     condition_number: Figure
     sigma: dict[str, Figure]
-    correlation: Floats
     correlations: tuple[Correlated, ...]
     weak: tuple[WeakDirection, ...]
 
@@ -183,9 +181,6 @@ def observability_of_rows(
     dropped = {name for g in groups for name in g.parameters if name not in g.keep}
     kept = [i for i in range(n) if not dead[i] and names[i] not in dropped]
     may_be_off = np.array([s if p.tolerance is None else p.tolerance for p, s in zip(parameters, scales, strict=True)])
-    sigma, correlation, correlations, weak = _spread(
-        jacobian[:, kept] * may_be_off[kept], [names[i] for i in kept], may_be_off[kept]
-    )
     with np.errstate(divide="ignore", invalid="ignore"):
         gap = float(s[rank - 1] / s[rank]) if 0 < rank < n else np.inf
     return Observability(
@@ -198,10 +193,7 @@ def observability_of_rows(
         null_space=null,
         indices=observability_indices(s[:rank], n_measurements),
         condition_number=float(s[0] / s[rank - 1]) if rank else np.inf,
-        sigma=sigma,
-        correlation=correlation,
-        correlations=correlations,
-        weak=weak,
+        **_accuracy(jacobian[:, kept] * may_be_off[kept], [names[i] for i in kept], may_be_off[kept]),
     )
 
 
@@ -222,12 +214,8 @@ def observability_indices(singular_values: Floats, n_measurements: int) -> dict[
     }
 
 
-def _spread(
-    J: Floats, names: Sequence[str], scales: Floats
-) -> tuple[dict[str, float], Floats, tuple[Correlated, ...], tuple[WeakDirection, ...]]:
-    """Sigmas, correlations, strong correlations and weak directions of columns that are determined together."""
-    if not names:
-        return {}, np.zeros((0, 0)), (), ()
+def _accuracy(J: Floats, names: Sequence[str], scales: Floats) -> dict[str, Any]:
+    """Sigmas, strong correlations and weak directions of columns that are determined together."""
     _, s, Vt = np.linalg.svd(J, full_matrices=False)
     half = Vt.T / s
     spread = np.linalg.norm(half, axis=1)
@@ -242,12 +230,11 @@ def _spread(
         members = sorted(np.flatnonzero(size > 0.3 * size.max()).tolist(), key=lambda i: -size[i])
         sign = np.sign(direction[members[0]])
         weak.append(WeakDirection(float(value), {names[i]: float(sign * direction[i]) for i in members}))
-    return (
-        dict(zip(names, (spread * scales).tolist(), strict=True)),
-        correlation,
-        tuple(Correlated((names[i], names[j]), float(correlation[i, j])) for i, j in strongest),
-        tuple(weak),
-    )
+    return {
+        "sigma": dict(zip(names, (spread * scales).tolist(), strict=True)),
+        "correlations": tuple(Correlated((names[i], names[j]), float(correlation[i, j])) for i, j in strongest),
+        "weak": tuple(weak),
+    }
 
 
 def _groups(

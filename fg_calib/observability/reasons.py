@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -39,21 +40,15 @@ class ObservedQuantities:
     custom: bool
 
     @classmethod
-    def of_tables(cls, tables: Sequence[Table]) -> ObservedQuantities:
-        """What tables see."""
+    def of(cls, problem: Problem) -> ObservedQuantities:
+        """What the tables of a problem see, and those that its prior information is from."""
         views: list[tuple[Model, FrameKnowledge]] = []
-        for t in tables:
+        for t in problem.data.tables:
             if t.model is not None:
                 relative = t.unknown_frame or (INSTRUMENTS[t.model].sees_landmarks and not t.known)
                 views.append((t.model, "unknown" if relative else "known"))
-        return cls(tuple(dict.fromkeys(views)), any(t.own for t in tables))
-
-    @classmethod
-    def of(cls, problem: Problem) -> ObservedQuantities:
-        """What the tables of a problem see, and those that its prior information is from."""
-        found = cls.of_tables(problem.data.tables)
-        before = () if problem.knowledge is None else problem.knowledge.views
-        return replace(found, views=tuple(dict.fromkeys((*found.views, *before))))
+        views += () if problem.knowledge is None else problem.knowledge.views
+        return cls(tuple(dict.fromkeys(views)), any(t.own for t in problem.data.tables))
 
     @property
     def position(self) -> bool:
@@ -64,11 +59,6 @@ class ObservedQuantities:
     def orientation(self) -> bool:
         """Whether something depends on the tool's orientation, or may."""
         return self.custom or any(one.sees_orientation for one in self.instruments)
-
-    @property
-    def pairs(self) -> bool:
-        """Whether all that is measured is between configurations."""
-        return not self.custom and all(one.uses_pairs for one in self.instruments)
 
     @property
     def instruments(self) -> list[Instrument]:
@@ -103,9 +93,6 @@ HARDLY_SEEN = 1e-3
 
 OTHERS = {"X": "the unknown measurement frame", "": "variables added to the graph"}
 """Variables that are no landmarks, by the letter of their symbols."""
-
-SINGULAR = (("O",), ("X",))
-"""Letters whose words are a singular."""
 
 
 def find_confounding(problem: Problem, parameters: Floats, directions: Floats) -> list[tuple[str, ...] | None]:
@@ -155,7 +142,7 @@ def confounding_in_words(letters: Sequence[str]) -> str:
     kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
     remedy = f": to see it, give places of {kind.name}s (key {kind.key})" if kind is not None and kind.key else ""
     together = " together" if len(letters) > 1 else ""
-    return f"{' and '.join(names)} {'takes' if letters in SINGULAR else 'take'} it up{together}{remedy}"
+    return f"confounded with {' and '.join(names)}{together}{remedy}"
 
 
 N_RANDOM = 60
@@ -222,15 +209,9 @@ def at_configurations(robot: Robot, table: Table, q: Floats, places: _Places, so
     poses, (column, names) = forward(build_chain(robot), robot.trig(q)), _named(table)
     real = [name for name in names if name is not None]
     index = np.array([real.index(name) if name is not None else -1 for name in names])[np.arange(len(q)) % len(names)]
-    length = np.full(len(q), robot.scale_of("m"))
-    m = Measurements.from_arrays(
-        q,
-        position=poses.position,
-        rotation=poses.rotation,
-        sigma_position=robot.scale_of("m"),
-        sigma_orientation=robot.scale_of("rad"),
-        source=table.measurements.source,
-    )
+    length, called = np.full(len(q), robot.scale_of("m")), table.measurements.source
+    scales: dict[str, Any] = {"sigma_position": robot.scale_of("m"), "sigma_orientation": robot.scale_of("rad")}
+    m = Measurements.from_arrays(q, position=poses.position, rotation=poses.rotation, source=called, **scales)
     sigmas = dict.fromkeys(INSTRUMENTS[model].generic_columns, length)
     m = replace(m, labels={column: Labels(tuple(real), index)} if real else {}, sigma_length=length, sigmas=sigmas)
     m = INSTRUMENTS[model].predict(m, poses, lambda kind, name: places[kind.letter, name])
@@ -303,14 +284,13 @@ class _Motion:
         columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, robot.trig(random_readings(robot, 60, np.random.default_rng(0))))
-        n = len(self._parameters)
         self._R, self._p = poses.rotation, poses.position
-        self._J = poses.jacobian[:, :, :n]
+        self._J = poses.jacobian[:, :, : len(columns)]
         self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
         self._sizes = np.abs(self._J)
         self._most = [float((J * self._scales).max(initial=0.0)) for J in np.split(self._sizes, 2, axis=1)]
-        last = poses.jacobian[:, 3:, -1]
-        self._on_last_axis = not robot.joints[-1].prismatic and float(np.abs(last).max()) < _NOTHING
+        moved = float(np.abs(poses.jacobian[:, 3:, -1]).max())
+        self._on_last_axis = moved < _NOTHING and not robot.joints[-1].prismatic
 
     def reason(self, direction: Floats) -> str:
         """Why a direction, shape (n,), [m] and [rad], has no effect on the measurements."""
@@ -318,10 +298,10 @@ class _Motion:
         seen, still = self._seen, not turns and not moves
         members = [p for p, v in zip(self._parameters, direction, strict=True) if v != 0.0]
         units, on_last_axis = {p.unit for p in members}, "the tool point lies on the last axis: " * self._on_last_axis
-        parallel, about = "parallel directions", "it" if self._on_last_axis else "its own point"
-        if all(p.kind in ("d", "theta") for p in members):
-            parallel = f"parallel axes {', '.join(str(p.owner) for p in members)}"
+        about, axes = "it" if self._on_last_axis else "its own point", ", ".join(str(p.owner) for p in members)
+        parallel = f"parallel axes {axes}" if {p.kind for p in members} <= {"d", "theta"} else "parallel directions"
         in_itself = _constant(np.einsum("nji,nj->ni", self._R, w)) and not (moves and seen.position)
+        pairs_alone = not seen.custom and all(one.uses_pairs for one in seen.instruments)
         of_what = "" if all(p.name.startswith("tool.") for p in members) else on_last_axis
         causes = (
             (still and units == {"m"}, f"{parallel}: only the sum of the shifts along them acts"),
@@ -331,7 +311,7 @@ class _Motion:
             (not (seen.position or turns) and units == {"rad"}, f"{parallel}: only the sum of their turns is seen"),
             (not (seen.position or turns), f"the tool only moves without turning, unseen by {seen}"),
             (self.of_base(direction), BASE),
-            (seen.pairs and in_itself, f"{of_what}the tool frame turns by the same in itself everywhere"),
+            (pairs_alone and in_itself, f"{of_what}the tool frame turns by the same in itself everywhere"),
         )
         return next((words for applies, words in causes if applies), NO_CAUSE)
 
