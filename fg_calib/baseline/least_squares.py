@@ -262,7 +262,7 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
         unit, unset, sigma = unit_whitening(len(train), h), np.zeros(s.nuisances[train].shape), s.sigma
         block = Block(s.kind, data.trigs(robot)[s.table], s.ends[train], s.data[train], unit, unset, s.source)
         if s.formed:  # each pair as if it were alone
-            pairs = usable_pairs(data.tables[s.table], ("distance" in s.kind.names, "angle" in s.kind.names))
+            pairs = usable_pairs(data.tables[s.table])
             of_pairs = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
             sigma = np.nan_to_num(
                 np.stack([of_pairs[part.quantity][s.number] for part in s.kind.parts], axis=1), nan=1.0

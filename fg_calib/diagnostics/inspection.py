@@ -244,7 +244,7 @@ def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
         n_pairs=len({k for s in series if s.kind.ends == 2 for k in s.number[s.train].tolist()}),
         n_test_pairs=len({k for s in series if s.kind.ends == 2 for k in s.number[s.test].tolist()}),
         n_residuals=dict(n_residuals),
-        labels=labels | ({} if m.groups is None else {"contact point": m.groups.n_groups}),
+        labels=labels | ({} if m.groups is None else {"contact point": len(m.groups.names)}),
         n_copies=copies,
         copy=copy,
         n_repeats=repeats,

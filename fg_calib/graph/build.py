@@ -41,11 +41,11 @@ from fg_calib.measurements import (
     Measurements,
     Table,
     build_dataset,
+    check_copies,
     check_rows,
     is_ours,
     missing_values,
     predict_measurements,
-    warn_of_copies,
 )
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, forward, names_of, random_readings
@@ -96,7 +96,7 @@ def build_problem(
             _log.warning("%s: not used, model %s is of poses", source, table.model)
         for text in missing_values(table):
             _log.warning("%s", text)
-        warn_of_copies(table)
+    check_copies(tables)
     return problem_of_tables(robot, tables, options)
 
 
@@ -237,7 +237,7 @@ def true_problem(
         options: Whether pairs share errors; the tables' own choices count for the rest.
         places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
     """
-    data, places = build_dataset(robot, tables_of(tables, options), predicted=True), places or {}
+    data, places = build_dataset(robot, tables_of(tables, options)), places or {}
     starts = {i: places[key] for i, key in enumerate(data.landmarks.keys) if key in places}
     data = replace(data, landmarks=data.landmarks.with_starts(starts))
     variables = variables_of(robot, data, options)

@@ -105,12 +105,7 @@ def _homography(points: Floats, seen: Floats, weight: Floats) -> Floats | None:
     (p, P), (s, S) = (_scaled(v) for v in (points, seen))
     ones, zeros, w = np.ones((len(p), 1)), np.zeros((len(p), 3)), weight / weight.mean()
     p = np.hstack([p, ones])
-    A = np.vstack(
-        [
-            w[:, :1] * np.hstack([p, zeros, -s[:, :1] * p]),
-            w[:, 1:] * np.hstack([zeros, p, -s[:, 1:] * p]),
-        ]
-    )
+    A = np.vstack([w[:, :1] * np.hstack([p, zeros, -s[:, :1] * p]), w[:, 1:] * np.hstack([zeros, p, -s[:, 1:] * p])])
     H = np.linalg.inv(S) @ np.linalg.svd(A, full_matrices=True)[2][-1].reshape(3, 3) @ P
     middle = H @ np.append(points.mean(axis=0), 1.0)
     return H / middle[2] if abs(middle[2]) > 1e-12 * np.abs(H).max() else None

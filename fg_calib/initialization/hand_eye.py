@@ -17,10 +17,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.robot import nearest_rotation, rotation_angle
 
 LEAST_TURN = 1e-6
@@ -128,12 +127,7 @@ def start_from_most_poses(
 
 
 def start_from_distances(
-    flange: tuple[Floats, Floats],
-    a: NDArray[np.int64],
-    b: NDArray[np.int64],
-    distance: Floats,
-    tool: Frame,
-    free: Booleans,
+    flange: tuple[Floats, Floats], ends: Integers, distance: Floats, tool: Frame, free: Booleans
 ) -> Frame:
     """The tool point from distances alone.
 
@@ -142,15 +136,13 @@ def start_from_distances(
 
     Args:
         flange: base_T_flange at the nominal parameters: rotations (n, 3, 3), translations (n, 3), [m].
-        a: First configuration of each pair, shape (m,).
-        b: Second configuration of each pair, shape (m,).
+        ends: Configurations of each pair, shape (m, 2).
         distance: Measured distances, shape (m,), [m].
         tool: The nominal tool frame.
         free: Which coordinates of the tool point are unknown, shape (3,).
     """
-    if not free.any() or not len(a):
-        return tool
-    a, b, distance = a[:MAX_ROWS], b[:MAX_ROWS], distance[:MAX_ROWS]
+    a, b = ends[:MAX_ROWS].T
+    distance = distance[:MAX_ROWS]
     dR, dp = flange[0][b] - flange[0][a], flange[1][b] - flange[1][a]  # (m, 3, 3), (m, 3)
     starts = [tool.translation]
     if free.all() and len(a) >= 9:
@@ -162,9 +154,7 @@ def start_from_distances(
     return Frame(tool.rotation, min(fits, key=lambda fit: fit[1])[0])
 
 
-def start_from_touches(
-    flange: tuple[Floats, Floats], touched: NDArray[np.int64], nominal: Floats, free: Booleans
-) -> Floats:
+def start_from_touches(flange: tuple[Floats, Floats], touched: Integers, nominal: Floats, free: Booleans) -> Floats:
     """The tool point that brings touches of each point nearest together, from the nominal one, shape (3,), [m].
 
     Args:
@@ -284,10 +274,7 @@ def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: 
             A[:, k, 9 + k] = 1.0
         A[:, :, 12:] = -R_F
         solution: Floats = np.linalg.lstsq(A.reshape(-1, 15), p_F.ravel(), rcond=1e-10)[0].astype(np.float64)
-        candidates += [
-            nearest_rotation(solution[:9].reshape(3, 3).T),
-            align_points(p_M, p_F + R_F @ solution[12:]),
-        ]
+        candidates += [nearest_rotation(solution[:9].reshape(3, 3).T), align_points(p_M, p_F + R_F @ solution[12:])]
     return candidates
 
 

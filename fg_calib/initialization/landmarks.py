@@ -69,8 +69,8 @@ def targets_from_positions(
     return Frame(rotation, X.translation + (shift if unknown_frame else 0.0)), places
 
 
-def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, known: Floats) -> Floats:
-    """Anchors from the lengths to tool points.
+def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, at: Floats) -> list[tuple[Integers, Floats]]:
+    """Anchors of unknown place from the lengths to tool points.
 
     `|p|^2 - d^2 = 2 p a - |a|^2` is linear in the anchor a and the last term. Least squares of the lengths follow,
     from there, from its mirror image across the plane that the points are nearest to, and from the points' middle on
@@ -78,22 +78,18 @@ def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, known
 
     Args:
         points: Tool points at the nominal parameters, shape (n, 3), [m].
-        length: Measured, less what the instrument adds, shape (n,), [m].
-        anchor: Which anchor each is to, shape (n,).
-        known: Places of the anchors, nan where they are to be found, shape (k, 3), [m].
+        length: Measured, minus what the instrument adds, shape (n,), [m].
+        anchor: Coordinates of the anchor that each is to, indices into `at`, shape (n, 3).
+        at: Values of all coordinates, nan where they are to be found, [m].
 
     Returns:
-        Places of the anchors, shape (k, 3), [m].
+        Coordinates and place of each anchor of unknown place.
     """
-    places = known.copy()
-    for k in np.unique(anchor):
-        if np.isnan(known[k]).any():
-            rows = anchor == k
-            places[k] = _trilaterated(points[rows], length[rows])
-    return places
+    each = [(coordinates, np.all(anchor == coordinates, axis=1)) for coordinates in np.unique(anchor, axis=0)]
+    return [(of, _trilaterated(points[rows], length[rows])) for of, rows in each if np.isnan(at[of]).any()]
 
 
-def offset_from_lengths(points: Floats, length: Floats, anchor: Integers, known: Floats) -> float:
+def offset_from_lengths(points: Floats, length: Floats, anchor: Integers, at: Floats) -> float:
     """What an instrument adds to every length: what all have in common that no anchors explain.
 
     `|p|^2 - d^2 = 2 p a - 2 d c - (|a|^2 - c^2)` is linear in the anchor a, the offset c and the last bracket: with one
@@ -104,18 +100,16 @@ def offset_from_lengths(points: Floats, length: Floats, anchor: Integers, known:
     """
     columns = [-2.0 * length]
     right = np.sum(points**2, axis=1) - length**2
-    for k in np.unique(anchor):
-        rows = (anchor == k).astype(np.float64)
-        if np.isnan(known[k]).any():
+    for coordinates in np.unique(anchor, axis=0):
+        rows, known = np.all(anchor == coordinates, axis=1).astype(np.float64), at[coordinates]
+        if np.isnan(known).any():
             columns += [2.0 * rows * points[:, axis] for axis in range(3)]
         else:
-            right = right - rows * 2.0 * (points @ known[k])
+            right = right - rows * 2.0 * (points @ known)
         columns.append(-rows)
     A = np.stack(columns, axis=1)
-    size = np.linalg.norm(A, axis=0)
-    size[size == 0.0] = 1.0  # of an arm that never leaves a plane
-    found = np.linalg.lstsq(A / size, right, rcond=1e-10)[0] / size
-    return float(found[0])
+    size = np.maximum(np.linalg.norm(A, axis=0), 1e-300)  # 0 of an arm that never leaves a plane
+    return float((np.linalg.lstsq(A / size, right, rcond=1e-10)[0] / size)[0])
 
 
 def _trilaterated(points: Floats, length: Floats) -> Floats:

@@ -73,10 +73,10 @@ class FrameStart:
         self.set_frame(X)
         return X
 
-    def tool_from_distances(self, a: Integers, b: Integers, distance: Floats) -> None:
-        """Start the tool point from distances between configurations a and b. See `hand_eye.start_from_distances`."""
-        if self._translation.any():
-            self.tool = hand_eye.start_from_distances(self.flange, a, b, distance, self.tool, self._translation)
+    def tool_from_distances(self, ends: Integers, distance: Floats) -> None:
+        """Start the tool point from distances between configurations. See `hand_eye.start_from_distances`."""
+        if self._translation.any() and len(ends):
+            self.tool = hand_eye.start_from_distances(self.flange, ends, distance, self.tool, self._translation)
             self.found[:3] |= self._translation
 
     def tool_from_contacts(self, rows: Integers, touched: Integers) -> None:

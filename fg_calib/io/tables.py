@@ -179,7 +179,7 @@ def read_readings(table: Table, columns: Sequence[str], robot: Robot, units: Uni
         unit = robot.joints[j].unit
         reading, low, high = (v / units.factor(unit) for v in (readings[row, j], *robot.limits[j]))
         found = f"{columns[j]} = {reading:.6g} {units.name(unit)} is outside [{low:.6g}, {high:.6g}]"
-        hint = limit_hint(readings, robot, j, (columns[j], "the table"), units.name(unit))
+        hint = limit_hint(readings[:, j], robot, j, units.name(unit))
         raise InputError(table.place(row), found, hint=hint)
     return readings
 
@@ -403,6 +403,5 @@ def _read_pairs(
             hint = error.hint or f"angles of the table are in {units.angle}" * ("in rad" in error.expected)
             table.require(np.arange(table.n_rows) != int(place[2]), place[1], error.expected, hint)
         raise InputError(table.name, error.found, error.expected, error.hint) from None
-    unused = tuple(name for name in table.columns if name not in known)
-    pairs = replace(pairs, **sigmas, test=once(pairs.test), source=table.name, unused=unused)
+    pairs = replace(pairs, **sigmas, test=once(pairs.test), source=table.name)
     return (pairs, no_pairs(table.name)) if not of_groups.any() else (pairs.select(~of_groups), pairs.select(of_groups))

@@ -1,5 +1,21 @@
-from .build import Dataset, build_dataset, find_copies, predict_measurements, start_frames, warn_of_copies
-from .dataset import Groups, Labels, Measurements, Noise, Pairs, are_same, form_pairs, no_pairs, pairs_from_arrays
+from .build import Dataset, build_dataset, check_copies, find_copies, predict_measurements, start_frames
+from .dataset import (
+    ANGLE_SLACK,
+    LIMIT_SLACK,
+    Groups,
+    Labels,
+    Measurements,
+    Noise,
+    Pairs,
+    check_readings,
+    checked_joint_sigma,
+    covariances,
+    form_pairs,
+    limit_hint,
+    no_pairs,
+    outside_limits,
+    pairs_from_arrays,
+)
 from .kind import Coincidence, Frames, Kind, Length, Rows, check_rows, directions, is_ours, stack
 from .kinds import GENERIC_COLUMNS, INSTRUMENTS, LANDMARKS
 from .kinds.board import COVARIANCE
@@ -11,15 +27,6 @@ from .landmarks import Estimate, Landmark, LandmarkKind, Landmarks
 from .moments import Moments, angle_moments, length_moments
 from .residuals import Block, pack, squares_along, unit_whitening, unpack
 from .table import UNKNOWN, CustomMeasurements, KnownPoint, MeasurementBlock, Table, by_station
-from .validation import (
-    ANGLE_SLACK,
-    LIMIT_SLACK,
-    check_readings,
-    checked_joint_sigma,
-    covariances,
-    limit_hint,
-    outside_limits,
-)
 
 __all__ = [
     "ANGLE_SLACK",
@@ -57,9 +64,9 @@ __all__ = [
     "Rows",
     "Table",
     "angle_moments",
-    "are_same",
     "build_dataset",
     "by_station",
+    "check_copies",
     "check_readings",
     "check_rows",
     "checked_joint_sigma",
@@ -82,5 +89,4 @@ __all__ = [
     "unit_whitening",
     "unpack",
     "usable_pairs",
-    "warn_of_copies",
 ]

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from fg_calib.initialization import Frame, FrameStart
-from fg_calib.inputs import NEAR, Booleans, Brief, Floats, InputError, Integers, ProblemError, did_you_mean
-from fg_calib.measurements import Kind, Labels, LandmarkKind, Landmarks, MeasurementBlock, Measurements, Table, is_ours
+from fg_calib.inputs import NEAR, Booleans, Brief, Floats, Integers, ProblemError, did_you_mean
+from fg_calib.measurements import Labels, Landmarks, MeasurementBlock, Measurements, Table, is_ours
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
-from fg_calib.measurements.kinds.contact import POINT
 from fg_calib.robot import Robot, build_chain, forward
 
 _log = logging.getLogger(__name__)
@@ -73,20 +72,22 @@ class Dataset(Brief):
             out[place] = table.measurements.readings
         return out
 
+    def _at(self, rows: Callable[[MeasurementBlock], Integers | Booleans]) -> Booleans:
+        """Which configurations some rows of the blocks are of, shape (n_configurations,)."""
+        found = np.zeros(self.n_configurations, dtype=np.bool_)
+        for s in self.blocks:
+            found[self.places[s.table][s.ends[rows(s)]]] = True
+        return found
+
     @property
     def fitted(self) -> Booleans:
         """Which configurations the train rows are of, shape (n_configurations,)."""
-        found = np.zeros(self.n_configurations, dtype=np.bool_)
-        for s in self.blocks:
-            found[self.places[s.table][s.ends[s.train]]] = True
-        return found
+        return self._at(lambda s: s.train)
 
     @property
     def held_out(self) -> Booleans:
         """Which configurations have test rows and no train row, shape (n_configurations,)."""
-        found = np.zeros(self.n_configurations, dtype=np.bool_)
-        for s in self.blocks:
-            found[self.places[s.table][s.ends[s.test]]] = True
+        found = self._at(lambda s: s.test)
         for table, place in zip(self.tables, self.places, strict=True):
             found[place[table.measurements.test]] = True
         return found & ~self.fitted
@@ -102,10 +103,6 @@ class Dataset(Brief):
         sources = [table.measurements.source for table in self.tables]
         return tuple(s if sources.count(s) == 1 else f"{s} ({i})" for i, s in enumerate(sources, start=1))
 
-    def n_train(self, chosen: Callable[[Kind], bool]) -> int:
-        """Number of train measurements of the kinds chosen."""
-        return sum(len(s.train) for s in self.blocks if chosen(s.kind))
-
     @property
     def source(self) -> str:
         """What the tables are called in messages."""
@@ -113,16 +110,12 @@ class Dataset(Brief):
 
     def estimated(self) -> Booleans:
         """Which landmarks a train measurement at a configuration depends on, shape (n_landmarks,)."""
-        seen = np.zeros(self.landmarks.n_coordinates, dtype=np.bool_)
-        for s in self.blocks:
-            if s.kind.ends:
-                seen[s.nuisances[s.train]] = True
-        first = np.cumsum([0, *self.landmarks.sizes])[:-1]
+        first = np.cumsum([0, *self.landmarks.sizes])[:-1].astype(np.int64)
         known = np.array([item.known for item in self.landmarks.items], dtype=np.bool_)
-        return seen[first] & ~known if len(first) else known
+        return _touched(self.blocks, self.landmarks)[first] & ~known
 
 
-def build_dataset(robot: Robot, tables: Sequence[Table], *, predicted: bool = False) -> Dataset:
+def build_dataset(robot: Robot, tables: Sequence[Table]) -> Dataset:
     """All tables together.
 
     Where tables state ids, the same id is the same configuration.
@@ -130,53 +123,36 @@ def build_dataset(robot: Robot, tables: Sequence[Table], *, predicted: bool = Fa
     Args:
         robot: The nominal robot: landmarks are started where it says that they are.
         tables: The tables.
-        predicted: Whether nothing of them was measured: what predicts the same is no measurement counted twice.
 
     Raises:
         ProblemError: A table lacks what its model needs, the noise of a joint is no figure of one, or two tables
             contradict each other.
     """
-    landmarks, blocks = Landmarks(), list[MeasurementBlock]()
+    landmarks, blocks, first = Landmarks(), list[MeasurementBlock](), tables[0].measurements
     places, names, index = list[Integers](), list[str](), dict[str, int]()
     for number, table in enumerate(tables):
-        m, first = table.measurements, tables[0].measurements
-        for before in () if predicted else tables[:number]:
-            _check_once(table, before)
+        m = table.measurements
         if m.named:
-            places.append(_places_of_named(m, names, index))
+            new = [name for name in dict.fromkeys(m.ids.tolist()) if name not in index]
+            index |= {name: len(names) + k for k, name in enumerate(new)}
+            names += new
+            places.append(np.array([index[name] for name in m.ids.tolist()], dtype=np.int64))
         else:
             places.append(np.arange(len(names), len(names) + m.n_configurations))
             names += m.ids.tolist() if len(tables) == 1 else [f"{name} of {m.source}" for name in m.ids.tolist()]
         if not np.array_equal(m.sigma_joint, first.sigma_joint):
             expected = f"that of {first.source}: the readings are of the same encoders"
             raise ProblemError(m.source, "another noise.joint", expected)
-        _check_joint_noise(robot, m)
+        for joint, sigma in zip(robot.joints, m.sigma_joint.tolist(), strict=False):  # their number is checked later
+            if not joint.prismatic and sigma >= np.pi:
+                found = f"noise.joint of {np.rad2deg(sigma):.4g} deg at {joint.name}"
+                raise ProblemError(m.source, found, "less than half a turn", "is it in degrees?")
         blocks += blocks_of(table, number, landmarks)
     _check_same_readings(tables, places, len(names))
     _check_known(tables)
     _check_fitted(blocks, landmarks)
     _start_landmarks(robot, tables, blocks, landmarks)
-    blocks = _predicted_alone(blocks, landmarks.n_coordinates)
     return Dataset(tuple(tables), tuple(blocks), landmarks, tuple(places), (*names, *landmarks.names))
-
-
-def _check_joint_noise(robot: Robot, m: Measurements) -> None:
-    """Raise where the noise of a revolute joint's readings is so large that they say nothing."""
-    for joint, sigma in zip(robot.joints, m.sigma_joint.tolist(), strict=False):  # their number is checked later
-        if not joint.prismatic and sigma >= np.pi:
-            found = f"noise.joint of {np.rad2deg(sigma):.4g} deg at {joint.name}"
-            raise ProblemError(m.source, found, "less than half a turn", "is it in degrees?")
-
-
-def _places_of_named(m: Measurements, names: list[str], index: dict[str, int]) -> Integers:
-    """Numbers of a table's configurations: by their names those of earlier ones, or new ones, which are added."""
-    place = np.empty(m.n_configurations, dtype=np.int64)
-    for k, name in enumerate(m.ids.tolist()):
-        if name not in index:
-            index[name] = len(names)
-            names.append(name)
-        place[k] = index[name]
-    return place
 
 
 def _check_same_readings(tables: Sequence[Table], places: Sequence[Integers], n: int) -> None:
@@ -190,9 +166,8 @@ def _check_same_readings(tables: Sequence[Table], places: Sequence[Integers], n:
     readings, origin = np.full((n, tables[0].measurements.readings.shape[1]), np.nan), np.zeros(n, dtype=np.int64)
     for number, (table, place) in enumerate(zip(tables, places, strict=True)):
         m = table.measurements
-        new, row = np.unique(place, return_index=True)
-        new, row = new[there := np.isnan(readings[new, 0])], row[there]
-        readings[new], origin[new] = m.readings[row], number
+        new = np.isnan(readings[place, 0])
+        readings[place[new]], origin[place[new]] = m.readings[new], number
         off = np.abs(m.readings - readings[place]).max(axis=1) > SAME_READING
         if off.any():
             k = int(np.argmax(off))
@@ -200,18 +175,25 @@ def _check_same_readings(tables: Sequence[Table], places: Sequence[Integers], n:
             raise ProblemError(m.source, f"other joint readings at id {m.ids[k]}", expected)
 
 
-def warn_of_copies(table: Table) -> None:
-    """Warn where measurements of a table are there twice, all figures the same.
+def check_copies(tables: Sequence[Table]) -> None:
+    """Warn of rows of a table that repeat others, and raise where two tables hold the same measurements.
 
-    Honest repeats have other figures at the same readings; but what instruments round, or nothing disturbs, may repeat.
+    Honest repeats have other values at the same readings; but what instruments round, or nothing disturbs, may repeat:
+    tables are the same where most values of the smaller one stand in the other at the same readings.
     """
-    m = table.measurements
-    if (m.n_configurations if m.pairs is None else m.pairs.n_pairs) > MOST_LOOKED_AT:
-        return
-    n, two, _ = find_copies(table)
-    if n:
-        found = f"{n} rows have the readings and figures of an earlier one, such as {two}"
-        _log.warning("%s: %s; were they copied? They count as often", m.source, found)
+    for number, table in enumerate(tables):
+        m, values = table.measurements, _rows_of(table)[1]
+        n_rows = m.n_configurations if m.pairs is None else m.pairs.n_pairs
+        n, two, _ = find_copies(table) if n_rows <= MOST_LOOKED_AT else (0, "", 0)
+        if n:
+            found = f"{n} rows have the readings and figures of an earlier one, such as {two}"
+            _log.warning("%s: %s; were they copied? They count as often", m.source, found)
+        for other in tables[:number]:
+            for name, rows in _rows_of(other)[1].items():
+                a, b = ({row.tobytes() for row in np.round(v, 9) + 0.0} for v in (rows, values.get(name, rows[:0])))
+                if 2 * len(a & b) > min(len(a), len(b)):
+                    found = f"the same {name}s as in {other.measurements.source}"
+                    raise ProblemError(m.source, found, "every measurement once")
 
 
 def find_copies(table: Table) -> tuple[int, str, int]:
@@ -219,15 +201,15 @@ def find_copies(table: Table) -> tuple[int, str, int]:
 
     Pairs count whichever end is a.
     """
-    m, (ends, readings, figures) = table.measurements, _rows_of(table)
-    of_rows = [of.index for of in m.labels.values()] + ([] if m.groups is None else [m.groups.index])
-    columns = np.hstack([readings, *(index[ends] for index in of_rows)]) + 0.0  # no -0
+    m, (ends, figures) = table.measurements, _rows_of(table)
+    of_rows = [of.index for of in (*m.labels.values(), m.groups) if of is not None]
+    columns = np.hstack([*(m.readings[k] for k in ends.T), *(index[ends] for index in of_rows)]) + 0.0  # no -0
     n_places = len(np.unique(columns, axis=0))
     if not figures:
         return 0, "", len(ends) - n_places
-    test = np.any(m.test[ends], axis=1, keepdims=True)
-    values = np.hstack([columns, *(np.nan_to_num(v, nan=-1e300) for v in figures.values()), test]) + 0.0
-    first, of = np.unique(values, axis=0, return_index=True, return_inverse=True)[1:]
+    values = [np.where(np.isnan(v), -1e300, v) for v in figures.values()]
+    rows = np.hstack([columns, *values, np.any(m.test[ends], axis=1, keepdims=True)]) + 0.0
+    first, of = np.unique(rows, axis=0, return_index=True, return_inverse=True)[1:]
     before, two = first[of.ravel()], dict[str, None]()
     copied = np.flatnonzero(before != np.arange(len(ends)))
     for k in copied[:1]:
@@ -235,49 +217,22 @@ def find_copies(table: Table) -> tuple[int, str, int]:
     return len(copied), " and ".join(two), len(first) - n_places
 
 
-def _rows_of(table: Table) -> tuple[Integers, Floats, dict[str, Floats]]:
-    """Configurations of each row, or measured pair, of a table, readings there, and what takes part, by its noise."""
+def _rows_of(table: Table) -> tuple[Integers, dict[str, Floats]]:
+    """Configurations of each row, or measured pair, of a table; by noise, readings there and what was measured."""
     m, pairs, instrument = table.measurements, table.measurements.pairs, INSTRUMENTS.get(table.model or "")
     ends = np.arange(m.n_configurations)[:, None]
-    figures = {} if instrument is None else {of.noise: m.value(of.field) for of in instrument.measured}
+    values = {} if instrument is None else {of.noise: m.value(of.field) for of in instrument.measured}
     if instrument is not None and instrument.uses_pairs and pairs is not None:
         ends = np.sort(np.stack([pairs.a, pairs.b], axis=1), axis=1)
-        figures = {name: getattr(pairs, name) for name in instrument.noise}
-    found = {name: v.reshape(len(v), math.prod(v.shape[1:])) for name, v in figures.items() if v is not None}
-    return ends, np.hstack([m.readings[k] for k in ends.T]), found
-
-
-def _check_once(table: Table, other: Table) -> None:
-    """Raise where two tables hold the same measurements: counted twice, they would look better than they are.
-
-    They do where most figures of the smaller one stand in the other at the same readings, in whatever order. A few may
-    do so by chance, where instruments round.
-    """
-    mine, others = _measured_by(table), _measured_by(other)
-    for words in sorted(mine.keys() & others.keys()):
-        a, b = ({row.tobytes() for row in np.round(rows, 9) + 0.0} for rows in (mine[words], others[words]))
-        if 2 * len(a & b) > min(len(a), len(b)):
-            a_source, b_source = table.measurements.source, other.measurements.source
-            raise ProblemError(a_source, f"the same {words} as in {b_source}", "every measurement once")
-
-
-def _measured_by(table: Table) -> dict[str, Floats]:
-    """What takes part of a table, with the readings that it is of, a row each, by what it is called."""
-    m, (_, readings, figures) = table.measurements, _rows_of(table)
-    found = {} if m.groups is None else {"touches": m.readings[m.groups.index >= 0]}
-    if table.model is not None and not INSTRUMENTS[table.model].sees_landmarks:
-        rows = {f"{name}s": np.hstack([readings, values]) for name, values in figures.items()}
-        found |= {name: of[np.isfinite(of).all(axis=1)] for name, of in rows.items()}
-    for own in table.own:
-        ends = np.arange(m.n_configurations)[:, None] if own.ends is None else own.ends.reshape(len(own.data), -1)
-        if len(ends) == len(own.data) and ends.max(initial=0) < m.n_configurations:
-            at = m.readings[ends].reshape(len(own.data), -1)
-            found[f"measurements of {type(own.kind).__name__}"] = np.hstack([at, own.data])
-    return found
+        values = {name: getattr(pairs, name) for name in instrument.noise}
+    at = m.readings[ends].reshape(len(ends), -1)
+    return ends, {
+        name: np.hstack([at, v.reshape(len(at), math.prod(v.shape[1:]))]) for name, v in values.items() if v is not None
+    }
 
 
 def _check_known(tables: Sequence[Table]) -> None:
-    """Names that no table has are told of; a name that was misspelt would be of something that is estimated.
+    """Warn of known places of names that no table has.
 
     Raises:
         ProblemError: A name is much like one that a table has and nothing is known of.
@@ -285,29 +240,12 @@ def _check_known(tables: Sequence[Table]) -> None:
     for column in (kind.name for kind in LANDMARKS.values() if kind.key):
         of_kind = [t for t in tables if t.model is not None and column in INSTRUMENTS[t.model].labels]
         seen = {name for t in of_kind if (labels := t.measurements.labels.get(column)) for name in labels.names}
-        said = dict.fromkeys(name for table in of_kind for name in table.known)
-        for name in said:
-            if name in seen:
-                continue
-            hint = did_you_mean(name, seen - set(said), NEAR)
+        known = dict.fromkeys(name for table in of_kind for name in table.known)
+        for name in (name for name in known if name not in seen):
             found = f"no row is of {name!r}"
-            if hint:
+            if hint := did_you_mean(name, seen - set(known), NEAR):
                 raise ProblemError(f"{column}s", found, f"one of {', '.join(sorted(seen))}", hint)
             _log.warning("%ss: %s; it is not used", column, found)
-
-
-def _predicted_alone(blocks: Sequence[MeasurementBlock], n_coordinates: int) -> list[MeasurementBlock]:
-    """The blocks; what is measured between landmarks of which no train row at a configuration is, is test rows."""
-    touched = np.zeros(n_coordinates, dtype=np.bool_)
-    for block in blocks:
-        if block.kind.ends:
-            touched[block.nuisances[~block.test]] = True
-    return [
-        block
-        if block.kind.ends or not is_ours(block.kind)
-        else replace(block, test=block.test | ~touched[block.nuisances].all(axis=1))
-        for block in blocks
-    ]
 
 
 def blocks_of(table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
@@ -322,33 +260,32 @@ def blocks_of(table: Table, number: int, landmarks: Landmarks) -> list[Measureme
         ProblemError: The table lacks what its model needs, or a sigma.
     """
     m, instrument = table.measurements, None if table.model is None else INSTRUMENTS[table.model]
-    for name in ("offset", "camera", "fixed_camera"):
-        if getattr(table, name) and (instrument is None or name not in instrument.options):
+    given = {"offset": table.offset, "camera": table.camera, "fixed_camera": table.fixed_camera, "group": m.groups}
+    for name in (name for name, value in given.items() if value not in (None, False)):
+        if instrument is None or name not in instrument.options:
             models = " or ".join(model for model, other in INSTRUMENTS.items() if name in other.options)
-            raise InputError(f"table: {name}", f"given with model {table.model}", f"model {models}")
-    if m.groups is not None and (instrument is None or POINT not in instrument.landmarks):
-        models = " or ".join(model for model, other in INSTRUMENTS.items() if POINT in other.landmarks)
-        raise ProblemError(m.source, f"a column group with model {table.model}", f"model {models}")
-    for k, own in enumerate(table.own):
-        if any(own is before for before in table.own[:k]):
-            raise ProblemError(m.source, "the same CustomMeasurements twice", "every measurement once")
+            raise ProblemError(m.source, f"{name} with model {table.model}", f"model {models}")
+    if len({id(own) for own in table.own}) < len(table.own):
+        raise ProblemError(m.source, "the same CustomMeasurements twice", "every measurement once")
     found = [own.block(table, number, landmarks) for own in table.own]
     return found + ([] if instrument is None else instrument.blocks(table, number, landmarks))
 
 
-def _check_fitted(blocks: Sequence[MeasurementBlock], landmarks: Landmarks) -> None:
-    """Raise where nothing but test rows says where something is.
+def _touched(blocks: Sequence[MeasurementBlock], landmarks: Landmarks) -> Booleans:
+    """Coordinates of landmarks on which a train measurement at a configuration depends, shape (n_coordinates,)."""
+    touched = np.zeros(landmarks.n_coordinates, dtype=np.bool_)
+    for block in blocks:
+        if block.kind.ends:
+            touched[block.nuisances[block.train]] = True
+    return touched
 
-    Args:
-        blocks: All blocks.
-        landmarks: What these depend on, as the tables say it.
-    """
-    fitted = np.zeros(landmarks.n_coordinates, dtype=np.bool_)
+
+def _check_fitted(blocks: Sequence[MeasurementBlock], landmarks: Landmarks) -> None:
+    """Raise where nothing but test rows depends on a landmark of unknown place."""
+    touched = _touched(blocks, landmarks)
     for block in blocks:
-        fitted[block.nuisances[~block.test]] = True
-    for block in blocks:
-        for i in np.unique(landmarks.owners[block.nuisances[~fitted[block.nuisances]]]).tolist():
-            item = landmarks.items[i]
+        coordinates = block.nuisances[~touched[block.nuisances]]
+        for item in (landmarks.items[i] for i in np.unique(landmarks.owners[coordinates]).tolist()):
             if item.kind.must_be_fitted and not item.is_stated:
                 name = item.name if item.kind.is_one else f"{item.kind.name} {item.name}"
                 raise ProblemError(block.source, f"{name} has test rows alone", "train rows too, or its place as known")
@@ -405,9 +342,8 @@ def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measureme
         m: The configurations, the noise, and the names of landmarks; measured values are not looked at.
         model: Which measurements take part.
     """
-    train = np.flatnonzero(~m.test)
+    instrument, train = INSTRUMENTS[model], np.flatnonzero(~m.test)
     poses, n = forward(build_chain(robot), robot.trig(m.readings[train])), len(train)
-    instrument = INSTRUMENTS[model]
 
     def specified(noise: str, *axes: int) -> Floats:
         sigma = m.sigma(noise)
@@ -418,15 +354,13 @@ def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measureme
         names = tuple(f"{column} {i + 1}" for i in range(instrument.n_landmarks))
         found = m.labels.get(column)
         labels[column] = Labels(names, np.arange(n) % len(names)) if found is None else found.of(train)
-    exact = Measurements(
-        readings=m.readings[train],
-        ids=np.arange(n).astype(str),
-        test=np.zeros(n, dtype=np.bool_),
+    exact = replace(
+        m.select(train),
+        covariance=None,
         position=poses.position,
         rotation=poses.rotation,
         sigma_position=specified("position", 3),
         sigma_orientation=specified("orientation", 3),
-        sigma_joint=m.sigma_joint,
         source="predictions",
         labels=labels,
         sigma_length=specified("distance"),
@@ -436,10 +370,4 @@ def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measureme
         return exact
     middle = poses.position.mean(axis=0)
     reach = max(1e-3, float(np.linalg.norm(poses.position - middle, axis=1).max()))
-
-    def place(kind: LandmarkKind, name: str) -> Floats:
-        names = instrument.names(exact, kind).names
-        found: Floats = kind.default_places(len(names), middle, reach)[names.index(name)]
-        return found
-
-    return instrument.predict(exact, poses, place)
+    return instrument.predict(exact, poses, lambda kind, names: kind.default_places(len(names), middle, reach))

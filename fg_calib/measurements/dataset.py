@@ -1,42 +1,102 @@
-"""What was measured: configurations, poses, pairs, and their noise; and how pairs are formed from poses."""
+"""What was measured: configurations, poses, pairs, and their noise; checks of arrays; how pairs are formed from poses.
+
+Arrays are in [m] and [rad]. The rules for them are those of the tables (see `io.tables`); messages name the array and
+its row.
+"""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import (
+    LEAST_SIZE,
+    NORM_TOLERANCE,
+    ORDINARY,
     Booleans,
     Floats,
     FrozenArrays,
     InputError,
     Integers,
     Pairing,
+    as_array,
+    as_columns,
+    as_figures,
+    as_floats,
+    as_names,
+    as_rotations,
     brief,
     check_names,
     check_number,
+    check_sizes,
     checked,
     listed,
+    require,
+    shape_of,
 )
-from fg_calib.measurements.validation import (
-    COLUMNS,
-    LABELS,
-    checked_columns,
-    checked_ids,
-    checked_joint_sigma,
-    checked_labels,
-    checked_mask,
-    checked_pairs,
-    checked_readings,
-)
-from fg_calib.robot import over_spans, rotation_angle
+from fg_calib.robot import Robot, rotation_angle
+
+_log = logging.getLogger(__name__)
+
 
 MOST_PAIRS = 10_000_000
 """The largest number of pairs that are formed from poses."""
+
+ANGLE_SLACK = 1e-5
+"""How far a rotation angle may exceed pi, [rad]: half a turn, rounded to six figures."""
+
+ROUNDED = 1e-9
+"""Share of a covariance that may be rounding."""
+
+LIMIT_SLACK = 1e-3
+"""How far a reading may be beyond its joint's limits, [rad] or [m]: encoders say so of a joint that stands at one."""
+
+FAR = 0.5
+"""Part of a joint's range beyond its limits from which a smaller unit is likelier than limits that are too narrow."""
+
+PAIR_KEYS = ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "test")
+
+ROTATIONS = ("rotation", "quaternion", "roll_pitch_yaw")
+
+ARRAYS: Mapping[str, tuple[str, tuple[int, ...]]] = {
+    "position": ("position", (3,)),
+    "distance": ("length", ()),
+    "pixel": ("pixel", (2,)),
+    "corner": ("corner", (2,)),
+    "covariance": ("covariance", (6, 6)),
+    "sigma_position": ("sigma_position", (3,)),
+    "sigma_orientation": ("sigma_orientation", (3,)),
+    "sigma_distance": ("sigma_length", ()),
+    "sigma_point": ("sigma_point", ()),
+    "sigma_pixel": ("sigma_pixel", (2,)),
+}
+"""Arrays that `Measurements.from_arrays` takes besides `ROTATIONS`, each with its field and the shape of a row.
+
+- `position`: world_p_tool, [m].
+- `rotation`: world_R_tool, shape (n, 3, 3); or `quaternion`: the same as x y z w, shape (n, 4); or `roll_pitch_yaw`:
+  the same as Rz(yaw) Ry(pitch) Rx(roll), shape (n, 3), [rad].
+- `distance`: to the row's anchor or from its plane, nan where not measured, [m].
+- `pixel`: where a point of the row's board was seen, u and v, [px]; `corner`: where that point is on the board, x and
+  y, [m].
+- `covariance`: of camera_T_board, rotation first, about and along the camera's axes.
+- `sigma_position` along the world's axes, `sigma_orientation` about the tool's, `sigma_point` on each axis.
+"""
+
+LABELS = ("target", "station", "anchor", "plane", "board")
+"""Names of what each row is of, shape (n,), that `Measurements.from_arrays` takes.
+
+- `target`: whose position was measured, None for the tool point itself.
+- `station`: from which it was measured, each with a frame of its own.
+- `anchor`: that `distance` is to.
+- `plane`: that the tool point is on, or `distance` from.
+- `board`: that a camera saw; `position` and orientation are then camera_T_board.
+"""
 
 
 @dataclass(frozen=True)
@@ -99,7 +159,6 @@ class Pairs(FrozenArrays):
         sigma_angle: Shape (n_pairs,), [rad].
         test: True for pairs that are predicted but never fitted, shape (n_pairs,).
         source: File name, for messages.
-        unused: Columns of the file that mean nothing.
     """
 
     a: Integers
@@ -110,7 +169,6 @@ class Pairs(FrozenArrays):
     sigma_angle: Floats
     test: Booleans
     source: str = "pairs"
-    unused: tuple[str, ...] = ()
 
     _left_open = ("a", "b")
 
@@ -121,20 +179,7 @@ class Pairs(FrozenArrays):
 
     def select(self, rows: Booleans | Integers) -> Pairs:
         """The pairs at `rows` only."""
-        columns = [f.name for f in fields(self) if f.name not in ("source", "unused")]
-        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
-
-
-def are_same(places: Integers | Floats, a: Integers, b: Integers) -> Booleans:
-    """Which pairs have both ends at the same place, shape (n_pairs,).
-
-    Args:
-        places: Of all that they may be between, shape (n, width).
-        a: The first of each, shape (n_pairs,).
-        b: The second.
-    """
-    spans = over_spans(lambda start, stop: np.all(places[a[start:stop]] == places[b[start:stop]], axis=1), len(a))
-    return np.concatenate([np.zeros(0, dtype=np.bool_), *spans])
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "source"})
 
 
 @dataclass(frozen=True)
@@ -155,23 +200,14 @@ class Labels(FrozenArrays):
 
 
 @dataclass(frozen=True)
-class Groups(FrozenArrays):
+class Groups(Labels):
     """Configurations in which the tool point touched the same physical point, whose position is unknown.
 
     Attributes:
-        names: Name of each group, shape (n_groups,).
-        index: Group of each configuration, -1 for none, shape (n_configurations,).
         pairs: Distances measured between the points of two groups (a and b are groups, angles nan).
     """
 
-    names: tuple[str, ...]
-    index: Integers
     pairs: Pairs
-
-    @property
-    def n_groups(self) -> int:
-        """Number of groups."""
-        return len(self.names)
 
 
 @dataclass(frozen=True)
@@ -264,20 +300,21 @@ class Measurements(FrozenArrays):
             sigma_joint: 1 sigma of the readings: one for all, or one a joint.
             source: Name of the measurements, for messages.
             columns: What was measured, its 1 sigma (one for all, an axis each, a row each, or all), and what it is of:
-                see `validation.COLUMNS` and `LABELS`.
+                see `ARRAYS`, `ROTATIONS` and `LABELS`.
 
         Raises:
             InputError: An array cannot be used; the message names it and its row.
         """
-        n = len(q := checked_readings(readings))
-        given = {name: values for name, values in columns.items() if values is not None}
-        check_names("Measurements.from_arrays", given, (*COLUMNS, *LABELS), "argument")
-        names, index = checked_labels("group", group, n)
-        labels = {what: Labels(*checked_labels(what, given[what], n)) for what in LABELS if what in given}
+        q = as_floats("readings", readings, "(n, n_joints)")
+        if not q.size:
+            raise InputError("readings", f"shape {q.shape}", "(n, n_joints) with at least one row and joint")
+        n, given = len(q), {name: values for name, values in columns.items() if values is not None}
+        check_names("Measurements.from_arrays", given, (*ROTATIONS, *ARRAYS, *LABELS), "argument")
+        labels = {name: Labels(*checked_labels(name, given[name], n)) for name in LABELS if name in given}
         repeated = "pixel" in given or bool(labels.keys() - {"station"})
         known, rows = checked_ids(ids, n, repeated=repeated), checked_mask("test", test, n)
-        every = tuple(dict.fromkeys((*names, *listed("points", points))))
-        between, of_groups = None, no_pairs(source)
+        names, index = checked_labels("group", group, n)
+        every, between, of_groups = (*dict.fromkeys([*names, *listed("points", points)]),), None, no_pairs(source)
         if pairs is not None:
             between, which = pairs_from_arrays(pairs, known, rows, Labels(every, index))
             between, of_groups = between.select(~which), between.select(which)
@@ -333,19 +370,242 @@ class Measurements(FrozenArrays):
         return replace(self, **own, columns={**self.columns, **{k: v for k, v in values.items() if k not in own}})
 
 
+def checked_columns(given: Mapping[str, Any], n: int) -> dict[str, Any]:
+    """Fields of `Measurements` from arrays of n rows by the names of `ARRAYS` and `ROTATIONS`."""
+    ways, found = [name for name in ROTATIONS if name in given], dict[str, Any]()
+    if len(ways) > 1:
+        raise InputError(f"{ways[0]} and {ways[1]}", "both were given", "one of the two")
+    for way in ways:
+        found |= _checked_rotation(way, given[way], n)
+    for name, (kept, axes) in ((name, ARRAYS[name]) for name in ARRAYS if name in given):
+        shape = (n, *axes)
+        if name.startswith("sigma_"):
+            found[kept] = np.ascontiguousarray(np.broadcast_to(checked_sigma(name, given[name], shape), shape))
+        else:
+            expected = f"({', '.join(map(str, shape))})"
+            found[kept] = as_floats(name, given[name], expected, missing=name == "distance")
+    if "length" in found and "plane" not in given:
+        require(~(found["length"] < 0.0), "distance", found["length"], "a number not below 0")
+    if "covariance" in found:
+        good, found["covariance"] = covariances(found["covariance"])
+        require(good, "covariance", given["covariance"], "symmetric matrices with eigenvalues above 0")
+    for name, other in (("pixel", "corner"), ("corner", "pixel")):
+        if other in found and name not in found:
+            raise InputError(name, f"none with {other}", "both: what was seen, and where it is on the board")
+    if "pixel" in found:
+        found["image"] = np.hstack([found.pop("pixel"), found.pop("corner")])
+    return found
+
+
+def _checked_rotation(way: str, given: ArrayLike, n: int) -> dict[str, Floats]:
+    """Rotation matrices, shape (n, 3, 3), and roll, pitch, yaw where those were given, shape (n, 3)."""
+    if way == "rotation":
+        return {way: as_rotations(way, given, n)}
+    if way == "roll_pitch_yaw":
+        angles = as_floats(way, given, f"({n}, 3)")
+        return {"rotation": Rotation.from_euler("xyz", angles).as_matrix(), way: angles}
+    q = as_floats(way, given, f"({n}, 4)")
+    require(np.abs(np.linalg.norm(q, axis=1) - 1.0) <= NORM_TOLERANCE, way, q, "x y z w of length 1")
+    return {"rotation": Rotation.from_quat(q).as_matrix()}
+
+
+def checked_joint_sigma(given: ArrayLike, n_joints: int) -> Floats:
+    """Sigma of the readings of each joint, shape (n_joints,), from one for all or one a joint."""
+    one = shape_of("sigma_joint", given, f"one value, or {n_joints}") == ()
+    sigma = as_floats("sigma_joint", given, "()" if one else f"({n_joints})")
+    require(sigma >= 0.0, "sigma_joint", sigma, "a number not below 0")
+    return np.ascontiguousarray(np.broadcast_to(sigma, n_joints))
+
+
+def checked_indices(name: str, given: Any, n: int, most: int | None) -> Integers:
+    """Whole numbers from 0, a row each of n, up to `most` where there is such."""
+    values = as_array(name, given, "iu", f"whole numbers, a row for each of {n}").copy()
+    if values.shape[:1] != (n,):
+        raise InputError(name, f"shape {values.shape}", f"a row for each of {n}")
+    good = (values >= 0) & ((values <= most) if most is not None else True)
+    require(good, name, values, "0 and above" if most is None else f"0 to {most}")
+    return values
+
+
+def checked_sigma(name: str, given: Any, shape: tuple[int, ...]) -> Floats:
+    """Sigmas that broadcast to (n,) or (n, k), from such, or one a row."""
+    sigma = as_figures(name, given, "finite numbers")
+    check_sizes(name, sigma)
+    require(sigma > 0.0, name, sigma, "a number above 0")
+    require(sigma >= LEAST_SIZE, name, sigma, ORDINARY)
+    if len(shape) == 2 and sigma.shape == shape[:1] != (1,):
+        if (n := shape[0]) == shape[1]:
+            raise InputError(name, f"shape ({n},) of {n} rows", f"({n}, 1) for one a row, (1, {n}) for one an axis")
+        sigma = sigma[:, None]
+    try:
+        np.broadcast_to(sigma, shape)
+    except ValueError:
+        raise InputError(name, f"shape {np.shape(given)}", f"one that broadcasts to {shape}, or one a row") from None
+    return sigma
+
+
+def checked_names(name: str, given: ArrayLike, n: int, *, missing: bool) -> list[str | None]:
+    """Names of n rows, of which some may be missing: None."""
+    if (found := shape_of(name, given, "names")) != (n,):
+        expected = "a name, or None where there is none" if missing else "one a configuration"
+        raise InputError(name, f"shape {found}", f"({n},): {expected}")
+    return as_names(name, given, missing=missing)
+
+
+def checked_ids(given: ArrayLike | None, n: int, *, repeated: bool) -> NDArray[np.str_]:
+    """Names of n configurations, different ones unless `repeated`: their row numbers if None."""
+    if given is None:
+        return np.arange(n).astype(np.str_)
+    ids = np.array(checked_names("ids", given, n, missing=False), dtype=np.str_)
+    first = np.unique(ids, return_index=True)[1]
+    require(repeated | np.isin(np.arange(n), first), "ids", ids, "different ids")
+    return ids
+
+
+def checked_mask(name: str, given: ArrayLike | None, n: int) -> Booleans:
+    """A mask of n rows: nowhere true if None."""
+    mask = as_array(
+        name, np.zeros(n, dtype=np.bool_) if given is None else given, "b", f"True or False for each of {n} rows"
+    )
+    if mask.shape != (n,):
+        raise InputError(name, f"shape {mask.shape}", f"({n},), one a row")
+    return mask.copy()
+
+
+def checked_labels(what: str, given: ArrayLike | None, n: int) -> tuple[tuple[str, ...], Integers]:
+    """Different names in the order met, and which of them each row has, -1 for none, shape (n,)."""
+    named = [None] * n if given is None else checked_names(what, given, n, missing=True)
+    names = tuple(dict.fromkeys(name for name in named if name is not None))
+    place = {name: i for i, name in enumerate(names)} | {None: -1}
+    return names, np.array([place[name] for name in named], dtype=np.int64)
+
+
+def covariances(C: Floats) -> tuple[Booleans, Floats]:
+    """Which matrices are covariances, shape (n,), and these with rounding taken off, shape (n, d, d)."""
+    size = np.sqrt(np.maximum(np.einsum("nii->ni", C), LEAST_SIZE**2))
+    scaled = C / (size[:, :, None] * size[:, None, :])
+    alike = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2), initial=0.0) < ROUNDED
+    C = 0.5 * (C + np.swapaxes(C, 1, 2))
+    return alike & (np.linalg.eigvalsh(scaled)[:, 0] > ROUNDED), C
+
+
 def pairs_from_arrays(given: Any, ids: NDArray[np.str_], test: Booleans, groups: Labels) -> tuple[Pairs, Booleans]:
     """Pairs, and which of them are of groups; those of a test row, or of a group of test rows alone, are test pairs.
 
     Args:
-        given: Columns by name: see `Measurements.from_arrays`.
+        given: Columns by the names of `PAIR_KEYS`; `a` and `b` hold ids, row numbers, or groups. Whole numbers are row
+            numbers where no id and no group is a number.
         ids: Names of the configurations.
         test: Which configurations are test rows.
         groups: The contact points.
+
+    Raises:
+        InputError: A column is missing or holds values that cannot be used.
     """
-    columns, of_groups = checked_pairs(given, ids, groups.names)
+    given = as_columns("pairs", given, "a mapping of arrays by the names a, b, distance, angle, or a frame")
+    check_names("pairs", given, PAIR_KEYS, "key")
+    lacking = [key for key in ("a", "b") if key not in given]
+    if lacking or not given.keys() & {"distance", "angle"}:
+        found = f"no {lacking[0]}" if lacking else "neither distance nor angle"
+        raise InputError("pairs", found, "a and b, the two configurations of a pair, and distance or angle")
+    columns, of_groups = _ends(given, ids, groups.names)
+    n = len(of_groups)
+    for key, most, words in (("distance", np.inf, "a number not below 0"), ("angle", np.pi, "0 to pi, in rad")):
+        figures = as_floats(f"pairs: {key}", given.get(key, np.full(n, np.nan)), f"({n})", missing=True)
+        require(~((figures < 0.0) | (figures > most + ANGLE_SLACK)), f"pairs: {key}", figures, words)
+        sigma, columns[key] = given.get(f"sigma_{key}"), np.minimum(figures, most)
+        columns[f"sigma_{key}"] = np.full(n, np.nan)
+        if sigma is not None:
+            columns[f"sigma_{key}"][:] = checked_sigma(f"pairs: sigma_{key}", sigma, (n,))
+    columns["test"] = checked_mask("pairs: test", given.get("test"), n)
+    angle, distance = columns["angle"], columns["distance"]
+    require(~of_groups | np.isnan(angle), "pairs: angle", angle, "nan: two points have a distance, but no angle")
+    require(~of_groups | (distance > 0.0), "pairs: distance", distance, "a number above 0 between two groups")
     for flags, chosen in ((test, ~of_groups), (only_of(test, groups.index, len(groups.names)), of_groups)):
         columns["test"][chosen] |= flags[columns["a"][chosen]] | flags[columns["b"][chosen]]
     return Pairs(**columns), of_groups  # type: ignore[arg-type]
+
+
+def _ends(
+    given: Mapping[str, ArrayLike], ids: NDArray[np.str_], groups: Sequence[str]
+) -> tuple[dict[str, NDArray[Any]], Booleans]:
+    """Rows of configurations or indices of groups that `a` and `b` name, and whether they are groups."""
+    n = len(ids)
+    by_row = bool(np.array_equal(ids, np.arange(n).astype(np.str_)))  # no ids were given
+    place = {name: i for i, name in enumerate([*ids.tolist(), *groups])}
+    both = set(groups).intersection(ids.tolist())
+    place |= dict.fromkeys(both, -1)
+    expected = "an id or a group" if groups else "an id (the row number where no ids were given)"
+    numbers = not any(word.isdigit() for word in (groups if by_row else place))
+    found, names = dict[str, Integers](), dict[str, NDArray[Any]]()
+    for key in ("a", "b"):
+        names[key] = as_array(f"pairs: {key}", given[key], "iuUO", "ids")
+        if names[key].shape != (np.size(given["a"]),):
+            raise InputError(f"pairs: {key}", f"shape {names[key].shape}", "(n_pairs,), as many of a as of b")
+        if numbers and names[key].dtype.kind in "iu":
+            found[key] = np.where(names[key] < n, names[key], -1).astype(np.int64)
+        else:
+            words: Any = names[key].tolist() if names[key].dtype.kind != "O" else as_names(f"pairs: {key}", given[key])
+            found[key] = np.array([place.get(str(word), -1) for word in words], dtype=np.int64)
+        require(found[key] >= 0, f"pairs: {key}", names[key], expected, "names of both stand for neither" * bool(both))
+    a, b = found["a"], found["b"]
+    require((a < n) == (b < n), "pairs: b", names["b"], "two configurations or two groups")
+    require(a != b, "pairs: b", names["b"], "another than a")
+    return {key: np.where(i < n, i, i - n) for key, i in found.items()}, a >= n
+
+
+def check_readings(readings: Floats, robot: Robot, name: str) -> None:
+    """Check that readings are of a robot's joints and within their limits; warn where they look like degrees.
+
+    Args:
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        robot: The robot.
+        name: What they are, for messages.
+
+    Raises:
+        InputError: They are of more or fewer joints, or outside limits.
+    """
+    if readings.shape[1] != robot.n_joints:
+        raise InputError(name, f"readings of {readings.shape[1]} joints", f"{robot.n_joints}, as {robot.name} has")
+    lower, upper = robot.limits.T
+    outside = outside_limits(readings, robot)
+    if outside.any():
+        row, j = divmod(int(np.argmax(outside)), robot.n_joints)
+        joint, reading = robot.joints[j], readings[row, j]
+        found = f"{joint.name} = {reading:.6g} {joint.unit} is outside [{lower[j]:.6g}, {upper[j]:.6g}]"
+        hint = limit_hint(readings[:, j], robot, j, joint.unit)
+        raise InputError(f"{name}: row {row}", found, hint=hint)
+    turning = np.array([not joint.prismatic for joint in robot.joints]) & np.isinf(lower) & np.isinf(upper)
+    suspicious = turning & ((np.abs(readings) > 4 * np.pi).mean(axis=0) > 0.5)
+    if suspicious.any():
+        joint = robot.joints[int(np.argmax(suspicious))]
+        _log.warning("%s: most readings of %s are more than two turns; are they in deg?", name, joint.name)
+
+
+def outside_limits(readings: Floats, robot: Robot) -> Booleans:
+    """Which readings, shape (n, n_joints), [rad] (prismatic: [m]), are beyond their joints' limits."""
+    lower, upper = robot.limits.T
+    outside: Booleans = (readings < lower - LIMIT_SLACK) | (readings > upper + LIMIT_SLACK)
+    return outside
+
+
+def limit_hint(readings: Floats, robot: Robot, joint: int, unit: str) -> str:
+    """What to do about a joint that has a reading outside its limits.
+
+    A smaller unit is suggested where a reading is far outside and all are within the limits in that unit.
+
+    Args:
+        readings: Of the joint, as understood so far, shape (n,), [rad] (prismatic: [m]).
+        robot: The robot.
+        joint: 0-based number of the joint.
+        unit: Unit that they are taken to be in.
+    """
+    smaller, size = {"rad": ("deg", np.pi / 180.0), "m": ("mm", 1e-3)}.get(unit, ("", 1.0))
+    low, high = robot.limits[joint]
+    far = max(low - readings.min(), readings.max() - high) > FAR * (high - low)
+    if far and smaller and low <= size * readings.min() and size * readings.max() <= high:
+        return f"is it in {smaller}?"
+    return "widen the joint's limits if the reading is right"
 
 
 def only_of(chosen: Booleans, group: Integers, n_groups: int) -> Booleans:

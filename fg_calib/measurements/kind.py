@@ -9,11 +9,13 @@ the frame, a parameter, a joint, a frame before or behind the arm, has a (w, dp)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fg_calib.inputs import Floats, InputError, Integers, as_array, check_number, require, shown
+from fg_calib.robot import cross_matrix
 
 
 class Frames(NamedTuple):
@@ -96,20 +98,14 @@ class Kind(ABC):
         """The kinds that are measured together, or the one alone."""
         return (self,)
 
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """Data that would be measured, shape (n, width).
+    def predict(self, at: Frames, nuisances: Floats) -> Floats:
+        """Data without noise, shape (n, width); for a kind whose data are all measured.
 
         Args:
             at: True tool frames of the ends.
-            data: What is given and not measured, such as a pixel's corner, shape (n, width).
             nuisances: True values, shape (n, n_nuisances).
-            noise: Error of each row, shape (n, residual_dim).
         """
-        if self.width == 0:  # a contact: its noise is where the arm stood
-            return np.zeros((len(noise), 0))
-        measured, given = np.split(data, [self.residual_dim], axis=1)
-        values = self.rows(at, np.hstack([0.0 * measured, given]), nuisances).residual + noise
-        return np.hstack([values, given])
+        return self.rows(at, np.zeros((len(nuisances), self.width)), nuisances).residual[:, : self.width]
 
     def mirrored(self, points: Floats, data: Floats, nuisances: Floats) -> Floats | None:
         """Nuisances of one landmark at its mirror image, which the same data may fit nearly as well; None of none.
@@ -135,26 +131,16 @@ class Kind(ABC):
         return hash(type(self))
 
 
-class Step(NamedTuple):
-    """Vectors from one point to another, and their derivatives.
-
-    Attributes:
-        vector: Shape (n, 3), [m].
-        wrenches: In (w, dp) of the ends that are tool points, shape (n, ends, 3, 6).
-        nuisances: In those that are landmarks, shape (n, 3, 3 n_landmarks).
-    """
-
-    vector: Floats
-    wrenches: Floats
-    nuisances: Floats
-
-
-def steps(at: Frames, landmarks: Floats) -> Step:
+def steps(at: Frames, landmarks: Floats) -> tuple[Floats, Floats, Floats]:
     """Vectors from the first of two points to the second: landmarks come first, then tool points.
 
     Args:
         at: Tool frames, of 0, 1 or 2 ends.
         landmarks: The other points, side by side, shape (n, 3 n_landmarks), [m].
+
+    Returns:
+        Vectors, shape (n, 3), [m], and their derivatives in (w, dp) of the ends that are tool points, shape (n, ends,
+        3, 6), and in the landmarks, shape (n, 3, 3 n_landmarks).
     """
     n, k = len(landmarks), landmarks.shape[1] // 3
     points = np.concatenate([landmarks.reshape(n, k, 3), at.position.reshape(n, -1, 3)], axis=1)
@@ -162,7 +148,7 @@ def steps(at: Frames, landmarks: Floats) -> Step:
     D = np.zeros((n, 2 - k, 3, 6))
     D[:, :, :, 3:] = signs[k:]
     N = np.tile(signs[:k].transpose(1, 0, 2).reshape(3, 3 * k), (n, 1, 1))
-    return Step(points[:, 1] - points[:, 0], D, N)
+    return points[:, 1] - points[:, 0], D, N
 
 
 def directions(vectors: Floats) -> tuple[Floats, Floats]:
@@ -183,15 +169,11 @@ class Length(Kind):
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
         landmarks, offset = np.split(nuisances, [3 * (2 - self.ends)], axis=1)
-        step = steps(at, landmarks)
-        length, u = directions(step.vector)
-        D = np.einsum("nk,nekj->nej", u, step.wrenches)[:, :, None]
-        N = np.concatenate([np.einsum("nk,nkj->nj", u, step.nuisances), np.ones(offset.shape)], axis=1)[:, None]
+        step, of_ends, of_landmarks = steps(at, landmarks)
+        length, u = directions(step)
+        D = np.einsum("nk,nekj->nej", u, of_ends)[:, :, None]
+        N = np.concatenate([np.einsum("nk,nkj->nj", u, of_landmarks), np.ones(offset.shape)], axis=1)[:, None]
         return Rows((length + offset.sum(axis=1))[:, None] - data, D, N)
-
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """See `Kind.simulate`."""
-        return np.abs(super().simulate(at, data, nuisances, noise))
 
 
 class Coincidence(Kind):
@@ -211,46 +193,40 @@ class Coincidence(Kind):
 class Stacked(Kind):
     """Rows of several kinds of the same ends, one below the other: a pose is an orientation and a position.
 
-    Data: those of the kinds, side by side. Nuisances: the same.
+    Data: those of the kinds, side by side. Nuisances: those of every kind that has some.
     """
 
     def __init__(self, *parts: Kind) -> None:
         self._parts = parts
         self.names = tuple(name for part in parts for name in part.names)
         self.units = tuple(unit for part in parts for unit in part.units)
-        self.ends = parts[0].ends
-        for name in ("residual_dim", "width", "n_nuisances"):
-            setattr(self, name, sum(getattr(part, name) for part in parts))
+        self.ends, self.n_nuisances = parts[0].ends, max(part.n_nuisances for part in parts)
+        self.residual_dim, self.width = len(self.names), sum(part.width for part in parts)
 
     @property
     def parts(self) -> tuple[Kind, ...]:
         """See `Kind.parts`."""
         return self._parts
 
-    def _split(self, of: Floats, size: str) -> list[Floats]:
-        """What each part has of an array, a view of its columns; `size` says how many of them."""
-        return np.split(of, np.cumsum([getattr(part, size) for part in self.parts])[:-1], axis=1)
+    def _each(self, data: Floats) -> Iterator[tuple[Kind, Floats]]:
+        """Each part with its columns of data."""
+        return zip(self.parts, np.split(data, np.cumsum([part.width for part in self.parts])[:-1], axis=1), strict=True)
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
-        of_parts = zip(self.parts, self._split(data, "width"), self._split(nuisances, "n_nuisances"), strict=True)
-        residuals, wrenches, given = zip(*(part.rows(at, *arrays) for part, *arrays in of_parts), strict=True)
-        N, row, column = np.zeros((len(data), self.residual_dim, self.n_nuisances)), 0, 0
-        for part, own in zip(self.parts, given, strict=True):
-            if part.n_nuisances:
-                N[:, row : row + part.residual_dim, column : column + part.n_nuisances] = own
-            row, column = row + part.residual_dim, column + part.n_nuisances
-        return Rows(np.concatenate(residuals, axis=1), np.concatenate(wrenches, axis=2), N)
+        each = [part.rows(at, own, nuisances) for part, own in self._each(data)]
+        none = np.zeros((len(data), self.residual_dim, self.n_nuisances))
+        N = [none[:, : r.residual.shape[1]] if r.nuisances is None else r.nuisances for r in each]
+        residual, D = (np.concatenate([r[i] for r in each], axis=i + 1) for i in (0, 1))
+        return Rows(residual, D, np.concatenate(N, axis=1))
 
     def figures(self, data: Floats) -> Floats:
         """See `Kind.figures`."""
-        return np.hstack([part.figures(own) for part, own in zip(self.parts, self._split(data, "width"), strict=True)])
+        return np.hstack([part.figures(own) for part, own in self._each(data)])
 
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """See `Kind.simulate`."""
-        sizes = ((data, "width"), (nuisances, "n_nuisances"), (noise, "residual_dim"))
-        each = zip(self.parts, *(self._split(of, size) for of, size in sizes), strict=True)
-        return np.hstack([part.simulate(at, *arrays) for part, *arrays in each])
+    def predict(self, at: Frames, nuisances: Floats) -> Floats:
+        """See `Kind.predict`."""
+        return np.hstack([part.predict(at, nuisances) for part in self.parts])
 
     def twins(self) -> Integers:
         """See `Kind.twins`; none at all if a part has none."""
@@ -281,21 +257,16 @@ def check_kind(kind: Kind) -> None:
     for name in ("ends", "residual_dim", "width", "n_nuisances"):
         least, most = int(name == "residual_dim"), 2 if name == "ends" else 1000
         check_number(f"{place}: {name}", getattr(kind, name, None), least=least, whole=True, most=most)
-    n = kind.residual_dim
-    for name, example in (("names", "('height',)"), ("units", "('m',)")):
+    for name, example in (("names", "words, such as ('height',)"), ("units", "of m, rad and px")):
         value = getattr(kind, name, None)
-        if not isinstance(value, tuple | list) or len(value) != n or not all(isinstance(v, str) and v for v in value):
-            expected = f"a tuple of residual_dim = {n} words, such as {example}"
+        words = value if isinstance(value, tuple | list) else ()
+        good = len(words) == kind.residual_dim and all(isinstance(word, str) and word for word in words)
+        if not good or (name == "units" and not {"m", "rad", "px"}.issuperset(words)):
+            expected = f"a tuple of residual_dim = {kind.residual_dim} {example}"
             raise InputError(f"{place}: {name}", f"found {shown(value)}", expected)
-    if not set(kind.units) <= {"m", "rad", "px"}:
-        raise InputError(f"{place}: units", f"found {shown(kind.units)}", "m, rad or px each")
     if not is_ours(kind) and len(kind.twins()):
         found = f"found {shown(kind.code)}"
         raise InputError(f"{place}: code", found, "None: compiled code would take the place of its rows")
-
-
-def _place(kind: Kind, name: str, source: str) -> str:
-    return f"{source}{': ' * bool(source)}kind {type(kind).__name__}: {name}"
 
 
 def checked_rows(
@@ -313,25 +284,22 @@ def checked_rows(
     Raises:
         InputError: One has another shape, or no numbers.
     """
-    found = kind.rows(at, data.copy(), nuisances.copy())
+    found, n, h = kind.rows(at, data.copy(), nuisances.copy()), len(at.position), kind.residual_dim
+    place = f"{source}{': ' * bool(source)}kind {type(kind).__name__}"
     if not isinstance(found, tuple) or len(found) != len(Rows._fields):
-        raise InputError(_place(kind, "rows", source), f"returned a {type(found).__name__}", "Rows(residual, D, N)")
-    n = len(at.position)
-    none = np.zeros((n, kind.residual_dim, 0)) if kind.n_nuisances == 0 else np.zeros(0)
-    shapes = ((n, kind.residual_dim), (n, kind.ends, kind.residual_dim, 6), (n, kind.residual_dim, kind.n_nuisances))
-    arrays = []
-    for name, given, shape in zip(Rows._fields, found, shapes, strict=True):
-        place = _place(kind, name, source)
-        numbers = as_array(place, none if given is None else given, "iuf", f"numbers of shape {shape}")
-        array = np.ascontiguousarray(numbers, dtype=np.float64)
-        if array.shape != shape:
-            raise InputError(place, f"shape {array.shape}", f"{shape}")
-        arrays.append(array)
+        raise InputError(f"{place}: rows", f"returned a {type(found).__name__}", "Rows(residual, D, N)")
+    each: tuple[Any, ...] = found if kind.n_nuisances else (*found[:2], np.zeros((n, h, 0)))
+    arrays, shapes = [], ((n, h), (n, kind.ends, h, 6), (n, h, kind.n_nuisances))
+    for name, given, shape in zip(Rows._fields, each, shapes, strict=True):
+        numbers = as_array(f"{place}: {name}", given, "iuf", f"numbers of shape {shape}")
+        if numbers.shape != shape:
+            raise InputError(f"{place}: {name}", f"shape {numbers.shape}", f"{shape}")
+        arrays.append(np.ascontiguousarray(numbers, dtype=np.float64))
     return arrays[0], arrays[1], arrays[2]
 
 
-def check_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str = "") -> None:
-    """Check that a custom kind's rows are finite, and compare what it says of its derivatives with differences.
+def check_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: str) -> None:
+    """Check that a custom kind's rows are finite, and compare its derivatives with central differences.
 
     Args:
         kind: The kind.
@@ -343,24 +311,22 @@ def check_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: 
     Raises:
         InputError: They are not, or differ by more than differences do.
     """
+    place = f"{source}: kind {type(kind).__name__}"
     for name, array in zip(Rows._fields, checked_rows(kind, at, data, nuisances, source), strict=True):
-        place = _place(kind, name, source)
-        require(np.isfinite(array), place, array, "a finite number", "at the start of the unknowns")
-    (rotation, position), data, nuisances = (of[:N_COMPARED] for of in at), data[:N_COMPARED], nuisances[:N_COMPARED]
-    at = Frames(rotation, position)
+        require(np.isfinite(array), f"{place}: {name}", array, "a finite number", "at the start of the unknowns")
+    at, data, nuisances = Frames(*(of[:N_COMPARED] for of in at)), data[:N_COMPARED], nuisances[:N_COMPARED]
     _, D, N = checked_rows(kind, at, data, nuisances, source)
     n_of_ends = 6 * kind.ends
-    said = np.concatenate([np.moveaxis(D, 1, 2).reshape(*N.shape[:2], n_of_ends), N], axis=2)
-    for k in range(said.shape[2]):
-        up, down = (_moved(at, nuisances, k, h) for h in (STEP, -STEP))
-        r_up, r_down = (checked_rows(kind, frames, data, values, source)[0] for frames, values in (up, down))
-        difference = (r_up - r_down) / (2.0 * STEP)
-        off = np.abs(difference - said[:, :, k]) / np.maximum(1.0, np.abs(difference))
-        if not np.all(off < MAX_DERIVATIVE_ERROR):
-            worst = np.unravel_index(np.argmax(np.nan_to_num(off, nan=np.inf)), off.shape)
-            found = f"{said[:, :, k][worst]:.6g} where a small change gives {difference[worst]:.6g}"
-            place = _place(kind, "wrenches" if k < n_of_ends else "nuisances", source)
-            raise InputError(place, found, "the derivative of its residual")
+    claimed = np.concatenate([np.moveaxis(D, 1, 2).reshape(*N.shape[:2], n_of_ends), N], axis=2)
+    for k, step in enumerate(STEP * np.eye(claimed.shape[2])):
+        up, down = (_residual_at(kind, at, data, nuisances, sign * step) for sign in (1.0, -1.0))
+        difference = (up - down) / (2.0 * STEP)
+        off = np.abs(difference - claimed[:, :, k]) / np.maximum(1.0, np.abs(difference))
+        worst = np.unravel_index(np.argmax(off), off.shape)
+        if not off[worst] < MAX_DERIVATIVE_ERROR:
+            found = f"{claimed[:, :, k][worst]:.6g} where a small change gives {difference[worst]:.6g}"
+            part = Rows._fields[1 + (k >= n_of_ends)]
+            raise InputError(f"{place}: {part}", found, "the derivative of its residual")
 
 
 N_COMPARED = 3
@@ -370,18 +336,12 @@ STEP = 1e-6
 """Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size."""
 
 MAX_DERIVATIVE_ERROR = 1e-4
-"""Difference of a derivative, of 1 or its size, that is a mistake."""
+"""Difference of a derivative, relative to 1 or its size, that is a mistake."""
 
 
-def _moved(at: Frames, nuisances: Floats, k: int, h: float) -> tuple[Frames, Floats]:
-    """Frames and nuisances with one coordinate changed: of a rotation or a translation of an end, or a nuisance."""
-    (rotation, position), (end, column) = (of.copy() for of in at), divmod(k, 6)
-    if end >= position.shape[1]:
-        k -= 6 * position.shape[1]
-        return at, nuisances + h * (np.arange(nuisances.shape[1]) == k)
-    if column < 3:
-        K = np.cross(np.eye(3), h * np.eye(3)[column])
-        rotation[:, end] = (np.eye(3) + K + 0.5 * K @ K) @ rotation[:, end]
-    else:
-        position[:, end, column - 3] += h
-    return Frames(rotation, position), nuisances
+def _residual_at(kind: Kind, at: Frames, data: Floats, nuisances: Floats, step: Floats) -> Floats:
+    """Residuals after a small rotation and translation of each end, and a small change of the nuisances."""
+    moves = step[: 6 * kind.ends].reshape(-1, 6)
+    rotation = at.rotation + cross_matrix(moves[:, :3]) @ at.rotation
+    moved = Frames(rotation, at.position + moves[:, 3:])
+    return checked_rows(kind, moved, data, nuisances + step[6 * kind.ends :])[0]

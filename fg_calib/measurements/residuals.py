@@ -2,8 +2,8 @@
 
 A *block* is a set of measurements of one kind; what a kind is and how it gives its derivatives stands in
 `measurements.kinds`. One kernel fills a panel, shape (n_columns + 1, rows): the transposed whitened Jacobian and, in
-its last row, the whitened residual. Panels are handed on chunk by chunk and never stored for a whole block: `gram` and
-`triangle` reduce them as they come, `linearise` keeps them for those who want to look at every row.
+its last row, the whitened residual. Panels are handed on chunk by chunk and never stored for a whole block: `triangle`
+reduces them as they come, `linearise` keeps them for those who want to look at every row.
 
 References:
     Andrews (1968), A square root formulation of the Kalman covariance equations. AIAA Journal 6(6).
@@ -14,10 +14,8 @@ References:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 
 import numpy as np
 from scipy.linalg import lapack
@@ -73,31 +71,22 @@ class Block(Brief):
 
 def pack(whitening: Floats) -> Floats:
     """Lower triangles, shape (n, d, d) with d the residual_dim, row by row: shape (n, d * (d + 1) / 2)."""
-    rows, columns = _lower(whitening.shape[1])
+    rows, columns = np.tril_indices(whitening.shape[1])
     return np.ascontiguousarray(whitening[:, rows, columns])
 
 
 def unpack(whitening: Floats, residual_dim: int) -> Floats:
     """What `pack` packed, shape (n, residual_dim, residual_dim)."""
-    rows, columns = _lower(residual_dim)
+    rows, columns = np.tril_indices(residual_dim)
     out = np.zeros((len(whitening), residual_dim, residual_dim))
     out[:, rows, columns] = whitening
     return out
 
 
-@cache
-def _lower(residual_dim: int) -> tuple[Integers, Integers]:
-    return np.tril_indices(residual_dim)
-
-
 def unit_whitening(n: int, residual_dim: int) -> Floats:
     """For rows that are not whitened; all of them are the same in memory."""
-    return np.broadcast_to(_packed_unit(residual_dim), (n, residual_dim * (residual_dim + 1) // 2))
-
-
-@cache
-def _packed_unit(residual_dim: int) -> Floats:
-    return pack(np.eye(residual_dim)[None])
+    unit = pack(np.eye(residual_dim)[None])
+    return np.broadcast_to(unit, (n, unit.shape[1]))
 
 
 def rows_of(block: Block, rows: slice | Integers) -> Block:
@@ -132,43 +121,20 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
     return out[:, :, -1], out[:, :, :-1]
 
 
-def squared_norm(block: Block, chain: Chain) -> float:
-    """Sum of squared whitened residuals."""
-    free = chain.without_columns()
-
-    def run(start: int, stop: int) -> float:
-        return math.fsum(float(np.vdot(panel[-1], panel[-1])) for _, _, panel in _panels(block, free, start, stop))
-
-    return math.fsum(over_spans(run, block.n))
-
-
-def gram(block: Block, chain: Chain) -> Floats:
-    """[J r]^T [J r] of the block, shape (n_columns + 1, n_columns + 1)."""
-    n_all = _n_columns(block, chain) + 1
-
-    def run(start: int, stop: int) -> Floats:
-        total = np.zeros((n_all, n_all))
-        for _, _, panel in _panels(block, chain, start, stop):
-            rows = panel.reshape(n_all, -1)
-            total += rows @ rows.T
-        return total
-
-    with one_blas_thread:
-        return sum(over_spans(run, block.n), np.zeros((n_all, n_all)))
-
-
 def triangle(block: Block, chain: Chain) -> Floats:
-    """R of a thin QR of [J r], shape (n_columns + 1, n_columns + 1): `gram` without squaring the condition number."""
+    """R of a thin QR of [J r], shape (n_columns + 1, n_columns + 1)."""
     n_all = _n_columns(block, chain) + 1
 
     def run(start: int, stop: int) -> Floats:
         running = np.zeros((n_all, n_all), order="F")
         for _, _, panel in _panels(block, chain, start, stop):
-            running = _onto(running, panel.reshape(n_all, -1).T)
+            rows = panel.reshape(n_all, -1).T
+            running = lapack.dtpqrt(0, min(QR_COLUMNS, n_all), running, rows, overwrite_a=1, overwrite_b=1)[0]
         return running
 
     with one_blas_thread:
-        return _upper(np.vstack([*over_spans(run, block.n), np.zeros((n_all, n_all))]))
+        R: Floats = np.linalg.qr(np.vstack([*over_spans(run, block.n), np.zeros((n_all, n_all))]), mode="r")  # type: ignore[assignment]
+    return R
 
 
 def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
@@ -190,18 +156,6 @@ def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
         for _ in over_spans(run, block.n):
             pass
     return out
-
-
-def _onto(R: Floats, rows: Floats) -> Floats:
-    """R of a thin QR of a triangle R and rows below it, both in the order of columns; both are overwritten."""
-    out, _, _, _ = lapack.dtpqrt(0, min(QR_COLUMNS, len(R)), R, rows, overwrite_a=1, overwrite_b=1)
-    return out  # type: ignore[no-any-return]
-
-
-def _upper(A: Floats) -> Floats:
-    """R of a thin QR."""
-    R: Floats = np.linalg.qr(A, mode="r")  # type: ignore[assignment]
-    return R
 
 
 def _n_columns(block: Block, chain: Chain) -> int:

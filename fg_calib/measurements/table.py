@@ -21,16 +21,24 @@ from fg_calib.inputs import (
     Integers,
     Model,
     Pairing,
+    as_figures,
     as_floats,
     check_fields,
     check_number,
     listed,
     shown,
 )
-from fg_calib.measurements.dataset import Labels, Measurements, Pairs, only_of
+from fg_calib.measurements.dataset import (
+    Labels,
+    Measurements,
+    Pairs,
+    checked_indices,
+    checked_mask,
+    checked_sigma,
+    only_of,
+)
 from fg_calib.measurements.kind import Kind, check_kind
 from fg_calib.measurements.landmarks import Landmark, LandmarkKind, Landmarks
-from fg_calib.measurements.validation import checked_indices, checked_mask, checked_numbers, checked_sigma
 
 
 @dataclass(frozen=True)
@@ -72,34 +80,27 @@ class MeasurementBlock(Brief):
 
     @classmethod
     def of_rows(
-        cls, kind: Kind, table: Table, number: int, rows: Integers, data: Floats, sigma: Floats,
-        nuisances: Integers | None = None, **more: Any,
-    ) -> MeasurementBlock:  # fmt: skip
-        """One measurement a row of a table, all of its components measured.
+        cls, kind: Kind, table: int, rows: Integers, data: Floats, sigma: Floats, **more: Any
+    ) -> MeasurementBlock:
+        """Measurements all of whose components were measured.
 
         Args:
             kind: What they are.
-            table: The table.
-            number: Its number.
-            rows: Rows of the table, shape (n,).
+            table: Which table they are from.
+            rows: Number of each in the table, shape (n,): its configuration, unless `more` says the ends.
             data: What was measured, shape (n, kind.width).
             sigma: 1 sigma, which broadcasts to (n, kind.residual_dim).
-            nuisances: Coordinates of nuisances, shape (n, kind.n_nuisances).
             more: Other fields.
         """
-        m, shape = table.measurements, (len(rows), kind.residual_dim)
-        nuisances = np.zeros((len(rows), 0), dtype=np.int64) if nuisances is None else np.ascontiguousarray(nuisances)
-        fields: dict[str, Any] = {"measured": np.ones(shape, dtype=np.bool_), "number": rows, "source": m.source} | more
-        return cls(
-            kind=kind,
-            table=number,
-            ends=fields.pop("ends") if "ends" in fields else rows[:, None],
-            test=fields.pop("test") if "test" in fields else m.test[rows],
-            data=np.ascontiguousarray(data),
-            sigma=sigma if sigma.shape == shape else np.ascontiguousarray(np.broadcast_to(sigma, shape)),
-            nuisances=nuisances,
-            **fields,
-        )
+        shape = len(rows), kind.residual_dim
+        fields: dict[str, Any] = {
+            "ends": rows[:, None],
+            "measured": np.ones(shape, dtype=np.bool_),
+            "number": rows,
+            "nuisances": np.zeros((len(rows), 0), dtype=np.int64),
+        }
+        sigma = sigma if sigma.shape == shape else np.ascontiguousarray(np.broadcast_to(sigma, shape))
+        return cls(kind=kind, table=table, data=np.ascontiguousarray(data), sigma=sigma, **fields | more)
 
     @property
     def n(self) -> int:
@@ -170,27 +171,36 @@ class CustomMeasurements(Brief):
         if not isinstance(self.kind, Kind):
             raise InputError("own: kind", f"found {shown(self.kind)}", "an object of a class derived from Kind")
         check_kind(self.kind)
-        kind, data = self.kind, np.atleast_1d(checked_numbers("own: data", self.data))
-        n = len(data)
-        data = data.reshape(n, -1) if n else data
-        if not n or data.shape[1] != kind.width:
-            raise InputError("own: data", f"shape {np.shape(self.data)}", f"({n or 'n'}, {kind.width})")
-        sigma = checked_sigma("own: sigma", self.sigma, (n, kind.residual_dim))
-        starts, names = np.atleast_2d(checked_numbers("own: unknowns", self.unknowns)), listed("own: names", self.names)
-        if not all(isinstance(name, str) and name for name in names):
-            raise InputError("own: names", f"found {shown(self.names)}", "a word for each unknown")
-        if kind.n_nuisances and (starts.ndim != 2 or not starts.size or kind.n_nuisances % starts.shape[1]):
+        kind, data = self.kind, as_figures("own: data", self.data, "finite numbers")
+        data = as_floats("own: data", data[:, None] if data.ndim == 1 else data, f"(n, {kind.width})")
+        starts, names = as_floats("own: unknowns", self.unknowns, "(n, k)"), listed("own: names", self.names)
+        if kind.n_nuisances and (not starts.size or kind.n_nuisances % starts.shape[1]):
             expected = f"a start for each unknown; {type(kind).__name__} has {kind.n_nuisances} coordinates of them"
-            raise InputError("own: unknowns", f"shape {np.shape(self.unknowns)}", expected)
-        if names and len(set(names)) != len(starts):
-            raise InputError("own: names", f"found {names!r}", f"{len(starts)} different names")
-        test = None if self.test is None else checked_mask("own: test", self.test, n)
-        found = {"data": data, "sigma": sigma, "unknowns": starts, "names": names, "test": test}
-        for name, top in (("ends", None), ("which", len(starts))):
-            if (given := getattr(self, name)) is not None:
-                found[name] = checked_indices(f"own: {name}", given, n, top)
+            raise InputError("own: unknowns", f"shape {starts.shape}", expected)
+        if names and (len(set(names)) != len(starts) or not all(isinstance(name, str) and name for name in names)):
+            raise InputError("own: names", f"found {shown(self.names)}", f"{len(starts)} different words")
+        found = {"data": data, "unknowns": starts, "names": names}
+        found["sigma"] = checked_sigma("own: sigma", self.sigma, (len(data), kind.residual_dim))
+        if self.test is not None:
+            found["test"] = checked_mask("own: test", self.test, len(data))
+        for name, most in (("ends", None), ("which", len(starts) - 1)):
+            if getattr(self, name) is not None:
+                found[name] = checked_indices(f"own: {name}", getattr(self, name), len(data), most)
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    def at(self, n_configurations: int) -> Integers:
+        """Configurations of each measurement, of so many that the table has, shape (n, ends).
+
+        Raises:
+            InputError: They are at configurations that the table has not.
+        """
+        n = len(self.data)
+        ends = np.arange(n_configurations)[:, None] if self.ends is None else self.ends.reshape(n, -1)
+        if len(ends) != n or ends.max(initial=0) >= n_configurations:
+            found = f"{n} measurements at {len(ends)} configurations" if len(ends) != n else f"found {ends.max()}"
+            raise InputError("own: ends", found, f"one a measurement, 0 to {n_configurations - 1}")
+        return ends
 
     def block(self, table: Table, number: int, landmarks: Landmarks) -> MeasurementBlock:
         """A block of them.
@@ -200,22 +210,18 @@ class CustomMeasurements(Brief):
         Raises:
             InputError: They are at configurations that the table has not.
         """
-        m, kind, n = table.measurements, self.kind, len(self.data)
-        ends = np.arange(m.n_configurations)[:, None] if self.ends is None else self.ends.reshape(n, -1)
-        if len(ends) != n or ends.max(initial=0) >= m.n_configurations:
-            found = f"{n} measurements at {len(ends)} configurations" if len(ends) != n else f"found {ends.max()}"
-            raise InputError("own: ends", found, f"one a measurement, 0 to {m.n_configurations - 1}")
-        nuisances, of = None, None
-        if kind.n_nuisances:
+        m, n = table.measurements, len(self.data)
+        fields: dict[str, Any] = {"ends": self.at(m.n_configurations), "source": m.source}
+        fields["test"] = np.zeros(n, dtype=np.bool_) if self.test is None else self.test
+        if self.kind.n_nuisances:
             names = self.names or tuple(map(str, range(len(self.unknowns))))
             new = [Landmark(UNKNOWN, name, start) for name, start in zip(names, self.unknowns, strict=True)]
             place = landmarks.add(new, m.source, number if table.unknown_frame else -1, named=bool(self.names))
             which = np.zeros((n, 1), dtype=np.int64) if self.which is None else self.which.reshape(n, -1)
-            nuisances = place[which].reshape(n, -1)
-            of = Labels(self.names, which[:, 0]) if len(self.names) > 1 and which.shape[1] == 1 else None
-        test = np.zeros(n, dtype=np.bool_) if self.test is None else self.test
-        arrays = np.arange(n), self.data, np.asarray(self.sigma), nuisances
-        return MeasurementBlock.of_rows(kind, table, number, *arrays, ends=ends, test=test, of=of)
+            fields["nuisances"] = place[which].reshape(n, -1)
+            if len(self.names) > 1 and which.shape[1] == 1:
+                fields["of"] = Labels(self.names, which[:, 0])
+        return MeasurementBlock.of_rows(self.kind, number, np.arange(n), self.data, np.asarray(self.sigma), **fields)
 
 
 @dataclass(frozen=True)
@@ -264,11 +270,6 @@ class Table(Brief):
     fixed_camera: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.known, Mapping):  # x, y and z are a point that is known exactly
-            known: dict[str, Any] = dict(self.known)
-            bare = [name for name, k in known.items() if isinstance(k, list | tuple | np.ndarray)]
-            known |= {name: KnownPoint(known[name]) for name in bare}
-            object.__setattr__(self, "known", known)
         check_fields(self, "table: ")
         object.__setattr__(self, "own", tuple(self.own))
         if self.model is None and self.frame == "unknown":
@@ -307,14 +308,13 @@ class Table(Brief):
             return replace(pairs, test=test[pairs.a] | test[pairs.b])
 
         def split_own(own: CustomMeasurements) -> CustomMeasurements:
-            ends = np.arange(len(configurations)) if own.ends is None else own.ends
-            return replace(own, test=np.any(configurations[np.reshape(ends, (len(own.data), -1))], axis=1))
+            return replace(own, test=np.any(configurations[own.at(len(configurations))], axis=1))
 
         changes: dict[str, Any] = {"test": configurations}
         if m.pairs is not None:
             changes["pairs"] = split(m.pairs, configurations)
         if (groups := m.groups) is not None:
-            only = only_of(configurations, groups.index, groups.n_groups)
+            only = only_of(configurations, groups.index, len(groups.names))
             changes["groups"] = replace(groups, pairs=split(groups.pairs, only))
         return replace(self, measurements=replace(m, **changes), own=tuple(map(split_own, self.own)))
 

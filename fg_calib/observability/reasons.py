@@ -214,7 +214,7 @@ def at_configurations(robot: Robot, table: Table, q: Floats, places: _Places, so
     m = Measurements.from_arrays(q, position=poses.position, rotation=poses.rotation, source=called, **scales)
     sigmas = dict.fromkeys(INSTRUMENTS[model].generic_columns, length)
     m = replace(m, labels={column: Labels(tuple(real), index)} if real else {}, sigma_length=length, sigmas=sigmas)
-    m = INSTRUMENTS[model].predict(m, poses, lambda kind, name: places[kind.letter, name])
+    m = INSTRUMENTS[model].predict(m, poses, lambda kind, names: np.array([places[kind.letter, one] for one in names]))
     frame = "unknown" if model != table.model and INSTRUMENTS[model].is_pose else table.frame
     known = {name: k for name, k in table.known.items() if name in real}
     return Table(replace(m, source=source), model, Pairing("chain"), frame, known=known, offset=table.offset)

@@ -322,7 +322,7 @@ class Measuring:
     def plain(self) -> tuple[Table, Truth]:
         """Columns that the model alone has."""
         model = INSTRUMENTS[self.model]
-        exact = model.predict(self.rows(), self.at(), lambda kind, name: np.zeros(kind.size))
+        exact = model.predict(self.rows(), self.at(), lambda kind, names: np.zeros((len(names), kind.size)))
         columns = {name: exact.columns[name] + self.noise(name, self.n) for name in model.generic_columns}
         sigmas = {name: self.sigma(name, self.n) for name in model.generic_columns}
         return Table(replace(exact, columns=columns, sigmas=sigmas), self.model), {}

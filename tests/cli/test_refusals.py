@@ -73,7 +73,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "degrees read as radians": (
         replaced(JOB, "angle: deg", "angle: rad"),
         CALIBRATE,
-        "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is the table in deg?",
+        "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is it in deg?",
     ),
     "outside the limits": (
         replaced(POSES, "^p1,[^,]*", "p1,181"),
@@ -100,7 +100,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     ),
     "no robot to observe": (nothing, ("observe", "missing.yaml"), "missing.yaml: no such file"),
     "an unknown parameter": (nothing, ("observe", ROBOT, "--prefer", "d9"), "unknown parameter 'd9'"),
-    "a table in degrees": (nothing, OBSERVE[:4], "is the table in deg?"),
+    "a table in degrees": (nothing, OBSERVE[:4], "is it in deg?"),
     "noise of zero": (
         nothing,
         (*OBSERVE, "--position-noise", 0),

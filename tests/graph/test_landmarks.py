@@ -43,7 +43,7 @@ def case(seed=0, *, n_points=4, n_each=12, tolerance=TOLERANCE, sigma=SIGMA, dis
 def all_pairs(m):
     """The same touches as pairs of each group, with sigma sqrt(n) times that of a touch."""
     index, parts = m.groups.index, []
-    for g in range(m.groups.n_groups):
+    for g in range(len(m.groups.names)):
         rows = np.flatnonzero(index == g)
         parts.append(rows[np.array(np.triu_indices(len(rows), 1))])
     a, b = np.hstack(parts)
@@ -156,7 +156,7 @@ def test_contacts_that_a_model_cannot_use_or_without_sigmas_are_refused():
     robot, _, m = case(n_each=3)
     pairs = replace(m.groups.pairs, sigma_distance=np.array([np.nan]))
     for model in ("pose", "rotation"):
-        said = f"poses.csv: a column group with model {model}, expected model distance or distance-rotation"
+        said = f"poses.csv: group with model {model}, expected model distance or distance-rotation"
         assert refused(robot, m, model=model) == said
     said = "poses.csv: no sigma for touched points, expected noise.point or a column sigma_point"
     assert refused(robot, replace(m, sigma_point=None), model="distance") == said

@@ -103,7 +103,7 @@ def test_tool_point_is_found_from_distances(t):
     tip = p + R @ np.array(t)
     a, b = np.triu_indices(30, 1)
     distance = np.linalg.norm(tip[b] - tip[a], axis=1)
-    found = start_from_distances((R, p), a, b, distance, IDENTITY, ALL)
+    found = start_from_distances((R, p), np.stack([a, b], axis=1), distance, IDENTITY, ALL)
     assert found.translation == pytest.approx(t, abs=rounding(1, 10))
 
 

@@ -51,10 +51,10 @@ def test_anchors_and_what_an_instrument_adds_from_lengths(offset, flat):
         points, anchors = rng.normal(size=(45, 3)) * [1.0, 1.0, flat], 2.0 * rng.normal(size=(3, 3))
         which = np.arange(45) % 3
         length = np.linalg.norm(points - anchors[which], axis=1) + offset + SIGMA * rng.normal(size=45)
-        unknown = np.full((3, 3), np.nan)
-        added = offset_from_lengths(points, length, which, unknown) if offset > 0.0 else 0.0
-        found = anchors_from_lengths(points, length - added, which, unknown)
-        assert found == pytest.approx(anchors, abs=0.1)
+        unknown, anchor = np.full(9, np.nan), 3 * which[:, None] + np.arange(3)
+        added = offset_from_lengths(points, length, anchor, unknown) if offset > 0.0 else 0.0
+        found = anchors_from_lengths(points, length - added, anchor, unknown)
+        assert [place for _, place in found] == pytest.approx(anchors, abs=0.1)
         assert added == pytest.approx(offset, abs=0.1)
 
 

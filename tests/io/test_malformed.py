@@ -94,7 +94,7 @@ JOBS = [
     (JOB + "columns: {q1: {name: x, scale: 0}}\n", 'job.yaml: columns: x: scale: found 0, expected a number other than 0'),
     (JOB + "prior: false\ngauge: prior\n", "job.yaml: prior: found False with gauge: prior, expected gauge alone"),
     (JOB.replace("robot.yaml","\"a\\0b\""), '{folder}/a\\x00b: cannot be read: ...'),
-    (JOB+"pairs: poses.csv\n", "poses.csv: no a, expected a and b, the two configurations of a pair"),
+    (JOB+"pairs: poses.csv\n", "poses.csv: no a, expected a and b, the two configurations of a pair, and distance or angle"),
     (JOB+"truth: other.yaml\n", 'other.yaml: another robot, expected the parameters of robot, with their true values'),
     (JOB+"noise: {position: 1e-40}\n", 'job.yaml: noise: position: found 1e-40 m, expected 1e-30 m or more'),
     (JOB+"prefer: a1\n", "job.yaml: prefer: found 'a1', expected a list of names"),

@@ -222,7 +222,7 @@ MISTAKES = [
      f"poses.csv: 4 joint columns (q1, q2, q3, q4), {JOINTS} q1, q2, q3, q4, {COLUMNS[4:]}"),
     (changed("0,0.6,0,0.8", "0,0.6,0,0.802"), "poses.csv:4: quaternion of norm 1.0016, expected 1 within 0.001"),
     (changed("p2,", ""), "poses.csv:3: 12 cells, expected 13 as in the header"),
-    (changed("0.2,0.3", "0.2,300"), "poses.csv:2: q3 = 300 m is outside [0, 0.5]; is the table in mm?"),
+    (changed("0.2,0.3", "0.2,300"), "poses.csv:2: q3 = 300 m is outside [0, 0.5]; is it in mm?"),
 ]  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib import InputError, Measurements, Noise, Options, Robot
 from fg_calib.io import Units, read_measurements
 from fg_calib.io.columns import write_csv
-from fg_calib.measurements.validation import check_readings
+from fg_calib.measurements.dataset import check_readings
 
 RNG = np.random.default_rng(3)
 N = 7
@@ -81,7 +81,7 @@ def test_a_frame_has_units_and_its_cells_are_named():
     frame = {"q1": [10.0, 20.0], "q2": [1.0, 2.0], "x": [1.0, np.nan], "y": [1.0, 2.0], "z": [1.0, 2.0]}
     with pytest.raises(InputError, match=r"^frame: row 1: x: found an empty cell, expected a finite number$"):
         Measurements.from_frame(frame, ROBOT, units=Units(angle="deg"))
-    with pytest.raises(InputError, match=r"^frame: row 0: q1 = 10 rad is outside .*; is q1 in deg\?$"):
+    with pytest.raises(InputError, match=r"^frame: row 0: q1 = 10 rad is outside .*; is it in deg\?$"):
         Measurements.from_frame(frame | {"x": [1.0, 2.0]}, ROBOT)
     found = Measurements.from_frame(frame | {"x": [1.0, 2.0]}, ROBOT, units=Units(angle="deg", length="mm"))
     assert found.readings[1, 0] == pytest.approx(np.deg2rad(20.0), rel=1e-15)
@@ -159,7 +159,7 @@ def test_sigmas_are_spread_over_the_rows(given, rows):
         ({"pairs": {"a": [0], "b": [1], "angle": [1], "sigma_angle": 0}}, "pairs: sigma_angle: found 0, expected"),
         (
             {"group": [0] * N, "pairs": {"a": [0], "b": [1], "distance": [1]}},
-            "pairs: a: row 0: found 0, expected dif",
+            "pairs: a: row 0: found 0, expected an id or a group; names of both",
         ),
         (
             {"group": ["l"] * 3 + ["r"] * 4, "pairs": {"a": ["l"], "b": ["r"], "angle": [1]}},
@@ -198,7 +198,7 @@ def test_what_is_made_of_arrays_directly_copies_none_and_locks_none():
 def test_readings_are_those_of_the_robot():
     with pytest.raises(InputError, match=r"^m: readings of 3 joints, expected 2, as robot has$"):
         check_readings(np.zeros((4, 3)), ROBOT, "m")
-    with pytest.raises(InputError, match=r"^m: row 1: q1 = 90 rad is outside \[-3, 3\]; is q1 in deg\?$"):
+    with pytest.raises(InputError, match=r"^m: row 1: q1 = 90 rad is outside \[-3, 3\]; is it in deg\?$"):
         check_readings(np.array([[0.0, 0.0], [90.0, 0.0]]), ROBOT, "m")
 
 

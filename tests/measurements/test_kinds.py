@@ -14,8 +14,7 @@ from fg_calib.measurements import Frames, Kind, Rows, check_rows, residuals
 from fg_calib.measurements.kind import Stacked
 from fg_calib.measurements.kinds.anchor import AnchorContact, AnchorDistance
 from fg_calib.measurements.kinds.board import BoardPose
-from fg_calib.measurements.kinds.contact import PointDistance, SamePoint, TouchedPoint
-from fg_calib.measurements.kinds.pair import Distance, RotationAngle
+from fg_calib.measurements.kinds.pair import Distance, PointDistance, RotationAngle, SamePoint, TouchedPoint
 from fg_calib.measurements.kinds.pixel import Pixel, RoomPixel
 from fg_calib.measurements.kinds.plane import PlaneDistance
 from fg_calib.measurements.kinds.pose import Orientation, Position, TargetPosition
@@ -111,24 +110,13 @@ def frames_of(n, ends, rng):
 
 
 @EVERY_KIND
-def test_simulated_data_leave_minus_their_noise_as_residuals(kind):
-    n, rng = 6, np.random.default_rng(8)
-    at, nuisances = frames_of(n, kind.ends, rng), rng.normal(size=(n, kind.n_nuisances))
-    nuisances += 5.0 * isinstance(kind, AnchorDistance)  # an offset and anchors that leave no length below 0
-    noise = 1e-3 * rng.normal(size=(n, kind.residual_dim))
-    data = kind.simulate(at, np.zeros((n, kind.width)), nuisances, noise)
+def test_predicted_data_leave_no_residuals(kind):
+    rng = np.random.default_rng(8)
+    at, nuisances = frames_of(6, kind.ends, rng), rng.normal(size=(6, kind.n_nuisances))
+    data = kind.predict(at, nuisances)
+    assert data.shape == (6, kind.width)
     if kind.width:  # of a contact nothing is measured: the arm is where the point is
-        assert kind.rows(at, data, nuisances).residual == pytest.approx(-noise, abs=2e-6)  # rotations to second order
-
-
-def test_simulated_pixels_keep_the_corners_that_are_given():
-    rng = np.random.default_rng(9)
-    at = Frames(np.eye(3)[None, None], np.zeros((1, 1, 3)))
-    corner, board = np.array([[0.0, 0.0, 0.1, -0.2]]), np.array([[0.1, 0.2, 0.3, 0.1, -0.1, 2.0]])
-    kind, noise = Pixel(Camera(900, 880, 640, 480, k1=-0.1)), rng.normal(size=(1, 2))
-    data = kind.simulate(at, corner, board, noise)
-    assert data[:, 2:] == pytest.approx(corner[:, 2:])
-    assert kind.rows(at, data, board).residual == pytest.approx(-noise, abs=rounding(1000.0))
+        assert kind.rows(at, data, nuisances).residual == pytest.approx(0.0, abs=rounding(10.0))
 
 
 def test_the_mirror_image_of_an_anchor_is_as_far_from_points_in_a_plane():
@@ -172,9 +160,7 @@ def test_the_reductions_are_those_of_the_rows(kind):
     rows = np.concatenate([J.reshape(r.size, -1), r.reshape(-1, 1)], axis=1)
     expected = rows.T @ rows
     R = residuals.triangle(block, chain)
-    assert residuals.gram(block, chain) == pytest.approx(expected, abs=rounding(expected, 10))
     assert R.T @ R == pytest.approx(expected, abs=rounding(expected, 10))
-    assert residuals.squared_norm(block, chain) == pytest.approx(expected[-1, -1], rel=rounding(1, 10))
 
 
 CAMERA = Camera(fx=900, fy=910, cx=640, cy=480, k1=-0.2, k2=0.1, p1=0.001, p2=-0.002, k3=0.01)
@@ -194,9 +180,9 @@ def seen_by_camera(n, rng):
 
 def test_pixels_have_the_derivatives_of_central_differences():
     at, data, board = seen_by_camera(40, np.random.default_rng(23))
-    check_rows(Pixel(CAMERA), at, data, board)
+    check_rows(Pixel(CAMERA), at, data, board, "")
     in_room = Frames(at.rotation, 0.3 * at.position + [0.0, 0.0, 4.0])
-    check_rows(RoomPixel(CAMERA), in_room, data, np.zeros((40, 0)))
+    check_rows(RoomPixel(CAMERA), in_room, data, np.zeros((40, 0)), "")
 
 
 def test_a_camera_in_the_room_and_one_on_the_tool_see_the_same_board():

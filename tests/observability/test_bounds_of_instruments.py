@@ -6,7 +6,7 @@ from instruments import measured_by
 from simulated import planar_robot
 from tolerances import rounding
 
-from fg_calib import Measurements, Table, assess, build_problem, solve
+from fg_calib import KnownPoint, Measurements, Table, assess, build_problem, solve
 from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot.kinematics import pose
 
@@ -23,7 +23,7 @@ def test_a_length_seen_by_a_wire_has_the_share_of_its_direction():
     data = Measurements.from_arrays(q, anchor=["post"] * 9, distance=length, sigma_distance=SIGMA)
     along = np.column_stack([np.cos(q[:, 0]), np.sin(q[:, 0]), np.zeros(9)])
     share = np.sum(along * away, axis=1) / length
-    bound = cramer_rao(robot, Table(data, "anchor", known={"post": anchor}), prior=False)
+    bound = cramer_rao(robot, Table(data, "anchor", known={"post": KnownPoint(anchor)}), prior=False)
     assert bound.covariance[0, 0] == pytest.approx(SIGMA**2 / np.sum(share**2), rel=rounding(1, 10), abs=0)
     # Of an anchor that nobody knows less is left: its three coordinates are projected out.
     J = np.column_stack([share, -away / length[:, None]])

@@ -7,7 +7,6 @@ from importlib import import_module
 
 from fg_calib.inputs import MODELS
 from fg_calib.measurements import UNKNOWN, LandmarkKind
-from fg_calib.measurements.kinds.contact import POINT
 from fg_calib.measurements.kinds.instrument import Column, Instrument
 
 INSTRUMENTS: dict[str, Instrument] = {
@@ -18,14 +17,11 @@ INSTRUMENTS: dict[str, Instrument] = {
 """The instrument of each model."""
 
 LANDMARKS: dict[str, LandmarkKind] = {
-    kind.letter: kind for kinds in ((POINT, UNKNOWN), *(i.landmarks for i in INSTRUMENTS.values())) for kind in kinds
+    kind.letter: kind for kinds in ((UNKNOWN,), *(i.landmarks for i in INSTRUMENTS.values())) for kind in kinds
 }
 """Kinds of landmarks, by the letter of their symbols."""
 
 GENERIC_COLUMNS: dict[str, Column] = {
-    column.names[0]: column
-    for i in INSTRUMENTS.values()
-    for column in i.columns
-    if column.names[0] in i.generic_columns
+    column.names[0]: column for one in INSTRUMENTS.values() for column in one.columns if column.generic
 }
 """Columns that `Measurements.columns` holds, which are kinds of noise too."""

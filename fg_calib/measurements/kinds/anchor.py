@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fg_calib.initialization import anchors_from_lengths, offset_from_lengths
-from fg_calib.inputs import Floats, ProblemError
+from fg_calib.inputs import Floats
 from fg_calib.measurements import Coincidence, Landmark, LandmarkKind, Landmarks, Length, Table
 from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Kinds, Quantity
 
@@ -70,13 +70,8 @@ class AnchorGauge(Instrument):
 
     def kinds(self, table: Table) -> Kinds:
         """See `Instrument.kinds`."""
-        m = table.measurements
-        there = self.names(m, ANCHOR).index >= 0
-        contact = np.zeros(len(there), dtype=np.bool_) if m.length is None else m.length == 0.0
-        fitted = there & ~m.test
-        if table.offset and fitted.any() and contact[fitted].all():
-            raise ProblemError(m.source, "contacts alone: all distances are 0", "lengths, or no offset to be estimated")
-        contact &= not table.offset
+        m, there = table.measurements, self.names(table.measurements, ANCHOR).index >= 0
+        contact = (np.zeros(1) if m.length is None or table.offset else m.length == 0.0).astype(np.bool_)
         return [(AnchorDistance(), there & ~contact), (AnchorContact(), there & contact)]
 
     def landmark(self, table: Table, kind: LandmarkKind, name: str) -> Landmark:
@@ -87,24 +82,19 @@ class AnchorGauge(Instrument):
 
     def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """What each table adds, from its rows alone; then anchors from all tables. See `Instrument.start_landmarks`."""
-        at = landmarks.start
-        lengths = []
+        at, lengths = landmarks.start, []
         for block, there in zip(blocks, points, strict=True):
-            length = np.zeros(block.n) if block.kind.is_contact else block.data[:, 0]
-            if not block.kind.is_contact:
-                offset = block.nuisances[0, 3]
+            length = np.zeros(block.n)
+            if block.kind.width:
+                length, offset = block.data[:, 0], block.nuisances[0, 3]
                 if np.isnan(at[offset]):
-                    places, anchor = np.unique(block.nuisances[:, 0], return_inverse=True)
-                    known = at[places[:, None] + np.arange(3)]
-                    at[offset] = offset_from_lengths(there, length, anchor.ravel(), known)
+                    at[offset] = offset_from_lengths(there, length, block.nuisances[:, :3], at)
                     landmarks.start_at(offset, at[[offset]])
                 length = length - at[offset]
             lengths.append(length)
-        places, anchor = np.unique(np.concatenate([block.nuisances[:, 0] for block in blocks]), return_inverse=True)
-        known = at[places[:, None] + np.arange(3)]
-        found = anchors_from_lengths(np.concatenate(points), np.concatenate(lengths), anchor.ravel(), known)
-        for coordinate, place in zip(places.tolist(), found, strict=True):
-            landmarks.start_at(coordinate, place)
+        anchor = np.concatenate([block.nuisances[:, :3] for block in blocks])
+        for coordinates, place in anchors_from_lengths(np.concatenate(points), np.concatenate(lengths), anchor, at):
+            landmarks.start_at(coordinates[0], place)
 
 
 INSTRUMENTS = (AnchorGauge(),)

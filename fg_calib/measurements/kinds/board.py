@@ -74,12 +74,10 @@ class BoardPose(Kind):
         D[:, 0, :3, :3], N[:, :3, :3] = -rotated, rotated @ left_jacobian(v)
         return Rows(np.concatenate([r, place - data[:, 9:]], axis=1), D, N)
 
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """`Exp(n) R^T B` and `R^T (b - p) + n`. See `Kind.simulate`."""
-        error, board = (Rotation.from_rotvec(v[:, :3]).as_matrix() for v in (noise, nuisances))
-        R = error @ np.swapaxes(at.rotation[:, 0], 1, 2) @ board
-        place = point_in_camera(at, nuisances, np.zeros((len(R), 3)))[0] + noise[:, 3:]
-        return np.hstack([R.reshape(-1, 9), place])
+    def predict(self, at: Frames, nuisances: Floats) -> Floats:
+        """See `Kind.predict`."""
+        R = np.swapaxes(at.rotation[:, 0], 1, 2) @ Rotation.from_rotvec(nuisances[:, :3]).as_matrix()
+        return np.hstack([R.reshape(-1, 9), point_in_camera(at, nuisances, np.zeros((len(R), 3)))[0]])
 
 
 def start_boards(start: FrameStart, rows: Integers, first: Integers, choices: tuple[Floats, Floats]) -> None:

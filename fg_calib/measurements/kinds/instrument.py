@@ -27,8 +27,8 @@ Blocks = Sequence[MeasurementBlock]
 Kinds = Sequence[tuple[Kind, Booleans]]
 """Kinds of measurement, each with the rows that it has, shape (n_configurations,)."""
 
-Places = Callable[[LandmarkKind, str], Floats]
-"""Coordinates of a landmark, by its kind and name."""
+Places = Callable[[LandmarkKind, Sequence[str]], Any]
+"""Coordinates of landmarks by kind and names, shape (n, size)."""
 
 
 class Column(NamedTuple):
@@ -38,8 +38,8 @@ class Column(NamedTuple):
         names: Their names.
         unit: `length`, `angle`, `pixel`, or empty of names and pure numbers.
         meaning: What they are.
-        generic: Whether the reader of tables puts them into `Measurements.columns` (of `sigma_...` into `sigmas`) by
-            their first name, as no field of `Measurements` is theirs.
+        generic: Whether the reader of tables puts them into `Measurements.columns` by their first name, and what
+            `sigma_...` says of them into `sigmas`, as no field of `Measurements` is theirs.
     """
 
     names: tuple[str, ...]
@@ -108,7 +108,7 @@ class Instrument:
     optional_labels: ClassVar[tuple[str, ...]] = ()
     noise: tuple[str, ...] = ()
     landmarks: tuple[LandmarkKind, ...] = ()
-    options: ClassVar[tuple[str, ...]] = ()
+    options: tuple[str, ...] = ()
     uses_pairs: ClassVar[bool] = False
     is_pose: ClassVar[bool] = False
     sees_position: bool = True
@@ -119,7 +119,7 @@ class Instrument:
     @property
     def generic_columns(self) -> tuple[str, ...]:
         """Names of the columns that `Measurements.columns` holds."""
-        return tuple(c.names[0] for c in self.columns if c.generic and not c.names[0].startswith("sigma_"))
+        return tuple(column.names[0] for column in self.columns if column.generic)
 
     @property
     def measured(self) -> tuple[Quantity, ...]:
@@ -141,15 +141,15 @@ class Instrument:
         Raises:
             ProblemError: A column that must say so is missing.
         """
-        n, column = m.n_configurations, kind.label
-        if kind.is_one or (column not in m.labels and column not in self.optional_labels):
-            return Labels((kind.of(m.source) if kind.is_one else kind.name,), np.zeros(n, dtype=np.int64))
-        if column in m.labels:
+        column, every = kind.label, np.zeros(m.n_configurations, dtype=np.int64)
+        if column in m.labels and not kind.is_one:
             return m.labels[column]
+        if kind.is_one or column not in self.optional_labels:
+            return Labels((kind.of(m.source) if kind.is_one else kind.name,), every)
         if self.sees_landmarks:
             found, expected = f"no column {column}", f"the name of a {column} for model {self.model}"
             raise ProblemError(m.source, found, expected)
-        return Labels((), np.full(n, -1))
+        return Labels((), every - 1)
 
     def landmark(self, table: Table, kind: LandmarkKind, name: str) -> Landmark:
         """A landmark as a table has it."""
@@ -210,8 +210,13 @@ class Instrument:
         for kind, chosen in kinds:
             rows = np.flatnonzero(chosen & ~np.isnan(data).any(axis=1))
             if len(rows):
-                arrays = data[rows, : kind.width], self.sigma(m, rows), nuisances[rows, : kind.n_nuisances]
-                found.append(MeasurementBlock.of_rows(kind, table, number, rows, *arrays, **self.more(table, rows)))
+                fields: dict[str, Any] = {
+                    "nuisances": np.ascontiguousarray(nuisances[rows, : kind.n_nuisances]),
+                    "test": m.test[rows],
+                }
+                fields |= {"source": m.source, **self.more(table, rows)}
+                arrays = data[rows, : kind.width], self.sigma(m, rows)
+                found.append(MeasurementBlock.of_rows(kind, number, rows, *arrays, **fields))
         return found
 
     def more(self, table: Table, rows: Any) -> dict[str, Any]:
@@ -219,7 +224,7 @@ class Instrument:
         labels = table.measurements.labels.get(self.landmarks[0].label) if self.landmarks else None
         return {} if labels is None else {"of": labels.of(rows)}
 
-    def _nuisances(self, m: Measurements, kinds: Kinds, of: Callable[[LandmarkKind, Sequence[str]], Any]) -> Floats:
+    def _nuisances(self, m: Measurements, kinds: Kinds, of: Places) -> Floats:
         """What landmarks have, by kind and names, for each row, shape (n_configurations, n_nuisances)."""
         found = [np.zeros((m.n_configurations, 0))]
         for kind in self.landmarks if any(kind.n_nuisances for kind, _ in kinds) else ():
@@ -239,14 +244,13 @@ class Instrument:
             places: Where the landmarks are.
         """
         kinds, n = self.kinds(Table(m, self.model)), m.n_configurations
-        nuisances = self._nuisances(m, kinds, lambda kind, names: np.array([places(kind, name) for name in names]))
+        nuisances = self._nuisances(m, kinds, places)
         sizes = [math.prod(of.shape) for of in self.measured]
         data = np.zeros((n, sum(sizes)))
         for kind, chosen in (each for each in kinds if each[1].any()):
             rows = np.flatnonzero(chosen)
             at = Frames(poses.rotation[rows, None], poses.position[rows, None])
-            nothing, noise = np.zeros((len(rows), kind.width)), np.zeros((len(rows), kind.residual_dim))
-            data[rows, : kind.width] = kind.simulate(at, nothing, nuisances[rows, : kind.n_nuisances], noise)
+            data[rows, : kind.width] = kind.predict(at, nuisances[rows, : kind.n_nuisances])
         parts = np.split(data, np.cumsum(sizes)[:-1], axis=1) if sizes else []
         return m.with_values({of.field: v.reshape(n, *of.shape) for of, v in zip(self.measured, parts, strict=True)})
 

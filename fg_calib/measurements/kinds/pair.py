@@ -1,4 +1,4 @@
-"""Distances and angles between configurations, measured directly, or formed from measured poses."""
+"""Distances and angles between configurations, measured or formed from measured poses; contact points."""
 
 from __future__ import annotations
 
@@ -7,10 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fg_calib.initialization import FrameStart
-from fg_calib.inputs import Floats, ProblemError, escaped, once
+from fg_calib.inputs import PAIR_MODELS, Floats, ProblemError, once
 from fg_calib.measurements import (
+    Coincidence,
     Frames,
     Kind,
+    Labels,
+    Landmark,
+    LandmarkKind,
     Landmarks,
     Length,
     MeasurementBlock,
@@ -18,19 +22,43 @@ from fg_calib.measurements import (
     Pairs,
     Rows,
     Table,
-    are_same,
     directions,
     form_pairs,
     no_pairs,
     stack,
 )
-from fg_calib.measurements.kinds.contact import POINT, SamePoint, contact_blocks
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, Quantity
 from fg_calib.measurements.kinds.pose import ORIENTATION, POSE_COLUMNS, POSITION
-from fg_calib.robot import Poses, kernels
+from fg_calib.robot import Poses, kernels, over_spans
 
-MAX_NAMED = 5
-"""Columns without a meaning that a warning names."""
+POINT = LandmarkKind("L", "point", "the unknown contact points", "Contact points (in the base frame), mm")
+
+
+class SamePoint(Coincidence):
+    """`p_B - p_A` in the base frame, up to a rotation, [m]: a distance of zero between configurations.
+
+    Its derivative in a parameter is `dp_B - dp_A` minus `a x (p_B - p_A)`: all vectors may be rotated by one rotation a
+    of each column without changing their lengths, so by one that undoes motions of the base.
+    """
+
+    ends, turned_back = 2, True
+    code = kernels.SAME_POINT
+
+
+class TouchedPoint(Coincidence):
+    """`p - point` in the base frame, up to a rotation as of `SamePoint`, [m]. Nuisances: the point, [m]."""
+
+    names = ("point.x", "point.y", "point.z")
+    ends, n_nuisances, turned_back = 1, 3, True
+
+
+class PointDistance(Length):
+    """The distance from one point to another; no configuration takes part.
+
+    Data: the distance, [m]. Nuisances: the points, 6 coordinates, [m].
+    """
+
+    ends, n_nuisances = 0, 6
 
 
 class Distance(Length):
@@ -65,11 +93,6 @@ class RotationAngle(Kind):
         D[:, 0, 0, :3], D[:, 1, 0, :3] = -k, k
         return Rows(angle[:, None] - data[:, :1], D)
 
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """With the sign ambiguity of angles at 0 and 180 degrees. See `Kind.simulate`."""
-        angle = np.abs(super().simulate(at, data, nuisances, noise))
-        return np.pi - np.abs(np.pi - angle)
-
 
 class PairQuantity(NamedTuple):
     """What is measured between two configurations.
@@ -93,17 +116,19 @@ PAIR_QUANTITIES = (
 )
 
 
-def usable_pairs(table: Table, wanted: tuple[bool, bool]) -> Pairs:
-    """The pairs of a table with something to use; each measurement has its sigma.
+def quantities_of(model: str | None) -> list[PairQuantity]:
+    """The quantities of pairs that a model uses."""
+    wanted = PAIR_MODELS.get(model or "", (False, False))
+    return [of for of, use in zip(PAIR_QUANTITIES, wanted, strict=True) if use]
 
-    Args:
-        table: The table.
-        wanted: Whether distances and angles take part.
+
+def usable_pairs(table: Table) -> Pairs:
+    """The pairs of a table with something to use; each measurement has its sigma.
 
     Raises:
         ProblemError: Poses to form pairs from are missing, or a sigma is.
     """
-    m, quantities = table.measurements, [of for of, use in zip(PAIR_QUANTITIES, wanted, strict=True) if use]
+    m, quantities = table.measurements, quantities_of(table.model)
     lacking = [of.pose for of in quantities if m.value(of.pose.field) is None]
     if m.pairs is not None:
         pairs = m.pairs
@@ -121,6 +146,14 @@ def usable_pairs(table: Table, wanted: tuple[bool, bool]) -> Pairs:
             raise ProblemError(pairs.source, f"no sigma for {of.name}", f"noise.{noise} or a column sigma_{noise}")
         measured |= there
     return pairs if measured.all() else pairs.select(measured)
+
+
+def missing_values(table: Table) -> list[str]:
+    """A sentence on each quantity that the model uses and no measured pair of a table has: a misspelt column?"""
+    pairs = table.measurements.pairs
+    lacking = [of for of in quantities_of(table.model) if pairs is not None and np.isnan(getattr(pairs, of.name)).all()]
+    of_table = f"{table.measurements.source}: no pair has a value of"
+    return [f"{of_table} {of.name}; is a column misspelt? model: {of.other} needs none" for of in lacking]
 
 
 class PairGauge(Instrument):
@@ -142,8 +175,8 @@ class PairGauge(Instrument):
     def __init__(self, model: str, distance: bool, angle: bool) -> None:
         self.model, self.words = model, " and ".join(["distances"] * distance + ["angles"] * angle)
         self.sees_position, self.sees_orientation = distance, angle
-        self.noise = ("distance",) * distance + ("angle",) * angle
-        self.landmarks = (POINT,) * distance
+        self.noise = tuple(of.name for of in quantities_of(model))
+        self.landmarks, self.options = (POINT,) * distance, ("group",) * distance
         self.quantities = (ORIENTATION,) * angle + (POSITION,) * distance
 
     def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
@@ -155,47 +188,40 @@ class PairGauge(Instrument):
         Raises:
             ProblemError: Poses to form pairs from are missing, or a sigma is.
         """
-        m, wanted = table.measurements, (self.sees_position, self.sees_orientation)
-        formed, pairs = m.pairs is None, usable_pairs(table, wanted)
-        used = [of for of, use in zip(PAIR_QUANTITIES, wanted, strict=True) if use]
+        q, formed, pairs = table.measurements.readings, table.measurements.pairs is None, usable_pairs(table)
+        used, found = quantities_of(self.model), list[MeasurementBlock]()
         values, sigmas = (np.stack([getattr(pairs, s + of.name) for of in used], axis=1) for s in ("", "sigma_"))
         there = np.isfinite(values)
-        point = np.zeros(pairs.n_pairs, dtype=np.bool_)
-        if self.sees_position and not formed:
-            point = values[:, 0] == 0.0
-            there[point, 0] = False
-        same, found = are_same(m.readings, pairs.a, pairs.b), list[MeasurementBlock]()
-        pair_kind = stack(*(of.kind for of in used))
-        for kind, rows in ((pair_kind, np.flatnonzero(there.any(axis=1))), (SamePoint(), np.flatnonzero(point))):
+        point = (values[:, 0] == 0.0) & (self.sees_position and not formed)
+        there[point, 0] = False
+        spans = over_spans(lambda i, j: np.all(q[pairs.a[i:j]] == q[pairs.b[i:j]], axis=1), pairs.n_pairs)
+        same = np.concatenate([np.zeros(0, dtype=np.bool_), *spans])
+        for kind, chosen in ((stack(*(of.kind for of in used)), there.any(axis=1)), (SamePoint(), point)):
+            rows = np.flatnonzero(chosen)
             if not len(rows):
                 continue
-            of_pairs = kind is pair_kind
-            data, sigma = np.nan_to_num(values[rows, : kind.width]), sigmas[rows, : None if of_pairs else 1]
+            data, sigma = np.nan_to_num(values[rows, : kind.width]), sigmas[rows, : max(1, kind.width)]
             fields: dict[str, Any] = {
                 "ends": np.stack([pairs.a[rows], pairs.b[rows]], axis=1),
                 "test": pairs.test[rows],
                 "formed": formed,
                 "excluded": {"same_configuration": same[rows]},
                 "source": pairs.source,
-            } | ({"measured": there[rows]} if of_pairs else {})
+            } | ({"measured": there[rows]} if kind.width else {})
             sigma = once(np.zeros_like(data) if formed else sigma)
-            numbers = rows.astype(pairs.a.dtype)
-            found.append(MeasurementBlock.of_rows(kind, table, number, numbers, data, sigma, **fields))
+            found.append(MeasurementBlock.of_rows(kind, number, rows.astype(pairs.a.dtype), data, sigma, **fields))
         return found + (contact_blocks(table, number, landmarks) if self.sees_position else [])
 
     def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
         """The tool point from distances of pairs, or from touches of the same points where none was measured."""
-        for block in blocks:
+        for block in sorted(blocks, key=lambda block: -block.kind.ends):
+            train = np.flatnonzero(block.measured[:, 0] & ~block.test)
             if block.kind.ends == 2 and block.kind.quantity == "distance" and not block.kind.is_contact:
-                rows = np.flatnonzero(block.measured[:, 0] & ~block.test)
-                a, b = block.ends[rows].T
-                start.tool_from_distances(a, b, block.data[rows, 0])
-                return
-        for block in blocks:
+                start.tool_from_distances(block.ends[train], block.data[train, 0])
+                break
             if block.kind.ends == 1:
-                train = np.flatnonzero(~block.test)
                 start.tool_from_contacts(block.ends[train, 0], block.nuisances[train, 0])
-                return
+                break
 
     def predict(self, m: Measurements, poses: Poses, places: Places) -> Measurements:
         """Pairs are formed from the poses as they are. See `Instrument.predict`."""
@@ -207,23 +233,32 @@ class PairGauge(Instrument):
         return "position" if m.groups is not None and m.pairs is None and m.position is None else self.model
 
 
-INSTRUMENTS = (
-    PairGauge("distance", distance=True, angle=False),
-    PairGauge("rotation", distance=False, angle=True),
-    PairGauge("distance-rotation", distance=True, angle=True),
-)
+def contact_blocks(table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
+    """Contacts, and distances between contact points.
+
+    Raises:
+        ProblemError: A sigma is missing.
+    """
+    m, groups = table.measurements, table.measurements.groups
+    if groups is None:
+        return []
+    found, rows, pairs = list[MeasurementBlock](), np.flatnonzero(groups.index >= 0), groups.pairs
+    place = landmarks.add([Landmark(POINT, name, np.full(3, np.nan)) for name in groups.names], m.source)
+    if len(rows):
+        if m.sigma_point is None or not np.isfinite(m.sigma_point[rows]).all():
+            raise ProblemError(m.source, "no sigma for touched points", "noise.point or a column sigma_point")
+        touched = groups.index[rows]
+        fields: dict[str, Any] = {"nuisances": place[touched], "of": Labels(groups.names, touched), "source": m.source}
+        arrays = rows, np.zeros((len(rows), 0)), m.sigma_point[rows, None]
+        found.append(MeasurementBlock.of_rows(TouchedPoint(), number, *arrays, test=m.test[rows], **fields))
+    if n := pairs.n_pairs:
+        if not np.isfinite(pairs.sigma_distance).all():
+            raise ProblemError(pairs.source, "no sigma for distance", "noise.distance or a column sigma_distance")
+        fields = {"ends": np.zeros((n, 0), dtype=np.int64), "nuisances": np.hstack([place[pairs.a], place[pairs.b]])}
+        arrays = np.arange(n), pairs.distance[:, None], pairs.sigma_distance[:, None]
+        fields |= {"test": pairs.test, "source": pairs.source}
+        found.append(MeasurementBlock.of_rows(PointDistance(), number, *arrays, **fields))
+    return found
 
 
-def missing_values(table: Table) -> list[str]:
-    """A sentence on each quantity that the model uses and no measured pair of a table has: a misspelt column?"""
-    pairs, instrument = table.measurements.pairs, next((i for i in INSTRUMENTS if i.model == table.model), None)
-    sentences: list[str] = []
-    if pairs is None or not pairs.n_pairs or instrument is None:
-        return sentences
-    for of in PAIR_QUANTITIES:
-        if of.name in instrument.noise and np.isnan(getattr(pairs, of.name)).all():
-            unused = ", ".join(map(escaped, pairs.unused[:MAX_NAMED]))
-            article, unused = "an" if of.name == "angle" else "a", f" (columns {unused} are not used)" * bool(unused)
-            found = f"{pairs.source}: no pair has {article} {of.name}, of which model {table.model} makes use"
-            sentences.append(f"{found}; is a column misspelt{unused}? model: {of.other} says that there is none")
-    return sentences
+INSTRUMENTS = tuple(PairGauge(model, *wanted) for model, wanted in PAIR_MODELS.items())

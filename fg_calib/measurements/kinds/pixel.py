@@ -6,21 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.initialization import Camera, FrameStart, boards_from_image
+from fg_calib.initialization import Camera, Frame, FrameStart, boards_from_image
 from fg_calib.inputs import Floats, Integers, ProblemError
 from fg_calib.measurements import Frames, Kind, Labels, Landmarks, MeasurementBlock, Measurements, Rows, Table
 from fg_calib.measurements.kinds.board import BOARD, BOARD_COLUMN, point_in_camera, start_boards
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Kinds, Quantity
 from fg_calib.measurements.kinds.pose import point_on_tool
 
-MAX_CHOICES = 2
-"""Poses of a board that one image may leave, at most."""
-
 MAX_IMAGES = 60
-"""Images of a board that it is started from: more would not make the start better."""
-
-GOOD_SHARE = 0.5
-"""Share of the points of a board's fullest image from which another is good for a start: a few corners say little."""
+"""Images of a board that it is started from, the fullest: more would not make the start better."""
 
 
 class Pixel(Kind):
@@ -116,30 +110,25 @@ def _poses_of_images(
         ProblemError: No image shows enough of a board.
     """
     _, first, of = np.unique(table.measurements.ids, return_index=True, return_inverse=True)
-    place = first[of.ravel()]  # the first row of each one's configuration
     board = block.nuisances[:, 0] if block.kind.n_nuisances else np.zeros(block.n, dtype=np.int64)
-    which = np.stack([place[block.ends[:, 0]], board], axis=1)[~block.test]
-    image, of = np.unique(which, axis=0, return_inverse=True)
-    train = np.flatnonzero(~block.test)[np.argsort(of.ravel(), kind="stable")]
-    shown = np.bincount(of.ravel(), minlength=len(image))
-    used = list[int]()
-    for name in np.unique(image[:, 1]):
-        of_board = image[:, 1] == name
-        good = np.flatnonzero(of_board & (shown >= GOOD_SHARE * shown[of_board].max()))
-        used += np.unique(good[np.linspace(0, len(good) - 1, min(MAX_IMAGES, len(good))).round().astype(int)]).tolist()
-    corners = np.split(train, np.cumsum(shown)[:-1])
-    rows, boards, poses = [], [], []
-    for k in sorted(used):
-        found = boards_from_image(camera, block.data[corners[k]], block.sigma[corners[k]])
-        if found:
-            rows.append(block.ends[corners[k][0], 0])
-            boards.append(image[k, 1])
-            poses.append([frame for _, frame in (found + found)[:MAX_CHOICES]])
+    which = np.stack([first[of.ravel()][block.ends[:, 0]], board], axis=1)  # the first row of each configuration
+    train, poses = np.flatnonzero(~block.test), list[tuple[int, int, list[Frame]]]()
+    images, of = np.unique(which[train], axis=0, return_inverse=True)
+    corners = np.split(train[np.argsort(of.ravel(), kind="stable")], np.cumsum(np.bincount(of.ravel()))[:-1])
+    for one in np.unique(board[train]).tolist():
+        of_board = [k for k in range(len(images)) if images[k, 1] == one]
+        for k in sorted(sorted(of_board, key=lambda k: -len(corners[k]))[:MAX_IMAGES]):
+            found = boards_from_image(camera, block.data[corners[k]], block.sigma[corners[k]])
+            if found:  # two poses, or one twice
+                poses.append((block.ends[corners[k][0], 0], one, [frame for _, frame in (found + found)[:2]]))
     if not poses:
         expected = "four points or more that are not on a line"
         raise ProblemError(block.source, "no image of a board to start from", expected)
-    rotations = np.array([[pose.rotation for pose in each] for each in poses])
-    return np.array(rows), np.array(boards), (rotations, np.array([[p.translation for p in each] for each in poses]))
+    rows, boards, choices = zip(*poses, strict=True)
+    rotations, places = (
+        np.array([[getattr(f, of) for f in each] for each in choices]) for of in ("rotation", "translation")
+    )
+    return np.array(rows), np.array(boards), (rotations, places)
 
 
 def _corners(m: Measurements) -> Labels:

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization import Frame, FrameStart, targets_from_positions
-from fg_calib.inputs import Floats
+from fg_calib.inputs import POSE_MODELS, Floats
 from fg_calib.measurements import Frames, Kind, LandmarkKind, Landmarks, Rows, Table, stack
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Kinds, Quantity
 from fg_calib.robot import cross_matrix, inverse_right_jacobian, kernels
@@ -97,9 +97,9 @@ class Orientation(Kind):
         D[:, 0, :, :3] = inverse_right_jacobian(r) @ R_T
         return Rows(r, D)
 
-    def simulate(self, at: Frames, data: Floats, nuisances: Floats, noise: Floats) -> Floats:
-        """`R Exp(noise)`: errors about the tool's axes. See `Kind.simulate`."""
-        return (at.rotation[:, 0] @ Rotation.from_rotvec(noise).as_matrix()).reshape(-1, 9)
+    def predict(self, at: Frames, nuisances: Floats) -> Floats:
+        """See `Kind.predict`."""
+        return at.rotation[:, 0].reshape(-1, 9)
 
 
 class PoseTracker(Instrument):
@@ -154,8 +154,4 @@ class PoseTracker(Instrument):
         start.set_frame(frame)
 
 
-INSTRUMENTS = (
-    PoseTracker("pose", orientation=True, position=True),
-    PoseTracker("position", orientation=False, position=True),
-    PoseTracker("orientation", orientation=True, position=False),
-)
+INSTRUMENTS = tuple(PoseTracker(model, *uses) for model, uses in POSE_MODELS.items())
