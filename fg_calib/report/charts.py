@@ -50,11 +50,9 @@ def tag(name: str, content: str = "", **attributes: str | float) -> str:
         content: Elements, or text that has been escaped.
         attributes: By name, a trailing _ removed; numbers are coordinates, in few characters.
     """
-    plain = [
-        f' {key.rstrip("_")}="{escape(escaped(value)) if isinstance(value, str) else f"{round(value, 1):g}"}"'
-        for key, value in attributes.items()
-    ]
-    return f"<{name}{''.join(plain)}>{content}</{name}>"
+    plain = (escape(escaped(v)) if isinstance(v, str) else f"{round(v, 1):g}" for v in attributes.values())
+    shown = [f' {key.rstrip("_")}="{value}"' for key, value in zip(attributes, plain, strict=True)]
+    return f"<{name}{''.join(shown)}>{content}</{name}>"
 
 
 def title(text: str) -> str:
@@ -159,10 +157,6 @@ class Plot:
 
     def _words(self, x: float, y: float, text: str, kind: str, **attributes: str) -> None:
         self._add("text", escape(escaped(text)), x=x, y=y, class_=kind, **attributes)
-
-    def words(self, x: float, y: float, text: str) -> None:
-        """Words to the right of a place."""
-        self._words(self.x(x) + 5.0, self.y(y) + 3.5, text, "tick")
 
     def line(self, x: tuple[float, float], y: float, kind: str) -> None:
         """A line from left to right at a height."""

@@ -13,11 +13,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from fg_calib import __version__
 from fg_calib.baseline import ESTIMATORS, Comparison, Estimate
 from fg_calib.diagnostics import probability
 from fg_calib.inputs import LIMITED, InputError, checked
-from fg_calib.io import Result, Run, fill_folder, write_text
+from fg_calib.io import Result, Run
 from fg_calib.monitoring import Check, Explanation
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, figure, in_words, line, section, table_of
@@ -39,15 +38,14 @@ def build_comparison_report(comparison: Comparison) -> Group:
     judged = f"judged at {comparison.n_judged} {comparison.judged_on} configurations"
     nominal = ("  nominal", "the arm before the calibration, tool and measurement frame fitted where unknown")
     estimators = [(f"  {e.name}", f"{ESTIMATORS[e.name]}; {e.message}") for e in comparison.estimates]
-    truth, values = ["truth|>"] * (job.truth is not None), [f"{e.name}|>" for e in comparison.estimates]
+    values = [f"{e.name}|>" for e in comparison.estimates]
+    columns = ("", "|unit", *["truth|>"] * (job.truth is not None), *values)
     return tables.report(
         line(f"{job.robot.name}: {job.model}, {judged}"),
         *(line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings),
         line(""),
         table_of(("", "|unit", "nominal|>", *values), _quantities(comparison)),
-        *section(
-            "Corrections (± sigma)", table_of(("", "|unit", *truth, *values), _corrections(comparison), wrap=True)
-        ),
+        *section("Corrections (± sigma)", table_of(columns, _corrections(comparison), wrap=True)),
         *section("Estimators", table_of(("", ""), [nominal, *estimators], wrap=True)),
         *section("Notes", *_comparison_notes(comparison)),
     )
@@ -94,9 +92,8 @@ def _large(value: float | None, unit: str, sign: str = "", unknown: str = "-") -
     """A value with a decimal less than usual, or in powers of ten where an estimate diverged; a count as it is."""
     if isinstance(value, int):
         return str(value)
-    decimals = tables.SHOWN.get(unit, (1.0, unit, 6))[2]
     large = value is not None and abs(value) * tables.factor(unit) >= 1e5
-    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{decimals - 1}f", unknown)
+    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{tables.shown_in(unit)[2] - 1}f", unknown)
 
 
 def _comparison_notes(comparison: Comparison) -> Iterator[str]:
@@ -104,10 +101,8 @@ def _comparison_notes(comparison: Comparison) -> Iterator[str]:
         yield "no test rows: judged at the train configurations, which is optimistic for every estimator"
     if comparison.errors_before is None:
         yield "the truth is unknown: no real errors (key truth of a job)"
-    if any(e.robot is not None and len(e.sigma) < len(comparison.estimates[0].sigma) for e in comparison.estimates):
-        yield "where others are fixed a parameter stands for its combination with them: compare errors, not corrections"
-    yield "predicted errors assume that fixed parameters are exact, so they may be too small in the base frame"
-    yield "residuals are of the rows that the graph uses"
+    yield "a parameter whose others are fixed stands for its combination with them: compare errors, not corrections"
+    yield "predicted errors take fixed parameters as exact, so they may be too small in the base frame"
 
 
 @checked
@@ -131,22 +126,19 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     job = comparison.job
     pairs = next((table for table in job.tables if table.uses_pairs), None)
     measured = pairs is not None and pairs.measurements.pairs is not None
-    document: dict[str, Any] = tables.plain(
-        {
-            "schema": "fg-calib/comparison/1",
-            "version": __version__,
-            "robot": job.robot.name,
-            "model": job.model,
-            "frame": "unknown" if any(table.unknown_frame for table in job.tables) else job.tables[0].frame,
-            "pairing": "measured" if measured else None if pairs is None else str(pairs.pairing),
-            **{key: getattr(comparison, key) for key in ("judged_on", "n_judged", "trustworthy", "findings")},
-            "truth_known": job.truth is not None,
-            "nominal": {"residual_rms": comparison.rms_before, "errors": comparison.errors_before},
-            "estimates": [_estimate(comparison, e) for e in comparison.estimates],
-            "inputs": job.inputs,
-        }
+    return tables.document_of(
+        "comparison",
+        comparison,
+        "judged_on n_judged trustworthy findings",
+        robot=job.robot.name,
+        model=job.model,
+        frame="unknown" if any(table.unknown_frame for table in job.tables) else job.tables[0].frame,
+        pairing="measured" if measured else None if pairs is None else str(pairs.pairing),
+        truth_known=job.truth is not None,
+        nominal={"residual_rms": comparison.rms_before, "errors": comparison.errors_before},
+        estimates=[_estimate(comparison, e) for e in comparison.estimates],
+        inputs=job.inputs,
     )
-    return document
 
 
 def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
@@ -165,12 +157,9 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
         for i, p in enumerate(comparison.job.robot.parameters)
         if robot is not None and p.estimated
     ]
-    keys = ("name", "ran", "converged", "message", "iterations", "seconds", "n_estimated", "residual_rms", "errors")
-    return {
-        **{key: getattr(e, key) for key in (*keys, *PREDICTED)},
-        "description": ESTIMATORS[e.name],
-        "parameters": parameters,
-    }
+    own = {key: value for key, value in vars(e).items() if key not in ("robot", "sigma")}
+    more = {"description": ESTIMATORS[e.name], "ran": e.ran, "n_estimated": e.n_estimated, "parameters": parameters}
+    return own | more
 
 
 @checked
@@ -180,9 +169,7 @@ def write_comparison(folder: Path | str, comparison: Comparison) -> None:
     Raises:
         InputError: The folder cannot be written.
     """
-    own = {"comparison.json": b'{\n "schema": "fg-calib/comparison/'}
-    text = tables.json_text(comparison_document(comparison))
-    fill_folder(Path(folder), lambda into: write_text(into / "comparison.json", text), own)
+    tables.write_document(folder, "comparison.json", comparison_document(comparison))
 
 
 def changes(old: Result, new: Result) -> list[dict[str, Any]]:
@@ -212,27 +199,17 @@ def changes_document(old: Result, new: Result, folders: tuple[Path, Path]) -> di
     { "schema": "fg-calib/changes/1", "old": folder, "new": folder,
       "parameters": [{"name", "unit", "old", "new", "change", "sigma", "in_sigma"}] }
     """
-    named = {"old": str(folders[0]), "new": str(folders[1])}
-    return {"schema": "fg-calib/changes/1", **named, "parameters": changes(old, new)}
+    return tables.document_of("changes", old=str(folders[0]), new=str(folders[1]), parameters=changes(old, new))
 
 
 def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -> Group:
     """Two calibrations for the terminal."""
-    rms = [
-        (kind, split, *(in_words(result.rms_after(split).get(kind), result.unit_of(kind)) for result in (old, new)))
-        for split in ("test", "train")
-        for kind in dict.fromkeys((*old.rms_after(split), *new.rms_after(split)))
-    ]
     rows = [tuple(one.values()) for one in changes(old, new)]
+    head: list[Content] = [line(f"OLD  {folders[0]}", "bold"), *summary(old), line("")]
+    head += [line(f"NEW  {folders[1]}", "bold"), *summary(new)]
     columns = ("", "|unit", "old|q", "new|q", "change|q:+", "sigma of it|q", "in sigma|+z.1f")
     return tables.report(
-        line(f"OLD  {folders[0]}", "bold"),
-        *summary(old),
-        line(""),
-        line(f"NEW  {folders[1]}", "bold"),
-        *summary(new),
-        line(""),
-        *section("Residuals after the calibration (RMS)", table_of(("", "rows", "old|>", "new|>"), rms)),
+        *head,
         *section("Parameters", table_of(columns, rows), INDEPENDENT),
     )
 
@@ -251,7 +228,7 @@ def history_document(robot: str, runs: Sequence[Run]) -> dict[str, Any]:
     """The runs of a calibration for programs, in [m] and [rad]."""
     moved = [None, *(_largest_change(*both) for both in pairwise(runs))]
     listed = [run.model_dump(mode="json") | {"moved": most} for run, most in zip(runs, moved, strict=True)]
-    return {"schema": "fg-calib/history/1", "robot": robot, "runs": listed}
+    return tables.document_of("history", robot=robot, runs=listed)
 
 
 def build_history(robot: str, runs: Sequence[Run]) -> Group:
@@ -275,14 +252,12 @@ KINDS = {
     "tool": "the tool",
     "frame": "the measurement frame, or the base",
     "row": "gross errors of one configuration",
-    "parameter": "",
 }
 """What each kind of explanation changes."""
 
-NO_ADVICE = (
-    "no configurations are advised: random ones cannot be measured like these rows (pairs, contacts, fixed lengths), or"
-    " do not distinguish these changes; another instrument may"
-)
+SHOWN_CHANGES = "Joint offset changes that these rows show in 9 of 10 cases"
+
+NO_ADVICE = "no configurations are advised: none like these rows distinguishes these changes; another instrument may"
 
 
 def named(parameters: Sequence[str]) -> str:
@@ -292,12 +267,11 @@ def named(parameters: Sequence[str]) -> str:
 
 def check_document(found: Check) -> dict[str, Any]:
     """A check for programs, in [m] and [rad]."""
-    document: dict[str, Any] = {"schema": "fg-calib/check/1", **tables.plain(found)}
+    document = tables.document_of("check", **vars(found))
     for e in document["explanations"]:
-        for key in ("told_apart_from", "not_told_apart_from"):
-            e[key] = [named(names) for names in e[key]]
+        e |= {key: [*map(named, e[key])] for key in ("told_apart_from", "not_told_apart_from")}
     if document["advice"] is not None:
-        document["advice"]["between"] = [named(names) for names in document["advice"]["between"]]
+        document["advice"]["between"] = [*map(named, document["advice"]["between"])]
     return document
 
 
@@ -310,16 +284,13 @@ def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
     """
     p = "" if found.p_value is None else f", p-value {probability(found.p_value)}"
     chi2 = f"chi-square {found.chi2:.5g} with {found.dof} degrees of freedom{p}, {found.n} measurements"
-    sizes = [
-        f"{name} {'none' if size is None else in_words(size, unit, '.2g')}"
-        for (name, size), unit in zip(found.detectable.items(), joint_units, strict=True)
-    ]
-    evaluated = found.verdict != "not_evaluated"
+    detectable = zip(found.detectable.items(), joint_units, strict=True)
+    sizes = [f"{name} {'none' if of is None else in_words(of, unit, '.2g')}" for (name, of), unit in detectable]
     return tables.report(
         line(*WORDS.get(found.verdict, ("NOT EVALUATED", "bold yellow"))),
         *(*found.reasons, *found.cautions, chi2),
         *section("Errors of the calibrated arm (RMS)", _rms_errors(found)),
-        *section("Joint offset changes that these rows show in 9 of 10 cases", *[", ".join(sizes)] * evaluated),
+        *(section(SHOWN_CHANGES, ", ".join(sizes)) if found.verdict != "not_evaluated" else []),
         *section("What changed", _explanations(found.explanations), *_conclusions(found)),
         *section("What to measure", *_advice(found, joint_units)),
     )
@@ -338,7 +309,7 @@ def _explanations(explanations: Sequence[Explanation]) -> Table:
         several = list(zip(e.change, e.sigma, e.units, strict=True)) if len(e.change) < 3 else []
         change = ", ".join(f"{figure(c, unit, '+')} {tables.unit_shown(unit)}" for c, _, unit in several)
         sigma = ", ".join(figure(s, unit) for _, s, unit in several)
-        rows.append((named(e.parameters), KINDS[e.kind], change, sigma, e.chi2_drop, e.p_value, word))
+        rows.append((named(e.parameters), KINDS.get(e.kind, ""), change, sigma, e.chi2_drop, e.p_value, word))
     columns = ("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", "")
     return table_of(columns, rows, wrap=True)
 
@@ -352,12 +323,11 @@ def _conclusions(found: Check) -> Iterator[str]:
         yield f"not distinguishable by these rows: {', '.join(named(e.parameters) for e in likely)}"
         yield "do not deploy any of these changes yet"
         yield from [NO_ADVICE] * (found.advice is None)
+    elif likely and found.verdict == "fail" and found.deploy:
+        change = likely[0].parameters[0]
+        yield f"no other single change explains the rows: update with --changed {change}, check again"
     elif likely and found.verdict == "fail":
-        update = (
-            f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check again"
-        )
-        remain = "do not deploy: residuals above noise remain after the most likely change"
-        yield update if found.deploy else remain
+        yield "do not deploy: residuals above noise remain after the most likely change"
 
 
 def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
@@ -366,11 +336,9 @@ def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
         return []
     rows = [(*q, apart, sigma) for q, apart, sigma in zip(advice.readings, advice.apart, advice.sigma, strict=True)]
     joints = [f"q{i} [{tables.unit_shown(unit)}]|{unit}:.2f" for i, unit in enumerate(joint_units, start=1)]
-    said = (
-        "measured like the rest, in the same table, these distinguish the changes"
-        if advice.enough
-        else "not even these distinguish all of them: measure more, spread over the whole workspace"
-    )
+    said = "measured like the rest, in the same table, these distinguish the changes"
+    if not advice.enough:
+        said = "not even these distinguish all of them: measure more, spread over the whole workspace"
     a, b = map(named, advice.between)
     least = f"{said} ({advice.needed:.1f} sigma are needed; least apart are {a} and {b})"
     return [table_of((*joints, "apart [mm]|m:.3f", "together [sigma]|.1f"), rows), least]

@@ -28,8 +28,6 @@ from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
 from fg_calib.simulation import instrument_keys, table_columns, to_fill_in
 
-SCHEMA = "fg-calib/design/1"
-
 MAX_POSES_LISTED = 40
 """Poses that the report lists; the table has all."""
 
@@ -39,29 +37,26 @@ UNKNOWN_ABOVE = 10.0
 
 def design_document(design: Design) -> dict[str, Any]:
     """A design for programs, in [m] and [rad]; null for what is unknown."""
-    document: dict[str, Any] = tables.plain(
-        {
-            "schema": SCHEMA,
-            "robot": design.pool.robot.name,
-            "n_given": len(design.pool.given),
-            "fitted": design.task.fitted,
-            "undetermined_share": design.unknown,
-            **{key: getattr(design, key) for key in ("criterion", "n", "target", "reached", "expected", "before")},
-            **{key: getattr(design, key) for key in ("random", "pairings", "travel")},
-            "travel_unordered": design.travel_before,
-            "curve": [{"n": p.n, "designed": p.designed, "random": p.random} for p in design.curve],
-            "candidates": {
-                name or "all": {"asked": one.asked, "taken": len(one.readings), "rejected": one.rejected}
-                for name, one in design.pool.found.items()
-            },
-            "stops": [
-                {"id": name, "table": table or None, "readings": q}
-                for name, table, q in zip(design.ids.tolist(), design.group.tolist(), design.readings, strict=True)
-            ],
-            "undetermined": [{"relation": relation} for relation in design.observability.lost],
-        }
+    return tables.document_of(
+        "design",
+        design,
+        "criterion n target reached expected before random pairings travel",
+        robot=design.pool.robot.name,
+        n_given=len(design.pool.given),
+        fitted=design.task.fitted,
+        undetermined_share=design.unknown,
+        travel_unordered=design.travel_before,
+        curve=[{"n": p.n, "designed": p.designed, "random": p.random} for p in design.curve],
+        candidates={
+            name or "all": {"asked": one.asked, "taken": len(one.readings), "rejected": one.rejected}
+            for name, one in design.pool.found.items()
+        },
+        stops=[
+            {"id": name, "table": table or None, "readings": q}
+            for name, table, q in zip(design.ids, design.group, design.readings, strict=True)
+        ],
+        undetermined=[{"relation": relation} for relation in design.observability.lost],
     )
-    return document
 
 
 def build_design_report(design: Design) -> Group:
@@ -72,12 +67,11 @@ def build_design_report(design: Design) -> Group:
         (f"{p.n}", *map(_size, (p.designed, p.random[1])), " to ".join(map(_size, (p.random[0], p.random[2]))))
         for p in design.curve
     ]
+    columns = ("poses|>", "designed mm|>", "random mm|>", "80 % of random|>")
     return tables.report(
         line(_headline(design), "bold"),
         *section("Expected", *_expected(design)),
-        *section(
-            "Poses and accuracy", table_of(("poses|>", "designed mm|>", "random mm|>", "80 % of random|>"), curve)
-        ),
+        *section("Poses and accuracy", table_of(columns, curve)),
         *section("Which pairs", table_of(("pairs", "expected mm|>", ""), pairs)),
         *section("Where to measure", _poses(design)),
         *section("Notes", *_notes(design)),
@@ -106,12 +100,11 @@ def _expected(design: Design) -> Iterator[str]:
 
 
 def _poses(design: Design) -> Shown:
-    with_table, shown = bool(np.any(design.group != "")), slice(MAX_POSES_LISTED)
-    rows = [
-        (name, *q, *[group or "all others"] * with_table)
-        for name, q, group in zip(design.ids[shown], design.readings[shown], design.group[shown], strict=True)
-    ]
-    return table_of(("pose", *tables.joint_columns(design.pool.robot, ":z.1f"), *["table"] * with_table), rows)
+    with_table = bool(np.any(design.group != ""))
+    tables_of = [[group or "all others"] * with_table for group in design.group]
+    rows = [(name, *q, *of) for name, q, of in zip(design.ids, design.readings, tables_of, strict=True)]
+    columns = ("pose", *tables.joint_columns(design.pool.robot, ":z.1f"), *["table"] * with_table)
+    return table_of(columns, rows, most=MAX_POSES_LISTED)
 
 
 def _notes(design: Design) -> Iterator[str]:
@@ -122,20 +115,13 @@ def _notes(design: Design) -> Iterator[str]:
     yield from map(str, missing_motions(design.pool.robot))
     travel = math.degrees(design.travel), math.degrees(design.travel_before)
     yield f"joint travel along the poses {travel[0]:.0f} deg, {travel[1]:.0f} unordered"
-    if design.n > MAX_POSES_LISTED:
-        yield f"{design.n - MAX_POSES_LISTED} more poses: --out writes them all"
-    position, best = design.expected.position, min(design.pairings, key=lambda name: design.pairings[name], default="")
-    if best and design.pairings[best] < 0.95 * (position or math.inf):
-        yield f"pairing: {best} in the job is more accurate with the same measurements"
     if lost := len(design.observability.lost):
         yield f"not identifiable: {lost} directions; fg-calib observe says which and why"
-    if position is None:
-        yield "the error over the task depends on what the measurements do not determine"
     if design.target is not None and not design.reached:
         yield "more poses (--n, --candidates), lower noise, other measurements or a wider range of poses would reach it"
     if design.asked is not None and design.n < design.asked:
         yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
-    if design.after_fit is not None and (design.after_fit.position or math.inf) < 0.5 * (position or 0.0):
+    if design.after_fit is not None and (design.after_fit.position or math.inf) < 0.5 * (design.expected.position or 0):
         best_fit = f"after the best rigid fit {_pose(design.after_fit)}"
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
 
@@ -239,7 +225,7 @@ def _files_before(folder: Path) -> dict[str, str]:
     path = folder / _DOCUMENT
     with suppress(ValueError, TypeError, KeyError, AttributeError, InputError):  # none, or changed manually
         document = json.loads(read_text(path)) if exists(path) else {}
-        if document["schema"] == SCHEMA:
+        if document["schema"] == "fg-calib/design/1":
             return {name: digest for name, digest in document["files"].items() if Path(name).name == name}
     return {}
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fg_calib.inputs import Booleans, Floats
-from fg_calib.observability import Identifiability
 from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of
-from fg_calib.report.tables import factor, in_words, unit_shown
+from fg_calib.report.tables import factor, unit_shown
 from fg_calib.report.text import ReportData
 from fg_calib.simulation import link_points
 
@@ -42,26 +41,12 @@ def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
     """All figures of a calibration by name, in the order of the page; none where its tables lack them."""
     space = None if data.result.evaluated_only else data.workspace
     return {
-        "accuracy": [accuracy_bars(data)],
         "parameters": parameter_whiskers(data),
         "residuals": residual_charts(data),
         "joints": error_over_joints(data),
         "correlations": correlation_matrix(data),
         "workspace": error_slices(space.errors.position, space.expected[:, 0], space.measured) if space else [],
     }
-
-
-def accuracy_bars(data: ReportData) -> Chart:
-    """RMS residuals before and after, by kind, as shares of the larger of both."""
-    kinds = {kind: rms for kind, rms in data.result.residual_rms[data.split].items() if rms is not None}
-    both = [(kind, when) for kind in kinds for when in ("before", "after")]
-    bars = [(f"{kind} {when}", kind, getattr(kinds[kind], when) or 0.0) for kind, when in both]
-    plot = Plot((0.0, 1.3), [name for name, _, _ in bars] or [""], ("of the larger of both", ""))
-    for k, (name, kind, value) in enumerate(bars):
-        share = value / (max(other for _, of, other in bars if of == kind) or 1.0)
-        plot.box((0.0, share), (k - 0.4, k + 0.4), class_=name.rsplit(" ", 1)[1])
-        plot.words(share, k, in_words(value, data.result.unit_of(kind)))
-    return plot.chart(f"RMS residuals of {data.split} rows before and after the calibration")
 
 
 def error_over_joints(data: ReportData) -> list[Chart]:
@@ -122,20 +107,15 @@ def correlation_matrix(data: ReportData) -> list[Chart]:
     most = np.max(np.abs(np.nan_to_num(rho + rho.T)), axis=1)
     chosen = np.sort(np.argsort(-most, kind="stable")[:MAX_PARAMETERS])
     more = "" if len(chosen) == len(known) else f"; the {len(chosen)} most correlated of {len(known)}"
-    labels, caption = [names[known[k]] for k in chosen], "Correlations of the errors: orange positive, blue negative"
-    return [_matrix(labels, labels, rho[np.ix_(chosen, chosen)], caption + more)]
-
-
-def _matrix(rows: Sequence[str], columns: Sequence[str], values: Floats, caption: str) -> Chart:
-    """A matrix of values from -1 to 1: blue where negative, orange where positive, strong where large."""
-    plot = Plot(columns, rows, ("", ""))
-    for (i, j), value in np.ndenumerate(values):
+    labels, rho = [names[known[k]] for k in chosen], rho[np.ix_(chosen, chosen)]
+    plot = Plot(labels, labels, ("", ""))
+    for (i, j), value in np.ndenumerate(rho):
         if abs(value) > 0.02:
-            about = f"{rows[i]}, {columns[j]}: {value:+.2f}" if abs(value) > 0.5 else ""
+            about = f"{labels[i]}, {labels[j]}: {value:+.2f}" if abs(value) > 0.5 else ""
             sides = (j - 0.46, j + 0.46), (i - 0.46, i + 0.46)
             kind = "plus" if value > 0.0 else "minus"
             plot.box(*sides, about, class_=kind, opacity=f"{min(1.0, abs(value)):.2f}")
-    return plot.chart(caption)
+    return [plot.chart(f"Correlations of the errors: orange positive, blue negative{more}")]
 
 
 def residual_charts(data: ReportData) -> list[Chart]:
@@ -230,25 +210,6 @@ def _draw_cells(plot: Plot, at: Floats, error: Floats, edges: Floats) -> None:
     for i, j in np.argwhere(n > 0).tolist():
         colour = charts.RAMP[int(np.searchsorted(edges[1:-1], np.sqrt(squares[i, j] / n[i, j])))]
         plot.box((x[i], x[i + 1]), (y[j], y[j + 1]), fill=colour)
-
-
-def draw_observability(found: Identifiability) -> dict[str, Sequence[Chart]]:
-    """The singular values and the null-space directions."""
-    o = found.observability
-    s = np.log10(np.maximum(o.singular_values / (o.singular_values.max(initial=0.0) or 1.0), 1e-18))
-    number = np.arange(1.0, len(s) + 1.0)
-    plot = Plot((0.0, len(s) + 1.0), limits_of(s), ("number", "singular value / largest"), powers=True)
-    for rows, kind in ((slice(o.rank), "large a"), (slice(o.rank, None), "large b")):
-        plot.dots(number[rows], s[rows], kind)
-    rank = plot.chart(f"rank {o.rank} of {len(o.names)}: blue determined, orange not")
-    figures: dict[str, Sequence[Chart]] = {"singular_values": [rank]}
-    if found.lost:
-        names = [name for name in o.names if any(name in lost.relation for lost in found.lost)]
-        changes = np.array([[lost.relation.get(name, 0.0) for name in names] for lost in found.lost])
-        reasons = [lost.reason.partition(":")[0] for lost in found.lost]
-        caption = "Null-space directions: change of each parameter [m], [rad], orange positive, blue negative"
-        figures["groups"] = [_matrix(reasons, names, changes, caption)]
-    return figures
 
 
 def arm_scene(data: ReportData, most: int = 300) -> Mapping[str, Any] | None:

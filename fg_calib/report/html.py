@@ -12,7 +12,7 @@ from fg_calib.io import Result
 from fg_calib.report import text
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import arm_scene, figures_of
-from fg_calib.report.predict import percentages, size_table
+from fg_calib.report.predict import FRAMES, percentages, size_table
 from fg_calib.report.tables import POSE_KINDS, Section, in_words, section, shortened
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ MAX_ROWS = 40
 """Suspicious rows that the page lists; the table of residuals has all."""
 
 EXPLANATIONS = {
-    text.RESIDUALS: "Residuals before and after the calibration contain the noise of the measurements.",
     text.PARAMETERS: "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the"
     " prior sigma. Orange: the uncertainty is unknown.",
     "Studentised residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1"
@@ -62,14 +61,12 @@ def build_page(data: text.ReportData) -> str:
     sections += [Section(title) for title, (_, drawn) in figures.items() if drawn and title not in known]
     if charts["workspace"] and space is not None:
         sections[-1:] = section(WORKSPACE, size_table(space), *percentages(space))
-    files = {"configurations": data.configurations, "residuals": data.residuals}
     template = _environment().get_template("page.html")
     return template.render(
+        data=data,
         result=result,
-        n_configurations=0 if data.configurations is None else len(data.configurations),
         sections=sections,
         figures={title: of for title, of in figures.items() if of[1]},
-        missing=[name for name, table in files.items() if table is None],
         arm=arm_scene(data),
         ramp=RAMP,
         verdict=text.verdict_word(result),
@@ -100,10 +97,10 @@ def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:
             unit = result.unit_of(kind)
             yield in_words(rms.after, unit), f"{kind}, rows {rows}; before: {in_words(rms.before, unit)}"
     if result.expected_error is not None:
-        where = "after the best rigid fit" if result.free_of_frame else "in the base frame"
-        both = result.expected_error.fitted if result.free_of_frame else result.expected_error.base
+        frame = "fitted" if result.free_of_frame else "base"
         for kind, unit in POSE_KINDS.items():
-            yield in_words(getattr(both, kind), unit), f"tool {kind} error expected from the covariance, {where} (RMS)"
+            size = in_words(getattr(getattr(result.expected_error, frame), kind), unit)
+            yield size, f"tool {kind} error expected from the covariance, {FRAMES[frame]} (RMS)"
     known = sum(p.sigma is not None for p in result.estimated)
     yield f"{result.n_configurations}", "configurations" if result.evaluated_only else "configurations fitted"
     yield f"{known} of {len(result.estimated)}", "parameters estimated with a known uncertainty"
@@ -111,13 +108,11 @@ def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:
 
 def _command(result: Result) -> str:
     """The command that repeats the calibration in the folder of its job; empty without a job."""
-    job = next(iter(result.inputs), None)
-    folds = [] if result.folds is None else ["--folds", f"{result.folds.n}"]
-    return "" if job is None else shlex.join(["fg-calib", "calibrate", job, "--out", "result", *folds])
+    job, folds = [*result.inputs][:1], [] if result.folds is None else ["--folds", f"{result.folds.n}"]
+    return shlex.join(["fg-calib", "calibrate", *job, "--out", "result", *folds]) if job else ""
 
 
 def _options(result: Result) -> Iterator[tuple[str, str]]:
     for key, value in vars(result.options).items():
         if value not in (None, (), "") and key != "accept":
-            shown = {True: "yes", False: "no"}[value] if isinstance(value, bool) else value
-            yield key, shortened(list(value), 20) if isinstance(value, tuple) else str(shown)
+            yield key, shortened(list(value), 20) if isinstance(value, tuple) else str(value)

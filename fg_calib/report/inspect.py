@@ -11,29 +11,25 @@ from pydantic import TypeAdapter
 from rich.console import Group
 from rich.table import Table
 
-from fg_calib import __version__
 from fg_calib.diagnostics import MAX_ROWS, Inspection
 from fg_calib.inputs import checked
 from fg_calib.io import Observability as Document
-from fg_calib.io import fill_folder, write_text
 from fg_calib.io import in_words as table_in_words
 from fg_calib.job import Job
 from fg_calib.observability import CORRELATED, Identifiability, Observability
 from fg_calib.report import tables
-from fg_calib.report.charts import write_charts
-from fg_calib.report.figures import draw_observability
 from fg_calib.report.tables import Content, Section, line, section, table_of
 from fg_calib.report.text import expected_tool_error
 
-FILES = {
-    "observability.json": b'{\n "schema": "fg-calib/observability/',
-    **dict.fromkeys(("singular_values.svg", "groups.svg"), b"<svg"),
-}
-"""The files that `write_observability` may write, and how each begins."""
-
-
 NOT_FAR = "as noise and priors allow", "larger than predicted, but not by far"
 """What is said of residuals that noise and priors explain, and of larger ones."""
+
+
+COUNTS = {
+    **{"": "name", "rows|>": "n_rows", "configurations|>": "n_configurations", "test rows|>": "n_test"},
+    **{"train pairs|>": "n_pairs", "test pairs|>": "n_test_pairs", "repeats|>": "n_repeats"},
+}
+"""Counts of a table by their headings."""
 
 
 @checked
@@ -45,17 +41,12 @@ def observability_document(found: Identifiability) -> dict[str, Any]:
 
 @checked
 def write_observability(folder: Path | str, found: Identifiability) -> None:
-    """Write `observability.json` and its figures into a folder, all of them or none.
+    """Write `observability.json` into a folder.
 
     Raises:
         InputError: The folder cannot be written.
     """
-
-    def write(into: Path) -> None:
-        write_text(into / "observability.json", json.dumps(observability_document(found), indent=1) + "\n")
-        write_charts(into, draw_observability(found))
-
-    fill_folder(Path(folder), write, FILES)
+    tables.write_document(folder, "observability.json", observability_document(found))
 
 
 def build_identifiability_report(found: Identifiability) -> Group:
@@ -105,13 +96,14 @@ def build_inspection_report(found: Inspection, job: Job) -> Group:
     counts = f"{found.n_residuals} residuals and {found.n_priors} priors on {found.n_unknowns} unknowns"
     nominal = f"Residuals of the nominal arm, frame and tool fitted (median; at most {MAX_ROWS} configurations a table)"
     groups = [f"[{' '.join(group.parameters)}]" for group in o.relative]
+    excluded = (f"{n} train pairs are excluded: {why.replace('_', ' ')}" for why, n in found.n_excluded.items())
     determined = f"What these rows can determine: {o.rank} of {len(o.names)} parameters"
     return tables.report(
         line(f"{found.robot}: {'; '.join(words)}"),
         *(line(f"LOOK AT THIS FIRST: {finding}", "bold red") for finding in found.findings),
         *([line(ready, "bold green")] if found.ready else []),
         *([line(evaluated)] if found.evaluated else []),
-        *section("Tables", _tables(found), *_excluded_pairs(found)),
+        *section("Tables", _tables(found), *excluded),
         *section("Joint readings", _joints(found)),
         *section(nominal, _residuals(found)),
         *section(determined, line(f"{counts}: {found.dof} degrees of freedom"), _class_table(o, groups)),
@@ -124,23 +116,11 @@ def build_inspection_report(found: Inspection, job: Job) -> Group:
 
 def _tables(found: Inspection) -> Table:
     """Counts of each table, without empty columns."""
-    columns: dict[str, list[Any]] = {
-        "": [t.name for t in found.tables],
-        "rows|d": [t.n_rows for t in found.tables],
-        "configurations|d": [t.n_configurations for t in found.tables],
-        "test rows|>": [t.n_test or "" for t in found.tables],
-        "train pairs|>": [t.n_pairs or "" for t in found.tables],
-        "test pairs|>": [t.n_test_pairs or "" for t in found.tables],
-        "repeats|>": [t.n_repeats or "" for t in found.tables],
-        "of": [", ".join(f"{n} {what}" for what, n in t.labels.items()) for t in found.tables],
-        "residuals to fit": [", ".join(f"{n} {kind}" for kind, n in t.n_residuals.items()) for t in found.tables],
-    }
+    columns = {heading: [getattr(t, key) or "" for t in found.tables] for heading, key in COUNTS.items()}
+    columns["of"] = [", ".join(f"{n} {what}" for what, n in t.labels.items()) for t in found.tables]
+    columns["residuals to fit"] = [", ".join(f"{n} {k}" for k, n in t.n_residuals.items()) for t in found.tables]
     filled = {heading: cells for heading, cells in columns.items() if any(cells)}
     return table_of(filled, zip(*filled.values(), strict=True), wrap=True)
-
-
-def _excluded_pairs(found: Inspection) -> Iterator[str]:
-    yield from (f"{n} train pairs are excluded: {reason.replace('_', ' ')}" for reason, n in found.n_excluded.items())
 
 
 def _joints(found: Inspection) -> Table:
@@ -186,22 +166,15 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
       "expected_error": {"base": {"position", "orientation"}, "fitted": {...}, "at", "n", "of", "relative"} | null,
       "inputs": {path: sha256} }
     """
-    keys = ("robot", "ready", "findings", "cautions", "evaluated", "tables", "disagreements", "expected_error")
-    counts = ("n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded")
-    document: dict[str, Any] = tables.plain(
-        {
-            "schema": "fg-calib/inspection/1",
-            "version": __version__,
-            **{key: getattr(found, key) for key in (*keys, *counts)},
-            "joints": [vars(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
-            "residuals": [
-                {"table": of.table, "excess": one.excess, **vars(one)} for of in found.setups for one in of.residuals
-            ],
-            "explanations": [
-                {"table": of.table, "mistakes": one.mistakes} for of in found.setups for one in of.explanations
-            ],
-            "observability": observability_document(found.identifiability),
-            "inputs": job.inputs,
-        }
+    setups, counts = found.setups, ("n_residuals", "n_priors", "n_unknowns", "n_excluded")
+    return tables.document_of(
+        "inspection",
+        found,
+        "robot ready findings cautions evaluated tables disagreements expected_error dof",
+        **{key: getattr(found, key) for key in counts},
+        joints=[vars(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
+        residuals=[{"table": of.table, "excess": one.excess, **vars(one)} for of in setups for one in of.residuals],
+        explanations=[{"table": of.table, "mistakes": one.mistakes} for of in setups for one in of.explanations],
+        observability=observability_document(found.identifiability),
+        inputs=job.inputs,
     )
-    return document

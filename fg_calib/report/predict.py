@@ -11,14 +11,13 @@ from rich.console import Group
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from fg_calib import __version__
 from fg_calib.inputs import Floats
 from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
 from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import error_slices
-from fg_calib.report.tables import POSE_KINDS, Content, figure, in_words, line, section, table_of
+from fg_calib.report.tables import POSE_KINDS, figure, in_words, line, section, table_of
 from fg_calib.report.text import verdict_word
 from fg_calib.robot import Robot
 
@@ -56,29 +55,24 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
     if worst is not None:
         of_worst = _configuration(worst.errors, 0, "" if worst.row is None else names[worst.row], worst.far)
         of_worst |= {"axes": worst.axes, "sigma": worst.sigma, "responsible": _shares(worst.responsible, result)}
-    document: dict[str, Any] = tables.plain(
-        {
-            "schema": "fg-calib/predict/1",
-            "version": __version__,
-            "trustworthy": not result.findings,
-            **{key: getattr(result, key) for key in ("robot", "findings", "reservations")},
-            "at": "configurations" if found.given else "workspace",
-            "n": len(errors.readings),
-            "counts": "fitted" if found.fitted else "base",
-            "expected": {
-                key: None if of is None else {kind: summed_up(of[:, k]) for k, kind in enumerate(POSE_KINDS)}
-                for key, of in sizes.items()
-            },
-            "far": np.mean(found.far),
-            **{key: getattr(found, key) for key in ("unknown", "undetermined", "limit", "within")},
-            "worst": of_worst,
-            "responsible": _shares(found.responsible, result),
-            "configurations": [
-                _configuration(errors, k, names[k], found.far[k]) for k in range(len(names) * found.given)
-            ],
-        }
+    return tables.document_of(
+        "predict",
+        found,
+        "unknown undetermined limit within",
+        **{key: getattr(result, key) for key in ("robot", "findings", "reservations")},
+        trustworthy=not result.findings,
+        at="configurations" if found.given else "workspace",
+        n=len(errors.readings),
+        counts="fitted" if found.fitted else "base",
+        expected={
+            key: None if of is None else dict(zip(POSE_KINDS, map(summed_up, of.T), strict=False))
+            for key, of in sizes.items()
+        },
+        far=np.mean(found.far),
+        worst=of_worst,
+        responsible=_shares(found.responsible, result),
+        configurations=[_configuration(errors, k, names[k], found.far[k]) for k in range(len(names) * found.given)],
     )
-    return document
 
 
 def _names(found: PredictedErrors, ids: Sequence[str]) -> tuple[str, ...]:
@@ -154,8 +148,7 @@ def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot
     n, names = len(found.errors.readings), _names(found, ids)
     where = f"at {n} configurations" if found.given else "over the workspace"
     in_part = ", as far as it is known" * bool(found.unknown)
-    listed: list[Content] = [_configurations(found, robot, names)] if found.given else []
-    listed += [f"and {n - MAX_LISTED} more: --out writes them all"] if found.given and n > MAX_LISTED else []
+    listed = [_configurations(found, robot, names)] if found.given else []
     return tables.report(
         line(f"{result.robot}: expected error of the tool {where}", "bold"),
         line(f"the calibration was {verdict_word(result)}", "bold red" if result.findings else "bold green"),
@@ -231,12 +224,12 @@ def _responsible(found: PredictedErrors, result: Result) -> Table:
 
 
 def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Table:
-    """The worst of the given configurations, in their order."""
+    """The given configurations, the worst first."""
     error = np.where(np.isnan(found.expected[:, 0]), np.inf, found.expected[:, 0])
-    shown = np.sort(np.argsort(-error, kind="stable")[:MAX_LISTED]).tolist()
     near = np.where(found.far, "no", "yes").tolist()
-    rows = [(names[k], *found.errors.readings[k], *found.expected[k], near[k]) for k in shown]
-    return table_of(("", *tables.joint_columns(robot, ":.2f"), "mm|m", "deg|rad", "near|>"), rows, wrap=True)
+    rows = [(names[k], *found.errors.readings[k], *found.expected[k], near[k]) for k in np.argsort(-error).tolist()]
+    columns = ("", *tables.joint_columns(robot, ":.2f"), "mm|m", "deg|rad", "near|>")
+    return table_of(columns, rows, wrap=True, most=MAX_LISTED)
 
 
 def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
@@ -278,9 +271,7 @@ def correction_document(name: str, ids: Sequence[str], correction: Correction) -
         for i, target in enumerate(ids)
     ]
     counts = {"n_targets": len(ids), "n_reached": int(correction.reached.sum())}
-    head = {"schema": "fg-calib/correct/1", "robot": name, **counts, "expected_fitted": correction.expected_fitted}
-    document: dict[str, Any] = tables.plain(head | {"targets": targets})
-    return document
+    return tables.document_of("correct", correction, "expected_fitted", robot=name, **counts, targets=targets)
 
 
 def build_correction_report(ids: Sequence[str], correction: Correction, robot: Robot) -> Group:
@@ -291,14 +282,12 @@ def build_correction_report(ids: Sequence[str], correction: Correction, robot: R
         correction: The commands.
         robot: The calibrated robot.
     """
-    n, reached = len(ids), int(correction.reached.sum())
-    shown = np.argsort(correction.reached, kind="stable")[:MAX_LISTED]
-    more = [f"and {n - len(shown)} more: --out writes them all"] if n > len(shown) else []
+    title = f"{robot.name}: {int(correction.reached.sum())} of {len(ids)} targets can be reached"
     return tables.report(
-        line(f"{robot.name}: {reached} of {n} targets can be reached", "bold"),
+        line(title, "bold"),
         line(""),
         _target_errors(correction),
-        *section("Joint positions to command", _commands(ids, correction, robot, np.sort(shown).tolist()), *more),
+        *section("Joint positions to command", _commands(ids, correction, robot)),
         *section("Notes", *_correction_notes(ids, correction)),
     )
 
@@ -314,24 +303,21 @@ def _target_errors(correction: Correction) -> Table:
     return table_of(("error at the targets", "RMS|q|-", "largest|q|-", "|unit"), rows, wrap=True)
 
 
-def _commands(ids: Sequence[str], correction: Correction, robot: Robot, chosen: Sequence[int]) -> Table:
-    """Joint positions and errors of some targets."""
+def _commands(ids: Sequence[str], correction: Correction, robot: Robot) -> Table:
+    """Joint positions and errors of the targets."""
     before, after = correction.uncorrected[:, 0], np.hypot(correction.missed[:, 0], correction.expected[:, 0])
-    rows = [(ids[i], *correction.readings[i], before[i], after[i]) for i in chosen]
-    return table_of(("target", *tables.joint_columns(robot), "before mm|m|-", "after mm|m|-"), rows, wrap=True)
+    rows = [(*of, b, a) for *of, b, a in zip(ids, *correction.readings.T, before, after, strict=True)]
+    columns = ("target", *tables.joint_columns(robot), "before mm|m|-", "after mm|m|-")
+    return table_of(columns, rows, wrap=True, most=MAX_LISTED)
 
 
 def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[str]:
-    yield (
-        "Give the controller the joint positions; or, where it only takes poses, the poses that --out writes, with its"
-        " nominal model, base and tool unchanged."
-    )
+    yield "Give the controller the joint positions; or the poses that --out writes, with its nominal model unchanged."
     point = correction.missed[:, 0] < 1e-9
     doubts = {
         "Reached with the point alone, the tool rotated as near as the arm can": ~correction.reached & point,
         "Out of reach within the joint limits": ~correction.reached & ~point,
-        "Look at these before you run them: a joint changes by more than a calibration alone explains (near a"
-        " singularity, or on another branch)": correction.far,
+        "Look at these first: a joint changes far (near a singularity, or on another branch)": correction.far,
     }
     for words, rows in doubts.items():
         if rows.any():

@@ -6,6 +6,7 @@ import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,8 +16,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from fg_calib import __version__
 from fg_calib.diagnostics import probability
 from fg_calib.inputs import check_number, escaped
+from fg_calib.io import fill_folder, write_text
 from fg_calib.observability import LostDirection, Observability
 from fg_calib.robot import AXIS_OF_KIND, Axis, Robot
 
@@ -46,9 +49,7 @@ def plain_text(report: RenderableType, width: int = WIDTH) -> str:
     """A report as plain text, without blanks at the ends of lines."""
     check_number("width", width, least=1, whole=True)
     text = io.StringIO()
-    console = Console(
-        file=text, width=width_for(report, width), color_system=None, highlight=False, legacy_windows=False
-    )
+    console = Console(file=text, width=width_for(report, width), color_system=None, highlight=False)
     console.print(report)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
@@ -93,8 +94,8 @@ class Section:
 
     @property
     def sentences(self) -> list[str]:
-        """Its sentences."""
-        return [str(part) for part in self.content if not isinstance(part, Table)]
+        """Its sentences, and what stands below its tables."""
+        return [str(part.caption or "") if isinstance(part, Table) else str(part) for part in self.content]
 
 
 def _part(content: Content) -> RenderableType:
@@ -112,7 +113,9 @@ def report(*parts: Section | Content) -> Group:
     return Group(*(part if isinstance(part, Section) else _part(part) for part in parts))
 
 
-def table_of(columns: Iterable[str], rows: Iterable[Sequence[Any]], *, wrap: bool = False) -> Table:
+def table_of(
+    columns: Iterable[str], rows: Iterable[Sequence[Any]], *, wrap: bool = False, most: int | None = None
+) -> Table:
     """A table without a frame, for the terminal and the page.
 
     Args:
@@ -128,6 +131,7 @@ def table_of(columns: Iterable[str], rows: Iterable[Sequence[Any]], *, wrap: boo
             Without any heading there is no heading row.
         rows: Values; text stands for itself in every column.
         wrap: Whether cells wrap at spaces where the terminal is narrow.
+        most: Rows that are shown; a line below says how many more there are.
     """
     parts = [tuple(f"{column}||".split("|")[:3]) for column in columns]
     show_header = any(heading for heading, _, _ in parts)
@@ -135,8 +139,10 @@ def table_of(columns: Iterable[str], rows: Iterable[Sequence[Any]], *, wrap: boo
     for heading, form, _ in parts:
         justify: Literal["left", "right"] = "left" if form in ("", "unit") else "right"
         table.add_column(line(heading), justify=justify, no_wrap=not wrap, overflow="fold")
-    at = next((k for k, (_, form, _) in enumerate(parts) if form == "unit"), 0)
-    for row in rows:
+    at, rows = next((k for k, (_, form, _) in enumerate(parts) if form == "unit"), 0), list(rows)
+    if most is not None and len(rows) > most:
+        table.caption, table.caption_justify = line(f"and {len(rows) - most} more"), "left"
+    for row in rows[:most]:
         cells = zip(row, parts, strict=True)
         table.add_row(*(_cell(value, form, unknown, str(row[at])) for value, (_, form, unknown) in cells))
     return table
@@ -157,14 +163,19 @@ def _cell(value: Any, form: str, unknown: str, unit: str) -> Text:
     return line(probability(value) if form == "p" else f"{value:{form}}")
 
 
+def shown_in(unit: str) -> tuple[float, str, int]:
+    """Factor, unit and decimals in which a quantity in [m], [rad] or [px] is shown; its own unit of others."""
+    return SHOWN.get(unit, (1.0, unit, 6))
+
+
 def factor(unit: str) -> float:
     """The factor from [m], [rad] or [px] to the unit in which a quantity is shown."""
-    return SHOWN.get(unit, (1.0, unit, 6))[0]
+    return shown_in(unit)[0]
 
 
 def unit_shown(unit: str) -> str:
     """The name of the unit in which a quantity is shown: `mm`, `deg`, `px`, or its own."""
-    return SHOWN.get(unit, (1.0, unit, 6))[1]
+    return shown_in(unit)[1]
 
 
 def figure(value: float | None, unit: str, form: str = "", unknown: str = "unknown") -> str:
@@ -178,8 +189,7 @@ def figure(value: float | None, unit: str, form: str = "", unknown: str = "unkno
     """
     if value is None or not np.isfinite(value):
         return unknown
-    decimals = SHOWN.get(unit, (1.0, unit, 6))[2]
-    return f"{value * factor(unit):{form if '.' in form else f'{form}z.{decimals}f'}}"
+    return f"{value * factor(unit):{form if '.' in form else f'{form}z.{shown_in(unit)[2]}f'}}"
 
 
 def in_words(value: float | None, unit: str, form: str = ".3g") -> str:
@@ -228,12 +238,10 @@ def unit_of(name: str) -> str:
 def weak_directions(observability: Observability, most: int = 5) -> Table:
     """Weak directions: their sigma over the prior sigma, and their largest members."""
     rows = []
-    for weak in observability.weak[:most]:
+    for weak in observability.weak:
         members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
-        rows.append((f"{1.0 / weak.signal_to_noise:.3g}" if weak.signal_to_noise > 0.0 else "unknown", members))
-    more = len(observability.weak) - most
-    rows += [("", f"and {more} more")] if more > 0 else []
-    return table_of(("sigma / prior", "largest members"), rows, wrap=True)
+        rows.append((1.0 / weak.signal_to_noise if weak.signal_to_noise > 0.0 else None, members))
+    return table_of(("sigma / prior|.3g|unknown", "largest members"), rows, wrap=True, most=most)
 
 
 def joint_columns(robot: Robot, form: str = "") -> list[str]:
@@ -245,6 +253,30 @@ def joint_columns(robot: Robot, form: str = "") -> list[str]:
 def plain(document: Any) -> Any:
     """A document as JSON has it: dataclasses as mappings, arrays as lists, null for what is not finite."""
     return json.loads(to_json(document, fallback=lambda value: value.tolist(), inf_nan_mode="null"))
+
+
+def document_of(name: str, source: object = None, keys: str = "", **more: Any) -> dict[str, Any]:
+    """A document for programs, as JSON has it.
+
+    Args:
+        name: Of its schema.
+        source: An object whose attributes it holds.
+        keys: Names of these attributes.
+        more: Other keys and their values.
+    """
+    head = {"schema": f"fg-calib/{name}/1", "version": __version__}
+    document: dict[str, Any] = plain(head | {key: getattr(source, key) for key in keys.split()} | more)
+    return document
+
+
+def write_document(folder: Path | str, name: str, document: dict[str, Any]) -> None:
+    """Write a JSON file into a folder, over an earlier one of its schema.
+
+    Raises:
+        InputError: The folder cannot be written, or holds another file of that name.
+    """
+    begins = json_text({"schema": document["schema"]}).rpartition("/")[0].encode()
+    fill_folder(Path(folder), lambda into: write_text(into / name, json_text(document)), {name: begins})
 
 
 def json_text(document: Any) -> str:

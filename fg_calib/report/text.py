@@ -124,7 +124,7 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
         *section("Combinations that the kept parameters stand for", _combinations(result)),
         *section("Suspicious rows", *_suspicious_rows(found.residuals, "train", most)),
         *section("Suspicious test rows", *_suspicious_rows(found.residuals, "test", most)),
-        *section("Suspicious configurations", *_suspicious_configurations(result)),
+        *section("Suspicious configurations", _suspicious_configurations(result)),
         *_joint_values(found),
         *_frames(result),
         *_landmarks(result),
@@ -228,18 +228,9 @@ def _prediction(result: Result) -> Iterator[Content]:
     """How well the test rows are predicted, by kind."""
     if (fit := result.test) is None:
         return
-    rows = [
-        (
-            _named(result, k),
-            k.n,
-            k.chi2,
-            k.expected,
-            k.seen_over_stated / k.factor,
-            k.p_value,
-            PREDICTION_VERDICTS[k.verdict],
-        )
-        for k in fit.kinds
-    ]
+    ratios = [(k.n, k.chi2, k.expected, k.seen_over_stated / k.factor, k.p_value) for k in fit.kinds]
+    words = [PREDICTION_VERDICTS[k.verdict] for k in fit.kinds]
+    rows = [(_named(result, k), *of, word) for k, of, word in zip(fit.kinds, ratios, words, strict=True)]
     yield table_of(("", "rows|d", "chi-square|.4g", "expected|.4g", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
     if fit.n_outliers:
         yield f"{fit.n_outliers} of {fit.n_measurements} measurements do not count: outliers by the loss"
@@ -318,15 +309,12 @@ def _tolerances(result: Result) -> Table:
 
 
 def _combinations(result: Result) -> Table:
-    rows = [
-        (p.name, p.sigma_of_combination, p.unit, tables.format_sum(p.stands_for))
-        for p in result.parameters
-        if p.stands_for
-    ]
+    sums = [(p, tables.format_sum(p.stands_for)) for p in result.parameters if p.stands_for]
+    rows = [(p.name, p.sigma_of_combination, p.unit, words) for p, words in sums]
     return table_of(("", "sigma|q", "|unit", "of the sum"), rows, wrap=True)
 
 
-def _suspicious_rows(residuals: pl.DataFrame | None, split: str, most: int) -> list[Content]:
+def _suspicious_rows(residuals: pl.DataFrame | None, split: str, most: int) -> list[Table]:
     """The rows of a split that are larger than noise, the worst first; none if they were not saved."""
     if residuals is None:
         return []
@@ -334,18 +322,14 @@ def _suspicious_rows(residuals: pl.DataFrame | None, split: str, most: int) -> l
     suspects = suspects[suspects["studentised"].abs().fill_nan(0.0).arg_sort(descending=True)]
     more = [name for name in ("table", "of") if name in suspects.columns]
     columns = ["a", "b", "kind", *more, "residual", "unit", "studentised", "flag"]
-    rows = [["" if value is None else value for value in row] for row in suspects.select(columns).head(most).rows()]
-    headings = ("a", "b", "", *more, "residual|q:+", "|unit", "in its sigma|+.1f", "")
-    left = [f"and {len(suspects) - most} more"] if len(suspects) > most else []
-    return [table_of(headings, rows), *left]
+    rows = [["" if value is None else value for value in row] for row in suspects.select(columns).rows()]
+    return [table_of(("a", "b", "", *more, "residual|q:+", "|unit", "in its sigma|+.1f", ""), rows, most=most)]
 
 
-def _suspicious_configurations(result: Result, most: int = 8) -> list[Content]:
+def _suspicious_configurations(result: Result, most: int = 8) -> Table:
     """The configurations whose residuals together are larger than noise."""
-    found = result.suspect_configurations
-    rows = [(c.id, c.n, c.chi2, c.expected) for c in found[:most]]
-    more = [f"and {shortened([c.id for c in found[most:]], 8)}"] if len(found) > most else []
-    return [table_of(("", "rows|d", "chi-square|.4g", "expected|.4g"), rows), *more]
+    rows = [(c.id, c.n, c.chi2, c.expected) for c in result.suspect_configurations]
+    return table_of(("", "rows|d", "chi-square|.4g", "expected|.4g"), rows, most=most)
 
 
 def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
@@ -356,30 +340,27 @@ def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
     units = [found.robot.joints[j].unit for j in values.joints]
     sigma = "specified" if (found.result.noise_factors or {}).get("joint", 1.0) == 1.0 else "estimated"
     rows = list(zip(values.names, values.sigma, units, values.mean, values.scatter, strict=True))
-    at = [int(values.configurations[i]) for i, _ in values.suspects[:most]]
-    names = at if configurations is None else configurations["id"].gather(at).to_list()
-    wrong = [
-        (str(name), values.names[k], values.error[i, k], units[k], values.studentised[i, k])
-        for name, (i, k) in zip(names, values.suspects, strict=False)
-    ]
-    more = [f"and {len(values.suspects) - most} more"] if len(values.suspects) > most else []
+    wrong = []
+    for i, k in values.suspects:
+        at = int(values.configurations[i])
+        name = str(at if configurations is None else configurations["id"][at])
+        wrong.append((name, values.names[k], values.error[i, k], units[k], values.studentised[i, k]))
     title = f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})"
     columns = ("", f"{sigma}|q", "|unit", f"mean error / {sigma}|+z.3f", "scatter|.3f")
-    suspicious = table_of(("", "", "error|q:+", "|unit", "in its sigma|+.1f"), wrong)
-    return [*section(title, table_of(columns, rows)), *section("Suspicious joint readings", suspicious, *more)]
+    suspicious = table_of(("", "", "error|q:+", "|unit", "in its sigma|+.1f"), wrong, most=most)
+    return [*section(title, table_of(columns, rows)), *section("Suspicious joint readings", suspicious)]
 
 
 def _landmarks(result: Result, most: int = 8) -> list[Section]:
     """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
     sections: list[Section] = []
     for kind, title in ((kind.name, kind.heading) for kind in LANDMARKS.values() if kind.heading):
-        chosen, rows = [p for p in result.groups if p.kind == kind], []
-        for p in chosen[:most]:
+        rows = []
+        for p in (p for p in result.groups if p.kind == kind):
             units = ["" if kind == "unknown" else unit for unit in p.units]
             sigma = _vector(p.sigma, *units) if p.sigma.any() else "known"
             rows.append((p.name, p.n, _vector(p.xyz, *units), "±", sigma))
-        more = [f"and {len(chosen) - most} more"] if len(chosen) > most else []
-        sections += section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows), *more)
+        sections += section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows, most=most))
     return sections
 
 
@@ -419,13 +400,9 @@ def summary(result: Result, most: int = 4) -> list[str]:
         f"{len(result.estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
     ]
     for split, kinds in result.residual_rms.items():
-        units = {kind: result.unit_of(kind) for kind, rms in kinds.items() if rms is not None}
-        both = (
-            f"{kind} {in_words(rms.before, units[kind])} -> {in_words(rms.after, units[kind])}"
-            for kind, rms in kinds.items()
-            if rms is not None
-        )
-        lines += [f"{split} residuals, RMS: {', '.join(both)}"] if units else []
+        known_rms = {kind: (rms, result.unit_of(kind)) for kind, rms in kinds.items() if rms is not None}
+        both = (f"{k} {in_words(r.before, unit)} -> {in_words(r.after, unit)}" for k, (r, unit) in known_rms.items())
+        lines += [f"{split} residuals, RMS: {', '.join(both)}"] if known_rms else []
     return [str(line(text if len(text) <= tables.WIDTH else f"{text[: tables.WIDTH - 4]} ...")) for text in lines]
 
 

@@ -33,8 +33,8 @@ WIRE = {"model": "anchor", "name": "wire", "anchors": {n: dict(zip("xyz", p, str
 TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {
-    "schema", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before", "random",
-    "undetermined_share", "curve", "pairings", "candidates", "stops", "undetermined", "travel",
+    "schema", "version", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before",
+    "random", "undetermined_share", "curve", "pairings", "candidates", "stops", "undetermined", "travel",
     "travel_unordered",
 }  # fmt: skip
 FEW = ("--candidates", 25)

@@ -118,7 +118,7 @@ def test_names_are_text_and_nothing_else():
 
 def test_figures_are_svg_files_of_their_own(folder):
     names = {file.stem for file in folder.glob("*.svg")}
-    assert names == {"accuracy", "joints", "parameters", "correlations", "residuals", "workspace"}
+    assert names == {"joints", "parameters", "correlations", "residuals", "workspace"}
     for file in folder.glob("*.svg"):
         assert html.fromstring(file.read_text()).tag == "svg"
 
