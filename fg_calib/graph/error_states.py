@@ -6,9 +6,9 @@ mean of z for rows y is `Z = S^-1 L^T y`, and
 
     (y - L Z)^T (y - L Z) + Z^T Z = y^T (1 + L L^T)^-1 y,
 
-so [y - L Z; Z] are rows of unit covariance that say the same. S is factored in the quickest of four ways: a dense
-Cholesky factor of 1 + L L^T or of S, whichever is smaller; or a sparse factor, configurations ordered so that trees do
-not fill and reference poses come last, or by minimum degree. Errors that reach one measurement only are private noise.
+so [y - L Z; Z] are rows of unit covariance that say the same. A factor of S, or of 1 + L L^T where rows are fewer, is
+dense where these are few or full, else sparse by minimum degree, which does not fill where pairs make a tree. Errors
+that reach one measurement only are private noise.
 
 The second-order term of a pair formed from poses, `(e_j - e_i)^T H (e_j - e_i) / 2`, counts as private, of variance q.
 For equal noise its correlation is at most 1/4 with that of a pair that shares a pose, and 0 with others: together all
@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -44,7 +44,7 @@ MAX_FILL = 10
 """Entries of a dense S for each entry of L up to which it is the quickest at any size, as of all pairs."""
 
 MAX_LOOP_STATES = 4000
-"""States that loops of the graph of configurations couple, up to which a breadth-first order fills little."""
+"""States that loops of the graph of configurations couple, up to which a sparse factor of S fills little."""
 
 MAX_SPARSE = 15_000
 """Rows, or states, up to which graphs of many loops are eliminated at all: 0.4 s for 6 000, 8 s for 15 000."""
@@ -85,8 +85,6 @@ class SchurComplement:
 
     def whiten(self, rows: Floats) -> Floats:
         """Rows of unit covariance that say the same as `rows`, shape (n_rows, k), do: shape (n, k)."""
-        if self._has_few_rows:
-            return self._unit @ rows
         Z = self.posterior_mean(rows)
         return np.concatenate([rows - self.loadings @ Z, Z])
 
@@ -126,66 +124,30 @@ class SchurComplement:
             total -= float(np.vdot(D, self.solve(D)))
         return total
 
-    @property
-    def _has_few_rows(self) -> bool:
-        n_rows, n_states = self.loadings.shape
-        return n_rows <= min(n_states, MAX_DENSE)
-
-    @cached_property
-    def _unit(self) -> Floats:
-        """The inverse Cholesky factor of C."""
-        L, one = self.loadings, np.eye(self.loadings.shape[0])
-        factor = scipy.linalg.cholesky(one + (L @ L.T).toarray(), lower=True, check_finite=False)
-        out: Floats = scipy.linalg.solve_triangular(factor, one, lower=True, check_finite=False)
-        return out
-
     @cached_property
     def _factor(self) -> tuple[bool, Callable[[Floats], Floats]]:
         """Whether C is factored, not S; and what multiplies by the inverse."""
-        L, width, (n_rows, n_states) = self.loadings, self.width, self.loadings.shape
+        L, (n_rows, n_states) = self.loadings, self.loadings.shape
         if not n_states:
             return False, lambda b: b
-        if self._has_few_rows:
-            return True, lambda b: self._unit.T @ (self._unit @ b)
-        if n_states <= MAX_DENSE or n_states**2 <= MAX_FILL * L.nnz:
-            S = scipy.linalg.cho_factor(np.eye(n_states) + (L.T @ L).toarray(), check_finite=False)
-            return False, lambda b: scipy.linalg.cho_solve(S, b, check_finite=False)
-        graph = _configuration_graph(L, width)
+        of_rows = n_rows <= min(n_states, MAX_DENSE)
+        if min(n_rows, n_states) <= MAX_DENSE or n_states**2 <= MAX_FILL * L.nnz:
+            M = (L @ L.T if of_rows else L.T @ L).toarray()
+            dense = scipy.linalg.cho_factor(np.eye(len(M)) + M, check_finite=False)
+            return of_rows, lambda b: scipy.linalg.cho_solve(dense, b, check_finite=False)
+        graph = _configuration_graph(L, self.width)
         n_parts = csgraph.connected_components(graph, directed=False)[0]
         n_loops = (graph.nnz - graph.shape[0]) // 2 - graph.shape[0] + n_parts
-        if n_loops * width <= MAX_LOOP_STATES:
-            order = csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
-            return False, _sparse_solver(L.T @ L, (order[:, None] * width + np.arange(width)).ravel())
-        if min(n_rows, n_states) > MAX_SPARSE:
+        loops = n_loops * self.width > MAX_LOOP_STATES
+        if loops and min(n_rows, n_states) > MAX_SPARSE:
             found = f"{n_states} errors that pairs share in loops are too many to eliminate"
             way_out = "use model pose with frame unknown, which holds the same, or a star or chain"
             raise SolverError(f"pairs: {found}; {way_out}")
-        return n_rows < n_states, _sparse_solver(L @ L.T if n_rows < n_states else L.T @ L)
-
-
-def _sparse_solver(M: Sparse, order: Integers | None = None) -> Callable[[Floats], Floats]:
-    """What multiplies by the inverse of 1 + M, by a sparse factor.
-
-    Breadth-first orders, reversed, have the parent of a node of a tree after it: states of one measurement each, trees
-    and graphs of few loops do not fill. Where loops are many, minimum degree leaves the smallest core.
-
-    Args:
-        M: Symmetric, shape (n, n).
-        order: Order of elimination; minimum degree if None.
-    """
-    M = (M + scipy.sparse.eye_array(M.shape[0])).tocsr()
-    place = slice(None) if order is None else order
-    M = M if order is None else M[order][:, order]
-    options = {"SymmetricMode": True, "Equil": False}
-    by: Literal["MMD_AT_PLUS_A", "NATURAL"] = "MMD_AT_PLUS_A" if order is None else "NATURAL"
-    factor = splu(M.tocsc(), permc_spec=by, diag_pivot_thresh=0.0, options=options)
-
-    def solve(b: Floats) -> Floats:
-        out = np.empty_like(b)
-        out[place] = factor.solve(np.ascontiguousarray(b[place]))
-        return out
-
-    return solve
+        of_rows = loops and n_rows < n_states
+        M = (L @ L.T if of_rows else L.T @ L) + scipy.sparse.eye_array(n_rows if of_rows else n_states)
+        options = {"SymmetricMode": True, "Equil": False}
+        factor = splu(M.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        return of_rows, lambda b: factor.solve(np.ascontiguousarray(b))
 
 
 def _configuration_graph(L: Sparse, width: int) -> Sparse:

@@ -184,7 +184,7 @@ def measurement_factors(
 
 
 def _error(letter: str, number: int) -> Variable:
-    return Variable(gtsam.symbol(letter, number), f"{letter}({number})", "own", (), slice(0))
+    return Variable(gtsam.symbol(letter, number), "own", (), slice(0))
 
 
 def _pair_factors(
@@ -281,28 +281,25 @@ def with_added(
     Raises:
         ProblemError: A factor has no finite weight, error or derivative, or values and variables do not match.
     """
-    variables = variables.without_added()
-    found = set(chain.from_iterable(factor.keys() for factor in factors if factor is not None))
-    if on_errors := found.intersection(errors.keys()):
-        added = f"an added factor on the error variable {_symbol(min(on_errors))}"
+    found, on_errors = set(chain.from_iterable(f.keys() for f in factors if f is not None)), set(errors.keys())
+    if found & on_errors:
+        added = f"an added factor on the error variable {_symbol(min(found & on_errors))}"
         raise ProblemError("problem.graph", added, "factors on other variables")
-    known, given = found.union(variables.keys), set(initial.keys()).difference(errors.keys())
-    for key in sorted(known - given):
-        raise ProblemError("problem.initial", f"no value of {_symbol(key)}", "one for every variable of the graph")
-    for key in sorted(given - known):
-        raise ProblemError("problem.initial", f"a value of {_symbol(key)}", "none without a factor on it")
+    ours = variables.with_added((), initial)
+    known, given = found.union(ours.keys), set(initial.keys()) - on_errors
+    for key in sorted(known ^ given):
+        what = f"{'no value' if key in known else 'a value'} of {_symbol(key)}"
+        raise ProblemError("problem.initial", what, "one for every variable of the graph, and no others")
     for factor in factors:
         _check_factor(factor, initial)
-    for key in sorted(given.difference(variables.keys)):
-        variables = variables.with_added(key, _symbol(key), initial)
+    variables = variables.with_added(sorted(given.difference(ours.keys)), initial)
     for v in (*variables.items, *variables.nuisance):
-        expected = "a gtsam.Pose3" if v.is_pose else f"{len(v.parameters)} finite numbers"
         try:
-            value = initial.atPose3(v.key).matrix() if v.is_pose else initial.atVector(v.key)
-        except RuntimeError:
-            value = np.full(1, np.nan)
-        if not np.isfinite(value).all() or value.size != (16 if v.is_pose else len(v.parameters)):
-            expected = "a finite vector or a gtsam.Pose3" if v.kind == "own" else expected
+            fits = bool(np.isfinite(variables.parameters(initial, [v])).all())
+        except (RuntimeError, ValueError):
+            fits = False
+        if not fits:
+            expected = "a gtsam.Pose3" if v.is_pose else f"{len(v.parameters)} finite numbers"
             raise ProblemError(f"problem.initial: {v.symbol}", "another value", expected)
     return variables, variables.parameters(initial)
 

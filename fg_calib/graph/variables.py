@@ -41,13 +41,15 @@ KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch",
 """Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
 
 
+VariableKind = Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
+
+
 @dataclass(frozen=True)
 class Variable:
     """One GTSAM variable.
 
     Attributes:
         key: GTSAM's key.
-        symbol: How it is written: `K(3)`, `T(0)`, `X(0)`.
         kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
             as a touched point, or a vector or pose that a user added.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
@@ -58,8 +60,7 @@ class Variable:
     """
 
     key: int
-    symbol: str
-    kind: Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
+    kind: VariableKind
     parameters: tuple[int, ...]
     columns: slice
     scales: tuple[float, ...] = ()
@@ -79,6 +80,12 @@ class Variable:
     def letter(self) -> str:
         """Letter of its symbol."""
         return chr(gtsam.symbolChr(self.key))
+
+    @property
+    def symbol(self) -> str:
+        """How it is written: `K(3)`, `T(0)`, `X(0)`; one that was added as GTSAM does."""
+        own = self.kind.startswith("own")
+        return str(gtsam.Symbol(self.key)).strip() if own else f"{self.letter}({self.number})"
 
     @property
     def is_pose(self) -> bool:
@@ -246,26 +253,22 @@ class Variables(Brief):
     def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
         """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
         column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
-        coordinates: list[int] = []
-        more: list[Variable] = []
-        taken = {v.symbol for v in self.items}  # the base has the letter of boards
+        coordinates, more, taken = list[int](), list[Variable](), {v.symbol for v in self.items}
         for index, (item, size) in enumerate(zip(unknowns.items, unknowns.sizes, strict=True)):
-            letter = item.kind.letter
             if not estimated[index]:
                 coordinates += [-1] * size
                 continue
-            parameters = tuple(range(place, place + size))
-            number = len(unknowns.items) if f"{letter}({index})" in taken else index
-            symbol, scales = f"{letter}({number})", tuple(map(self.robot.scale_of, item.units))
+            letter, parameters = item.kind.letter, tuple(range(place, place + size))
+            number = (
+                len(unknowns.items) if f"{letter}({index})" in taken else index
+            )  # the base has the letter of boards
+            prior = None if item.tolerance is None else (tuple(item.start.tolist()), size * (item.tolerance,))
             key, columns = gtsam.symbol(letter, number), slice(column, column + size)
-            tolerance, prior = item.tolerance, None
-            if tolerance is not None:
-                prior = (tuple(item.start.tolist()), size * (tolerance,))
-            more.append(Variable(key, symbol, "unknown", parameters, columns, scales, prior))
+            scales = tuple(map(self.robot.scale_of, item.units))
+            more.append(Variable(key, "unknown", parameters, columns, scales, prior))
             coordinates += parameters
             column, place = column + size, place + size
-        others = np.nan_to_num(unknowns.start)
-        found = np.array(coordinates, dtype=np.int64)
+        others, found = np.nan_to_num(unknowns.start), np.array(coordinates, dtype=np.int64)
         return replace(self, nuisance=self.nuisance + tuple(more), coordinates=found, others=others)
 
     def at(self, parameters: Floats) -> State:
@@ -276,26 +279,15 @@ class Variables(Brief):
         chains = tuple(chain.at(parameters) for chain in self.chains)
         return State(chains, values, columns, self.n_columns, self.n_nuisance)
 
-    def without_added(self) -> Variables:
-        """The variables without a user's."""
-        return replace(self, nuisance=tuple(v for v in self.nuisance if not v.kind.startswith("own")))
-
-    def with_added(self, key: int, symbol: str, initial: gtsam.Values) -> Variables:
-        """The variables with one that a user added, a pose or a vector; a vector of nothing where it is neither."""
-        n = 6
-        kind: Literal["own", "own pose"] = "own pose"
-        try:
-            initial.atPose3(key)
-        except RuntimeError:
-            kind = "own"
-            try:
-                n = len(initial.atVector(key))
-            except RuntimeError:
-                n = 0
-        first, column = self.nuisance_span.stop, self.n_columns + self.n_nuisance
-        places, columns = tuple(range(first, first + n)), slice(column, column + n)
-        added = Variable(key, symbol, kind, places, columns, scales=(1.0,) * n)
-        return replace(self, nuisance=(*self.nuisance, added))
+    def with_added(self, keys: Sequence[int], initial: gtsam.Values) -> Variables:
+        """The variables with those that a user added, and no others of a user's."""
+        v = replace(self, nuisance=tuple(v for v in self.nuisance if not v.kind.startswith("own")))
+        for key in keys:
+            kind, n = _own_kind(initial, key)
+            first, column = v.nuisance_span.stop, v.n_columns + v.n_nuisance
+            places, columns = tuple(range(first, first + n)), slice(column, column + n)
+            v = replace(v, nuisance=(*v.nuisance, Variable(key, kind, places, columns, scales=(1.0,) * n)))
+        return v
 
     def columns_of(self, other: Variables, parameters: Floats) -> Floats:
         """Each column of other variables of the same arm in these, shape (n_columns, other.n_columns).
@@ -349,52 +341,50 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
         frames: Of each table, whether its measurement frame is unknown.
         priors: Whether the robot's tolerances are priors.
     """
-    items: list[Variable] = []
-    names: list[str] = []
-    columns: dict[int, int] = {}
-    tool_tangent = base_tangent = None
+    items, names, n = list[Variable](), list[str](), len(robot.parameters)
+
+    def add(letter: str, number: int, kind: VariableKind, places: Sequence[int], of: Sequence[str]) -> None:
+        span = slice(len(names), len(names) + len(of))
+        names.extend(of)
+        items.append(Variable(gtsam.symbol(letter, number), kind, tuple(places), span))
+
     for owner in range(robot.n_joints + 2):
-        owned = robot.owned_by(owner)
-        chosen = [i for i in owned if robot.parameters[i].estimated]
-        if not chosen:
-            continue
-        first = len(names)
-        names += names_of(robot.parameters[i] for i in chosen)
-        span = slice(first, len(names))
-        if owner == robot.n_joints + 1 and len(chosen) == 6:
-            tool_tangent = first
-            items.append(Variable(gtsam.symbol("T", 0), "T(0)", "tool", tuple(chosen), span))
-        elif owner == 0 and len(chosen) == 6:
-            base_tangent = first
-            items.append(Variable(gtsam.symbol("B", 0), "B(0)", "base", tuple(chosen), span))
-        else:
-            columns |= {i: first + k for k, i in enumerate(chosen)}
-            items.append(Variable(gtsam.symbol("K", owner), f"K({owner})", "vector", tuple(chosen), span))
-    place, tangents = len(robot.parameters), {}
-    for table in np.flatnonzero(frames).tolist():
-        tangents[table] = (len(names), place)
+        chosen = [i for i in robot.owned_by(owner) if robot.parameters[i].estimated]
+        of = names_of(robot.parameters[i] for i in chosen)
+        if len(chosen) == 6 and owner == 0:
+            add("B", 0, "base", chosen, of)
+        elif len(chosen) == 6 and owner > robot.n_joints:
+            add("T", 0, "tool", chosen, of)
+        elif chosen:
+            add("K", owner, "vector", chosen, of)
+    for k, table in enumerate(np.flatnonzero(frames).tolist()):
         prefix = "frame" if sum(frames) == 1 else f"frame{table + 1}"
-        span = slice(len(names), len(names) + 6)
-        names += [f"{prefix}.{kind}" for kind in FRAME_KINDS]
-        key = gtsam.symbol("X", table)
-        items.append(Variable(key, f"X({table})", "frame", tuple(range(place, place + 6)), span))
-        place += 6
-    chains = []
-    for table in range(len(frames)):
-        tangent, source = tangents.get(table, (None, 0))
+        add("X", table, "frame", range(n + 6 * k, n + 6 * k + 6), [f"{prefix}.{kind}" for kind in FRAME_KINDS])
+    vectors = (v for v in items if v.kind == "vector")
+    columns = {i: v.columns.start + k for v in vectors for k, i in enumerate(v.parameters)}
+    poses, chains = {v.symbol: v for v in items if v.is_pose}, list[Chain]()
+    tangents = {symbol: v.columns.start for symbol, v in poses.items()}
+    for frame in (f"X({table})" for table in range(len(frames))):
         chain = build_chain(
             robot,
             columns,
-            tool_tangent=tool_tangent,
-            base_tangent=base_tangent,
-            frame_tangent=tangent,
-            frame=tangent is not None,
+            tool_tangent=tangents.get("T(0)"),
+            base_tangent=tangents.get("B(0)"),
+            frame_tangent=tangents.get(frame),
+            frame=frame in poses,
         )
-        moved = np.where(
-            chain.source >= len(robot.parameters), chain.source - len(robot.parameters) + source, chain.source
-        )
-        chains.append(replace(chain, source=moved, n_columns=len(names)))
+        later = poses[frame].parameters[0] - n if frame in poses else -n
+        source = np.where(chain.source >= n, chain.source + later, chain.source)
+        chains.append(replace(chain, source=source, n_columns=len(names)))
     return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
+
+
+def _own_kind(initial: gtsam.Values, key: int) -> tuple[VariableKind, int]:
+    """Kind and size of a variable that a user added: a vector, else a pose."""
+    try:
+        return "own", len(initial.atVector(key))
+    except RuntimeError:
+        return "own pose", 6
 
 
 def pose_of(frame: Floats) -> gtsam.Pose3:

@@ -176,7 +176,7 @@ DAMAGES = {
     "longer": (lambda p: p.graph.resize(20), "problem.graph: an added NoneType, expected a factor with a noise "
                "model of sigmas above 0, such as PriorFactorVector or CustomFactor"),
     "no start": (lambda p: p.initial.erase(K1), "problem.initial: no value of K1, expected one for every variable of "
-                 "the graph"),
+                 "the graph, and no others"),
     "a longer start": (with_value(K1, np.zeros(7)), "problem.initial: K(1): another value, expected 4 finite numbers"),
     "a start of another type": (with_value(T0, np.zeros(6)), "problem.initial: T(0): another value, expected "
                                 "a gtsam.Pose3"),
@@ -184,9 +184,9 @@ DAMAGES = {
                             "expected 4 finite numbers"),
     "an added variable without a start": (with_factor(gtsam.PriorFactorPose3(ADDED, gtsam.Pose3(), UNIT(6))),
                                           "problem.initial: no value of p7, expected one for every variable of "
-                                          "the graph"),
+                                          "the graph, and no others"),
     "a start without a factor": (lambda p: p.initial.insert(ADDED, np.ones(3)), "problem.initial: a value of p7, "
-                                 "expected none without a factor on it"),
+                                 "expected one for every variable of the graph, and no others"),
     "a factor of other size": (with_factor(gtsam.PriorFactorVector(K1, np.zeros(3), UNIT(3))), "problem.graph: added "
                                "PriorFactorVector on K1: raised ValueError: NoiseModelFactor: NoiseModel has dimension "
                                "3 instead of 4."),

@@ -47,10 +47,15 @@ def direct(rng, *, graph="star", joint=0.0):
         "all": np.triu_indices(14, 1),
         "mixed": (np.repeat(np.arange(5), 3), 5 + np.arange(15) % 9),
     }[graph]
+    if graph == "mixed":  # points reached again from nearby
+        q = m.readings.copy()
+        q[b[::4]] = q[a[::4]] + 1e-3 * rng.normal(size=(4, 4))
+        m = replace(m, readings=q)
     at, n = pose(true_robot(robot, rng), m.readings + joint * rng.normal(size=m.readings.shape)), len(a)
     distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + 1e-3 * rng.normal(size=n)
     angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + 5e-4 * rng.normal(size=n)
     distance[:: 4 if graph == "mixed" else 100] = 0.0 if graph == "mixed" else np.nan
+    angle[: n if graph == "mixed" else 0 : 4] = np.nan
     pairs = Pairs(a, b, distance, angle, np.full(n, 1e-3), np.full(n, 5e-4), np.zeros(n, bool))
     return robot, replace(m, pairs=pairs, sigma_joint=np.full(4, joint))
 
