@@ -10,27 +10,18 @@ from simulated import paper_robot, planar_robot, small_arm
 
 from fg_calib.designs.candidates import find_candidates
 from fg_calib.robot.inverse import REACHED, random_readings
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.model import Robot
 from fg_calib.simulation.obstacles import enters, link_points
 from fg_calib.simulation.scenario import BoardViews, Box, GivenReadings, Placement, TargetViews
 from fg_calib.simulation.views import number_of
 
-LIMIT = 170.0
-
-
-def arm(limit=LIMIT):
-    """Seven joints, 1.3 m from the base to the tool; all turn +-limit degrees."""
-    rows = [(0, -90, 0.36), (0, 90, 0), (0, 90, 0.42), (0, -90, 0), (0, -90, 0.4), (0, 90, 0), (0, 0, 0.126)]
-    builder = RobotBuilder("arm", "dh")
-    builder.add_frame("base", {}, 0, False)
-    for i, (a, alpha, d) in enumerate(rows):
-        joint = Joint(f"q{i + 1}", lower=-np.deg2rad(limit), upper=np.deg2rad(limit))
-        builder.add_convention_joint(joint, {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0})
-    builder.add_frame("tool", {"z": 0.1, "pitch": 0.2}, 8, False)
-    return builder.build()
-
-
-ARM = arm()
+LIMIT = np.deg2rad(170.0)
+ARM = Robot.from_dh(
+    [(0, -np.pi / 2, 0.36, 0), (0, np.pi / 2, 0, 0), (0, np.pi / 2, 0.42, 0), (0, -np.pi / 2, 0, 0),
+     (0, -np.pi / 2, 0.4, 0), (0, np.pi / 2, 0, 0), (0, 0, 0.126, 0)],
+    "dh", name="arm", limits=[[-LIMIT, LIMIT]] * 7, tool=[0, 0, 0.1, 0, 0.2, 0],
+)  # fmt: skip
+"""Seven joints, 1.3 m from the base to the tool."""
 BOARD = Placement(np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).T, np.array([0.7, 0.1, 0.4]))
 VIEWS = BoardViews(BOARD, 99, height=0.4, distance=(0.3, 0.6), cone=0.7)  # its normal is the base's -x
 TARGET = TargetViews(
@@ -39,14 +30,12 @@ TARGET = TargetViews(
 )  # fmt: skip
 
 
-def draw(robot, of, seed=0, **options):
-    of = replace(of, **{key: options[key] for key in ("apart", "keep_out") if key in options})
-    found = find_candidates(robot, of, options.get("n", number_of(of)), np.random.default_rng(seed))
+def draw(robot, of, n=None, **conditions):
+    of = replace(of, **conditions)
+    found = find_candidates(robot, of, n or number_of(of), np.random.default_rng(0))
     assert found.asked == len(found.readings) + sum(found.rejected.values())
     lower, upper = robot.limits.T
-    if not isinstance(of, GivenReadings):
-        assert (found.readings >= lower).all()
-        assert (found.readings <= upper).all()
+    assert isinstance(of, GivenReadings) or ((found.readings >= lower) & (found.readings <= upper)).all()
     return found
 
 
@@ -63,7 +52,7 @@ def angle(a, b):
 
 
 def test_rows_of_a_table_outside_the_limits_are_rejected_and_the_order_kept():
-    q = np.linspace(-2.0, 2.0, 5)[:, None] * np.ones(7) * np.deg2rad(LIMIT) / 1.5
+    q = np.linspace(-2.0, 2.0, 5)[:, None] * np.ones(7) * LIMIT / 1.5
     found = draw(ARM, GivenReadings(q))
     assert found.readings.tolist() == q[1:4].tolist()
     assert (found.asked, found.rejected) == (5, {"outside the joint limits": 2})
