@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fg_calib import statistics
 from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
 from fg_calib.diagnostics.multistart import multistart
 from fg_calib.graph import Problem, Solution, check_graph, problem_of, solve
@@ -18,24 +19,6 @@ from fg_calib.observability import Identifiability, Observability, identifiabili
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot, without_rigid_motion
-from fg_calib.statistics import (
-    Acceptance,
-    CrossValidation,
-    Estimates,
-    Fit,
-    HeldOut,
-    Spread,
-    accept,
-    chi_square,
-    estimate_noise,
-    estimate_tolerances,
-    estimates_at,
-    judge_fit,
-    judge_priors,
-    judge_without_outliers,
-    spread_of,
-    with_left_out,
-)
 from fg_calib.statistics.residual_table import residual_table
 
 
@@ -75,19 +58,19 @@ class Assessment(FrozenArrays):
     """
 
     robot: Robot
-    estimates: Estimates
+    estimates: statistics.Estimates
     names: tuple[str, ...]
     covariance: Floats
-    spread: Spread
-    whole: Spread
-    fit: Fit
+    spread: statistics.Spread
+    whole: statistics.Spread
+    fit: statistics.Fit
     identifiability: Identifiability
     verdict: Verdict
     expected_error: ExpectedError | None
-    acceptance: Acceptance | None = None
-    cross_validation: CrossValidation | None = None
+    acceptance: statistics.Acceptance | None = None
+    cross_validation: statistics.CrossValidation | None = None
 
-    def with_folds(self, folds: CrossValidation, solution: Solution) -> Assessment:
+    def with_folds(self, folds: statistics.CrossValidation, solution: Solution) -> Assessment:
         """The assessment with cross-validation, which judges limits on kinds without test rows.
 
         Args:
@@ -96,7 +79,7 @@ class Assessment(FrozenArrays):
         """
         return replace(self.with_held_out(folds.by_table, solution), cross_validation=folds)
 
-    def with_held_out(self, others: Sequence[HeldOut], solution: Solution) -> Assessment:
+    def with_held_out(self, others: Sequence[statistics.HeldOut], solution: Solution) -> Assessment:
         """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
 
         Args:
@@ -106,7 +89,8 @@ class Assessment(FrozenArrays):
         tested = self.fit.residuals.held_out(solution.problem.data.labels)
         kinds = {held.kind for held in tested}
         held_out = (*tested, *(held for held in others if held.kind not in kinds))
-        return replace(self, acceptance=accept(solution.problem.options.accept, held_out, self.verdict.errors))
+        limits = solution.problem.options.accept
+        return replace(self, acceptance=statistics.accept(limits, held_out, self.verdict.errors))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.estimates.parameters if p.identifiability != "fixed")
@@ -202,7 +186,8 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
     """
     problem = problem or problem_of(job)
     try:
-        solution = estimate_tolerances(problem, estimate_noise if job.options.estimate_noise else solve)
+        solve_with = statistics.estimate_noise if job.options.estimate_noise else solve
+        solution = statistics.estimate_tolerances(problem, solve_with)
     except SolverError as error:
         for table in job.tables:
             if table.model is not None:
@@ -234,17 +219,18 @@ def assess(solution: Solution) -> Assessment:
     """
     problem = solution.problem
     check_graph(problem)
-    spread = spread_of(solution)
-    whole = with_left_out(solution, spread)
+    spread = statistics.spread_of(solution)
+    whole = statistics.with_left_out(solution, spread)
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     table = residual_table(solution)
-    goodness = judge_without_outliers(solution, spread, table, judge_fit(solution, spread, table))
+    goodness = statistics.judge_without_outliers(solution, spread, table, statistics.judge_fit(solution, spread, table))
     table = table.without(goodness.unknown(table))
-    fit = Fit(chi_square(solution, spread), table, goodness, judge_priors(solution, spread))
+    chi_square, priors = statistics.chi_square(solution, spread), statistics.judge_priors(solution, spread)
+    fit = statistics.Fit(chi_square, table, goodness, priors)
     verdict = judge(solution, spread, fit, identifiability.missing)
     return Assessment(
         robot=problem.robot.with_values(solution.parameters[problem.variables.robot_span]),
-        estimates=estimates_at(solution, spread, whole, identifiability.observability),
+        estimates=statistics.estimates_at(solution, spread, whole, identifiability.observability),
         names=whole.variables.names[: whole.variables.n_robot_columns],
         covariance=whole.named(),
         spread=spread,
@@ -253,5 +239,5 @@ def assess(solution: Solution) -> Assessment:
         identifiability=identifiability,
         verdict=verdict,
         expected_error=None if problem.evaluated else expected_error(problem, whole),
-        acceptance=accept(problem.options.accept, fit.residuals.held_out(problem.data.labels), verdict.errors),
+        acceptance=statistics.accept(problem.options.accept, table.held_out(problem.data.labels), verdict.errors),
     )

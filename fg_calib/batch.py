@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.inputs import InputError, checked, escaped, shown
@@ -184,10 +184,9 @@ def jobs_document(jobs: Sequence[JobSummary], seconds: float) -> dict[str, Any]:
         jobs: The summary of each job.
         seconds: Duration of all of them together, [s].
     """
-    verdicts: tuple[Verdict, ...] = ("good", "not accepted", "doubtful", "failed")
     return {
         "schema": "fg-calib/jobs/1",
-        "n": {verdict: sum(job.verdict == verdict for job in jobs) for verdict in verdicts},
+        "n": {verdict: sum(job.verdict == verdict for job in jobs) for verdict in get_args(Verdict)},
         "exit_code": exit_code(jobs),
         "seconds": seconds,
         "jobs": [asdict(job) for job in jobs],

@@ -14,7 +14,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +21,11 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from fg_calib import io
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.graph import SIZE, Knowledge, Solution, Variables, build_variables, frame_of, tables_of
 from fg_calib.inputs import (
+    Brief,
     Floats,
     InputError,
     Options,
@@ -37,26 +38,6 @@ from fg_calib.inputs import (
     listed,
     shown,
 )
-from fg_calib.io import (
-    RESULT_FILES,
-    UNSTATED,
-    ResidualFile,
-    Result,
-    configuration_frame,
-    fill_folder,
-    is_folder,
-    joint_frame,
-    noting_reads,
-    read_calibrated_robot,
-    read_job,
-    read_result,
-    read_table,
-    read_table_like,
-    residual_frame,
-    write_calibration,
-    write_text,
-)
-from fg_calib.io import Knowledge as SavedKnowledge
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
@@ -80,7 +61,7 @@ from fg_calib.report import (
     summary,
 )
 from fg_calib.robot import Robot, names_of
-from fg_calib.statistics import FrameEstimate, ParameterEstimate, TangentCovariance, cross_validate
+from fg_calib.statistics import ParameterEstimate, TangentCovariance, cross_validate
 
 if TYPE_CHECKING:
     import polars as pl
@@ -136,7 +117,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
         ProblemError: The measurements lack what the model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    given = job if isinstance(job, Job) else read_job(job)
+    given = job if isinstance(job, Job) else io.read_job(job)
     options = given.options
     try:
         tell("calibrating")
@@ -159,12 +140,11 @@ def _with_first_sigmas(m: Measurements) -> Measurements:
     first: dict[str, Any] = {}
     for name, measured in (("position", m.position), ("orientation", m.rotation)):
         if measured is not None and getattr(m, f"sigma_{name}") is None:
-            first[f"sigma_{name}"] = np.full((m.n_configurations, 3), getattr(UNSTATED, name))
+            first[f"sigma_{name}"] = np.full((m.n_configurations, 3), getattr(io.UNSTATED, name))
     if m.pairs is not None:
-        given: dict[str, Any] = {"distance": m.pairs.sigma_distance, "angle": m.pairs.sigma_angle}
-        first["pairs"] = replace(
-            m.pairs, **{f"sigma_{k}": np.nan_to_num(s, nan=getattr(UNSTATED, k)) for k, s in given.items()}
-        )
+        distance = np.nan_to_num(m.pairs.sigma_distance, nan=io.UNSTATED.distance or 0.0)
+        angle = np.nan_to_num(m.pairs.sigma_angle, nan=io.UNSTATED.angle or 0.0)
+        first["pairs"] = replace(m.pairs, sigma_distance=distance, sigma_angle=angle)
     return replace(m, **first)
 
 
@@ -173,7 +153,7 @@ Given = Path | str | Job | Measurements | Table | Sequence[Measurements | Table]
 
 
 @dataclass(frozen=True)
-class PredictedPoses:
+class PredictedPoses(Brief):
     """Tool poses that a calibrated robot takes, with what its parameters may be off.
 
     Attributes:
@@ -197,11 +177,6 @@ class PredictedPoses:
         """1 sigma of a turn about the axes, shape (n, 3), [rad]."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, 3:])
 
-    def __repr__(self) -> str:
-        n = len(self.position)
-        rms = np.sqrt(np.mean(np.sum(self.sigma_position**2, axis=1))) * 1e3 if n else np.nan
-        return f"PredictedPoses, {n} poses, expected RMS error of the position {rms:.3g} mm"
-
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Calibration:
@@ -216,7 +191,7 @@ class Calibration:
     """
 
     robot: Robot
-    result: Result
+    result: io.Result
     posterior: TangentCovariance
     assessed: tuple[Solution, Assessment] | None = None
     folder: Path | None = None
@@ -229,9 +204,9 @@ class Calibration:
         Args:
             solution: The solution.
             uncertainty: Its assessment.
-            origin: Files, job, date and history: see `Result.of`.
+            origin: Files, job, date and history: see `io.Result.of`.
         """
-        result = Result.of(solution, uncertainty, notes=tuple(notes_of(solution, uncertainty)), **origin)
+        result = io.Result.of(solution, uncertainty, notes=tuple(notes_of(solution, uncertainty)), **origin)
         return cls(uncertainty.robot, result, uncertainty.whole, (solution, uncertainty))
 
     @classmethod
@@ -244,15 +219,15 @@ class Calibration:
         Raises:
             InputError: There is none, or it is damaged.
         """
-        result, folder = read_result(path), Path(path) if is_folder(Path(path)) else Path(path).parent
-        robot = _with_priors(read_calibrated_robot(folder, result), result)
+        result, folder = io.read_result(path), Path(path) if io.is_folder(Path(path)) else Path(path).parent
+        robot = _with_priors(io.read_calibrated_robot(folder, result), result)
         nominal = robot.with_values([p.nominal for p in result.parameters])  # columns are scaled by its reach
         posterior = _posterior(nominal, result, f"{folder / 'result.json'}: posterior")
         return cls(robot, result, posterior, folder=folder)
 
     @checked
     def save(
-        self, folder: Path | str, *, residuals: ResidualFile = "csv", report: bool = False, figures: bool = False
+        self, folder: Path | str, *, residuals: io.ResidualFile = "csv", report: bool = False, figures: bool = False
     ) -> None:
         """Write what `calibrate --out` writes: `result.json`, the calibrated robot and the tables.
 
@@ -270,9 +245,9 @@ class Calibration:
         if residuals != "none":
             tables[f"residuals.{residuals}"] = self.residuals
         if joint_errors is not None:
-            tables["joints.csv"] = joint_frame(joint_errors, self.solution)
+            tables["joints.csv"] = io.joint_frame(joint_errors, self.solution)
         known = {name: table for name, table in tables.items() if table is not None}
-        write_calibration(Path(folder), self.result, self.robot, known, self._pages(report=report, figures=figures))
+        io.write_calibration(Path(folder), self.result, self.robot, known, self._pages(report=report, figures=figures))
 
     def _pages(self, *, report: bool, figures: bool) -> dict[str, str]:
         """The text of the page and of its figures, by file."""
@@ -283,15 +258,15 @@ class Calibration:
     def configurations(self) -> pl.DataFrame | None:
         """Every measured configuration, as `configurations.csv` has it; None if that file is missing."""
         if self.assessed is not None:
-            return configuration_frame(*self.assessed)
-        return None if self.folder is None else read_table(self.folder, "configurations", self.result)
+            return io.configuration_frame(*self.assessed)
+        return None if self.folder is None else io.read_table(self.folder, "configurations", self.result)
 
     @cached_property
     def residuals(self) -> pl.DataFrame | None:
         """Every scalar residual, as `residuals.csv` has it; None if it was not saved."""
         if self.assessed is not None:
-            return residual_frame(*self.assessed)
-        return None if self.folder is None else read_table(self.folder, "residuals", self.result)
+            return io.residual_frame(*self.assessed)
+        return None if self.folder is None else io.read_table(self.folder, "residuals", self.result)
 
     @property
     def measured(self) -> Floats | None:
@@ -430,13 +405,13 @@ class Calibration:
             if not job:
                 found = "the calibration does not say how its tables were read"
                 raise InputError(path.name, found, "a job that names the table")
-            with noting_reads() as files:
-                table = read_table_like(job, robot, path, pairs=of_pairs, like=like)
+            with io.noting_reads() as files:
+                table = io.read_table_like(job, robot, path, pairs=of_pairs, like=like)
             inputs = {file.name: digest for file, digest in files.items()}
             return Rows.of([table], [like or path.name], options), inputs
         if pairs is not None or like is not None:
             raise InputError("pairs" if pairs else "like", "given with rows that say it themselves", "none")
-        new, inputs = read_job(given) if isinstance(given, Path | str) else given, {}
+        new, inputs = io.read_job(given) if isinstance(given, Path | str) else given, {}
         if isinstance(new, Job):
             if names_of(new.robot.parameters) != names_of(robot.parameters) or new.robot.convention != robot.convention:
                 expected = f"that of the result, {robot.name}"
@@ -494,11 +469,6 @@ class Calibration:
         return every[np.ix_(rows, rows)]
 
     @property
-    def frame(self) -> FrameEstimate | None:
-        """The measurement frame world_T_base; None where it was not estimated."""
-        return self.result.frame_estimate
-
-    @property
     def findings(self) -> tuple[str, ...]:
         """Why it is not to be trusted; empty if it is."""
         return self.result.findings
@@ -541,7 +511,7 @@ class Calibration:
             raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
         if number is None and len(known) == 1:
             return known[0]
-        if not isinstance(number, Integral) or number not in known:
+        if number is None or number not in known:
             found = "several measurement frames" if number is None else f"found {shown(number)}"
             raise InputError("table", found, f"one of {', '.join(map(str, known))}: the table whose frame is meant")
         return int(number)
@@ -662,12 +632,12 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
 
     def write(into: Path) -> None:
         for name, text in texts.items():
-            write_text(into / name, text)
+            io.write_text(into / name, text)
 
-    fill_folder(Path(folder or found.folder or ""), write, {name: RESULT_FILES[name] for name in texts})
+    io.fill_folder(Path(folder or found.folder or ""), write, {name: io.RESULT_FILES[name] for name in texts})
 
 
-def _with_priors(robot: Robot, result: Result) -> Robot:
+def _with_priors(robot: Robot, result: io.Result) -> Robot:
     """A robot with the priors of a result, which may have been estimated, and with its estimated parameters."""
     robot, prior = robot.with_estimated(result.covariance.names), {p.name: p.prior_sigma for p in result.parameters}
     return replace(
@@ -675,7 +645,7 @@ def _with_priors(robot: Robot, result: Result) -> Robot:
     )
 
 
-def _posterior(robot: Robot, result: Result, place: str) -> TangentCovariance:
+def _posterior(robot: Robot, result: io.Result, place: str) -> TangentCovariance:
     """The saved covariance, of a nominal robot.
 
     Raises:
@@ -706,7 +676,7 @@ def _posterior_of_names(variables: Variables, values: Floats, covariance: Floats
     return TangentCovariance(variables, values, tangent, loose, loose)
 
 
-def _knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
+def _knowledge(robot: Robot, saved: io.Knowledge) -> Knowledge:
     """The information of the rows of a saved result.
 
     Raises:
@@ -723,20 +693,18 @@ def _knowledge(robot: Robot, saved: SavedKnowledge) -> Knowledge:
 
 
 def _date_and_days(given: str | None, before: str) -> tuple[str, float | None]:
-    """A date as it is written, now if None, and the days to it from the date before; None where that is not known.
+    """A date, now if None, and the days to it from the date before; None where that is not known.
 
     Raises:
         InputError: It is no date, or a day or more before the other.
     """
+    text = given or datetime.now(UTC).isoformat(timespec="seconds")
     try:
-        date = datetime.now(UTC) if given is None else datetime.fromisoformat(given)
+        dates = [datetime.fromisoformat(date) for date in (before or text, text)]
     except ValueError:
         raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
-    text = date.isoformat(timespec="seconds") if given is None else date.isoformat()
-    if not before:
-        return text, None
-    first, second = (d if d.tzinfo else d.replace(tzinfo=UTC) for d in (datetime.fromisoformat(before), date))
+    first, second = (date if date.tzinfo else date.replace(tzinfo=UTC) for date in dates)
     days = (second - first).total_seconds() / 86400.0
     if days <= -1.0:  # a date without a time zone may be of the same day
         raise InputError("date", f"{text} is before the calibration, {before}", "a later one")
-    return text, max(days, 0.0)
+    return text, max(days, 0.0) if before else None

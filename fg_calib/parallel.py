@@ -38,9 +38,7 @@ MOST = 1000
 SCHEDULER_TIMEOUT_S = 30.0
 """Time in which a scheduler must answer."""
 
-DIED = (
-    "the process that it ran on died, twice; is there enough memory, and is a script guarded by __name__ == '__main__'?"
-)
+DIED = "its process died, twice; is there enough memory, and is a script guarded by __name__ == '__main__'?"
 
 listener: ContextVar[Callable[[str, int, int], None]] = ContextVar("listener", default=lambda _what, _done, _of: None)
 """Takes what is being done, how many parts of it are done, and how many there are (0: unknown)."""
@@ -134,8 +132,7 @@ def _note_fork() -> None:
     _forked_from_polars = "polars" in sys.modules
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note_fork)
+os.register_at_fork(after_in_child=_note_fork)
 
 
 def require_polars(place: str) -> None:
@@ -187,12 +184,7 @@ def map_jobs(
 
     Returns:
         What the function returned, or a failure, in the order of the jobs.
-
-    Raises:
-        InputError: The jobs are no list.
     """
-    if not isinstance(jobs, Iterable):
-        raise InputError("jobs", f"found {shown(jobs)}", "a list of them")
     given = list(jobs)
     named = [f"job {k + 1}" for k in range(len(given))] if names is None else list(names)
     calls = [_submit(executor, function, *both) for both in zip(given, named, strict=True)]
@@ -291,8 +283,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError:
-        hint = "pip install 'fg-calib[distributed]'"
-        raise InputError("scheduler", "Dask is not installed", "the package distributed", hint) from None
+        raise InputError("scheduler", "Dask is not installed", hint="pip install 'fg-calib[distributed]'") from None
     try:
         client: Any = Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:

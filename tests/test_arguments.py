@@ -37,7 +37,7 @@ def test_arguments_that_fit_pass_as_they_are():
 
 
 def test_a_wrong_call_fails_in_pythons_own_words():
-    with pytest.raises(TypeError, match="missing 1 required positional argument: 'path'"):
+    with pytest.raises(TypeError, match="missing a required argument: 'path'"):
         named()
 
 

@@ -132,7 +132,7 @@ def test_predictions_in_the_measurement_frame(found):
     world = result.predict(m.readings, world=True)
     off = (world.position - m.position)[m.test] / 1e-3  # sigma of a measured position
     assert np.sum(off**2) < 2.0 * off.size
-    turn, shift = Rotation.from_quat(result.frame.quaternion_xyzw), result.frame.xyz
+    turn, shift = Rotation.from_quat(result.result.frame_estimate.quaternion_xyzw), result.result.frame_estimate.xyz
     base = result.predict(m.readings)
     assert world.position == pytest.approx(turn.apply(base.position) + shift, abs=1e-12)
     assert np.all(world.sigma_position.max(axis=1) < base.sigma_position.max(axis=1))
@@ -148,7 +148,7 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
     assert np.array_equal(again.covariance(), result.covariance(), equal_nan=True)
     assert again.robot.nominal == pytest.approx(result.robot.nominal, abs=1e-15)
     assert (again.trustworthy, again.findings) == (result.trustworthy, result.findings)
-    for world in (False, True)[: 1 + (result.frame is not None)]:
+    for world in (False, True)[: 1 + (result.result.frame_estimate is not None)]:
         before, after = result.predict(Q, world=world), again.predict(Q, world=world)
         # The frame goes through a quaternion; all else is the same figures.
         assert after.position == pytest.approx(before.position, abs=1e-14)

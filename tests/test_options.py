@@ -84,9 +84,6 @@ MISTAKES = {
     "a seed below 0": (
         lambda: Pairing("random", 3, -1), "pairing: seed: found -1, expected a whole number not below 0"
     ),
-    "a number of pairs of a star": (
-        lambda: Pairing("star", 3), "pairing: count: has no effect on star, expected the strategy random"
-    ),
     **{f"a bare strategy {f.__name__}": (
         lambda f=f: f(pairing="chain"), "pairing: found 'chain', expected a Pairing, such as Pairing('chain')"
     ) for f in (problem, bound, practical)},

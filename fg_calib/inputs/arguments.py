@@ -60,10 +60,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def with_checked(*args: P.args, **kwargs: P.kwargs) -> R:
         hints = _hints(function)
-        try:
-            given = _signature(function).bind(*args, **kwargs).arguments
-        except TypeError:  # in Python's own words
-            return function(*args, **kwargs)
+        given = _signature(function).bind(*args, **kwargs).arguments
         for name in given.keys() & hints.keys():
             check_type(name, given[name], hints[name])
         return function(*args, **kwargs)

@@ -35,10 +35,8 @@ class _AsLists:
 
 
 def _listed(values: NDArray[Any]) -> list[Any]:
-    finite = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, dtype=np.bool_)
-    plain: NDArray[Any] = values if finite.all() else values.astype(object)
-    plain = plain if finite.all() else np.where(finite, plain, np.array(None))
-    listed: list[Any] = plain.tolist()
+    known = values.dtype.kind != "f" or np.isfinite(values)
+    listed: list[Any] = (values if np.all(known) else np.where(known, values.astype(object), np.array(None))).tolist()
     return listed
 
 
@@ -64,11 +62,7 @@ class Brief:
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         if "__repr__" not in vars(cls):
-            cls.__repr__ = _brief  # type: ignore[method-assign] # dataclass makes none where there is one
-
-
-def _brief(of: object) -> str:
-    return brief(of, (f.name for f in fields(of) if f.repr))  # type: ignore[arg-type]
+            cls.__repr__ = lambda self: brief(self, (f.name for f in fields(self) if f.repr))  # type: ignore
 
 
 def brief(of: object, names: Iterable[str]) -> str:
@@ -279,15 +273,14 @@ def as_names(name: str, given: object, *, missing: bool = False) -> list[str | N
     found: list[str | None] = []
     listed = given if isinstance(given, list | tuple) else as_array(name, given, "iufUO", "names").tolist()
     for row, one in enumerate(listed):  # numpy would make words of what stands beside words in a list, even of None
-        whole = missing and isinstance(one, float) and one.is_integer()  # so pandas has whole numbers beside nan
+        whole = missing and isinstance(one, float) and one.is_integer()  # so pandas has whole numbers with nan
         cell: Any = int(one) if whole else one
-        word = isinstance(cell, str | int | np.integer) and not isinstance(cell, bool) and cell != ""
-        word = word and str(cell).strip().lower() not in NOTHING
         none = missing and (cell is None or type(cell).__name__ == "NAType" or cell == "" or cell != cell)  # noqa: PLR0124
-        if not word and not none:
+        word = isinstance(cell, str | int | np.integer) and not isinstance(cell, bool)
+        if not none and (not word or str(cell).strip().lower() in ("", *NOTHING)):
             expected = f"a name{', or None for none' * missing}: a word or a whole number"
             raise InputError(f"{name}: row {row}", f"found {_shown(cell)}", expected)
-        found.append(str(cell) if word else None)
+        found.append(None if none else str(cell))
     return found
 
 

@@ -66,7 +66,7 @@ class Pairing:
         seed: Seed of the random pairs; of no other strategy.
 
     Raises:
-        InputError: One of them is not possible, or has no effect.
+        InputError: One of them is not possible.
     """
 
     strategy: Strategy = "star"
@@ -77,9 +77,6 @@ class Pairing:
         check("pairing", self.strategy, Strategy)
         check_number("pairing: count", self.count, above=self.strategy == "random", whole=True)
         check_number("pairing: seed", self.seed, whole=True)
-        for key in ("count", "seed"):
-            if self.strategy != "random" and getattr(self, key):
-                raise InputError(f"pairing: {key}", f"has no effect on {self.strategy}", "the strategy random")
 
     def __str__(self) -> str:
         return self.strategy if self.strategy != "random" else f"random ({self.count}, seed {self.seed})"
