@@ -349,15 +349,11 @@ def correlation_of(noises: Sequence[RowNoise], rows: WhitenedRows, J: Floats) ->
         rows: The whitened train rows.
         J: Their derivatives, shape (n_rows, n_columns); C is the covariance of the whitened rows.
     """
-    own, start = np.zeros((J.shape[1], J.shape[1])), 0
-    for part in rows.parts:
-        noise, train = noises[part.series], noises[part.series].series.train
-        of_part = J[start : start + part.n_rows].reshape(part.block.n, part.block.residual_dim, -1)
-        G = np.swapaxes(whitener_of(noise, part) @ noise.loading[train], 1, 2)
-        each = (G @ of_part).reshape(-1, J.shape[1])
-        own, start = own + each.T @ each, start + part.n_rows
+    each = [(noises[part.series], whitener_of(noises[part.series], part)) for part in rows.parts]
+    private = [block_diagonal(W @ noise.loading[noise.series.train]) for noise, W in each]
+    own = scipy.sparse.block_diag(private).T @ J
     common = all_errors(noises, rows).T @ J
-    out: Floats = common.T @ common - own
+    out: Floats = common.T @ common - own.T @ own
     return out
 
 

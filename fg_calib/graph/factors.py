@@ -222,11 +222,7 @@ _PAIR_FACTORS: dict[type, type[MeasurementFactor]] = {Distance: DistanceFactor, 
 
 def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
     """One factor for each variable that has parameters with a prior, or that was said to be somewhere."""
-    factors: list[gtsam.NonlinearFactor] = []
-    for v in variables.items:
-        n_rows = len(variables.stated[v.symbol][0])
-        if n_rows:
-            factors.append(_prior_factor(variables, v, n_rows))
+    factors = [_prior_factor(variables, v) for v in variables.items if variables.stated[v.symbol][0]]
     for v in variables.nuisance:
         if v.prior is not None:
             mean, sigma = (np.array(figures) for figures in v.prior)
@@ -234,37 +230,29 @@ def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
     return factors
 
 
-def _prior_factor(variables: Variables, variable: Variable, n_rows: int) -> gtsam.NonlinearFactor:
-    """GTSAM's own, which calls no Python, of a vector all of which has a prior; of poses, and of parts, ours."""
-    if not variable.is_pose and n_rows == len(variable.parameters):
-        mean, sigma = variables.nominal()[variable.places], 1.0 / variables.stated[variable.symbol][1]
-        return gtsam.PriorFactorVector(variable.key, mean, gtsam.noiseModel.Diagonal.Sigmas(sigma))
-
+def _prior_factor(variables: Variables, variable: Variable) -> gtsam.NonlinearFactor:
     def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
         r, J = prior_rows(variables, variables.parameters(values, [variable]), variable)
         return r, J[:, variable.columns]
 
-    return CheckedFactor([replace(variable, columns=slice(0, len(variable.parameters)))], n_rows, rows)
+    local = replace(variable, columns=slice(0, len(variable.parameters)))
+    return CheckedFactor([local], len(variables.stated[variable.symbol][0]), rows)
 
 
 def linearize_factors(
     factors: Sequence[gtsam.NonlinearFactor], variables: Variables, values: gtsam.Values
 ) -> tuple[Floats, Floats]:
     """Factors' whitened residuals and derivatives at some values, shapes (n,), (n, n_columns + n_nuisance)."""
-    n = variables.n_columns + variables.n_nuisance
-    if not factors:
-        return np.zeros(0), np.zeros((0, n))
-    graph = gtsam.NonlinearFactorGraph()
+    of_key = {v.key: np.r_[v.columns] for v in variables.items + variables.nuisance}
+    r, J = [np.zeros(0)], [np.zeros((0, variables.n_columns + variables.n_nuisance))]
     for factor in factors:
-        graph.add(factor)
-    chosen = [v for v in variables.items + variables.nuisance if v.key in graph.keyVector()]
-    ordering = gtsam.Ordering()
-    for v in chosen:
-        ordering.push_back(v.key)
-    A, b = graph.linearize(values).jacobian(ordering)
-    wide = np.zeros((len(b), n))
-    wide[:, np.concatenate([np.r_[v.columns] for v in chosen])] = A
-    return -b, wide
+        linear = factor.linearize(values)
+        A, b = linear.jacobian()
+        wide = np.zeros((len(b), J[0].shape[1]))
+        wide[:, np.concatenate([of_key[key] for key in linear.keys()])] = A  # noqa: SIM118 -- GTSAM's keys
+        r.append(-b)
+        J.append(wide)
+    return np.concatenate(r), np.vstack(J)
 
 
 def with_added(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from fg_calib.graph.factors import CheckedFactor
 from fg_calib.graph.normal_system import determined, eliminate
-from fg_calib.graph.variables import Variables, build_variables, pose_of
+from fg_calib.graph.variables import Variables, build_variables
 from fg_calib.inputs import Floats, FrameKnowledge, FrozenArrays, Integers, Model
 from fg_calib.measurements import LANDMARKS, Landmarks
 from fg_calib.robot import Robot
@@ -170,14 +170,10 @@ class Knowledge(FrozenArrays):
         """
         own, n = self.variables, self.variables.n_columns
         values, before = parameters[own.robot_span], self.robot.nominal
-        s, turned = np.zeros(n + len(self.at)), np.eye(n)
+        s, turned = np.concatenate([own.step(before, values), np.zeros(len(self.at))]), np.eye(n)
         for v in own.items:
-            of_v = v.places
             if v.is_pose:
-                step = gtsam.Pose3.Logmap(pose_of(before[of_v]).between(pose_of(values[of_v])))
-                s[v.columns], turned[v.columns, v.columns] = step, gtsam.Pose3.LogmapDerivative(step)
-            else:
-                s[v.columns] = values[of_v] - before[of_v]
+                turned[v.columns, v.columns] = gtsam.Pose3.LogmapDerivative(s[v.columns])
         D = np.zeros((len(s), variables.n_columns + variables.n_nuisance))
         D[:n, : variables.n_columns] = turned @ own.columns_of(variables, values)
         for i, name in enumerate(self.unknowns):

@@ -14,8 +14,6 @@ estimate. The fixed point solves J^T C(x)^-1 r = 0: quasi-likelihood, consistent
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -286,8 +284,12 @@ class _Point:
     @cached_property
     def system(self) -> NormalSystem:
         """The normal system."""
-        with _in_one_line():
+        try:
             return linear_system(self.problem, self.parameters)
+        except CalibrationError:
+            raise
+        except Exception as error:  # of LAPACK or an added factor
+            raise SolverError(" ".join((str(error) or type(error).__name__).split())) from error
 
     @property
     def decrement(self) -> float:
@@ -345,8 +347,13 @@ class _Point:
 
         graph.add(gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(n + 1), [key], evaluate))
         start.insert(key, np.zeros(n))
-        params = levenberg_marquardt_params(damping)
-        params.setDiagonalDamping(False)  # directions are in units of what they may be off
+        params = gtsam.LevenbergMarquardtParams()  # damping of all directions alike: they are in units of what they
+        params.setLinearSolverType("MULTIFRONTAL_QR")  # may be off
+        params.setlambdaInitial(damping)
+        params.setlambdaFactor(DAMPING_FACTOR)
+        params.setlambdaUpperBound(MOST_DAMPING)
+        params.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
+        params.setAbsoluteErrorTol(0.0)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, params)
         optimizer.iterate()
         if not optimizer.error() < system.cost or optimizer.lambda_() >= MOST_DAMPING:
@@ -466,33 +473,3 @@ def _solution(run: _Fit, before: Floats, started: Problem, clock: float) -> Solu
         weighted_cost=weighted_cost,
         seconds=time.perf_counter() - clock,
     )
-
-
-@contextmanager
-def _in_one_line() -> Iterator[None]:
-    """What LAPACK or an added factor raises in the block becomes a `SolverError`."""
-    try:
-        yield
-    except CalibrationError:
-        raise
-    except Exception as error:
-        raise SolverError(" ".join((str(error) or type(error).__name__).split())) from error
-
-
-def levenberg_marquardt_params(damping: float = 1e-3) -> gtsam.LevenbergMarquardtParams:
-    """Options for GTSAM's own optimiser that work on these graphs: QR, and damping in each column's own unit.
-
-    With its defaults GTSAM returns the start without a word where weak priors hold directions.
-
-    Args:
-        damping: Of the first step, as a share of each column's own curvature.
-    """
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setLinearSolverType("MULTIFRONTAL_QR")
-    parameters.setDiagonalDamping(True)
-    parameters.setlambdaInitial(damping)
-    parameters.setlambdaFactor(DAMPING_FACTOR)
-    parameters.setlambdaUpperBound(MOST_DAMPING)
-    parameters.setRelativeErrorTol(1e-13)  # no search for a lambda once the cost's own rounding decides
-    parameters.setAbsoluteErrorTol(0.0)
-    return parameters
