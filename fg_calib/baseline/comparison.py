@@ -190,16 +190,9 @@ def compare(job: Job) -> Comparison:
             robot, spread = assessed.robot, assessed.spread
             values = np.sqrt(np.diag(spread.named())).tolist()
             sigma, predicted = dict(zip(spread.variables.names, values, strict=False)), errors_at(spread, readings)
-        return Estimate(
-            name=name,
-            robot=robot,
-            sigma=sigma,
-            residual_rms=rms(fit, "after"),
-            predicted_position_rms=predicted[0].position,
-            predicted_position_rms_fitted=predicted[1].position,
-            errors=errors(robot),
-            **{key: getattr(fit, key) for key in ("converged", "message", "iterations", "seconds")},
-        )
+        base, fitted = (error.position for error in predicted)
+        about = (fit.converged, fit.message, fit.iterations, fit.seconds, rms(fit, "after"))
+        return Estimate(name, robot, sigma, *about, base, fitted, errors(robot))
 
     def without_priors(name: str) -> Estimate:
         try:

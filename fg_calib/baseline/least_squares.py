@@ -13,9 +13,9 @@ An unknown measurement frame takes six more unknowns: world_T_base = Txyz Rz(yaw
 pitch of 90 degrees. Landmarks that are not known are unknowns as well; one with a prior is a measurement of its place.
 
 Note:
-    Every measured train row takes part, but for distances of exactly 0 and angles of exactly 0 or pi at the start,
-    where they are not differentiable. Every measurement counts as independent, also pairs formed from poses and the
-    rows of one configuration, which share its joint noise. All rows and derivatives are in memory at once.
+    Every measured train row takes part, but pairs of one configuration with itself. Every measurement counts as
+    independent, also pairs formed from poses and the rows of one configuration, which share its joint noise. All rows
+    and derivatives are in memory at once.
 
 References:
     Jia, Wang, Chen, Sun (2019), Error Modeling in Distance and Rotation for Self-Calibration of Space Robots on
@@ -49,9 +49,6 @@ ROUNDING = 1e-8
 
 REWEIGHTED = 1e-10
 """Weights are final once a fit with them moves the unknowns by less than this, [m] and [rad]."""
-
-NOT_DIFFERENTIABLE = 1e-12
-"""A predicted distance below this, or an angle this near to 0 or pi, has no derivative, [m], [rad]."""
 
 _ROUNDS, _STEPS = 20, 50
 """Fits with new weights, and steps of one fit, at most."""
@@ -171,24 +168,17 @@ def gauss_newton(evaluate: Evaluate, x: Floats) -> Fit:
 
 
 def scipy_fit(evaluate: Evaluate, x: Floats) -> Fit:
-    """Minimum by MINPACK's Levenberg-Marquardt, or scipy's trust region with fewer rows than unknowns."""
+    """Minimum by MINPACK's Levenberg-Marquardt, which needs as many rows as unknowns."""
     from scipy import optimize  # here: it takes as long to import as a small calibration
 
-    def residual(x: Floats) -> Floats:
-        return evaluate(x)[0]
-
-    def jacobian(x: Floats) -> Floats:
-        return evaluate(x)[1]
-
-    method = "lm" if len(residual(x)) >= len(x) else "trf"
     ends = {"ftol": 1e-15, "xtol": _SMALL_STEP, "gtol": 1e-15, "max_nfev": _STEPS}  # near the least that MINPACK takes
-    options: dict[str, Any] = {"method": method, "x_scale": "jac", **ends}
+    both = {"fun": lambda x: evaluate(x)[0], "jac": lambda x: evaluate(x)[1]}
+    options: dict[str, Any] = {**both, "x0": x, "method": "lm", "x_scale": "jac", **ends}
     try:
-        found = optimize.least_squares(residual, x, jacobian, **options)
+        found = optimize.least_squares(**options)
     except (ValueError, np.linalg.LinAlgError) as error:
         return Fit(x, False, f"no step possible: {error}", 0)
-    message = " ".join(str(found.message).split()).rstrip(".")
-    message = f"{'converged' if found.status > 0 else 'not converged'}: {message}"
+    message = f"{'not ' * (found.status <= 0)}converged: {' '.join(str(found.message).split()).rstrip('.')}"
     return Fit(np.asarray(found.x, float), bool(found.status > 0), message, int(found.njev or found.nfev))
 
 
@@ -226,15 +216,6 @@ class _Rows:
     use: Booleans
     covariance: Floats
 
-    def differentiable(self, chain: Chain) -> _Rows:
-        """The rows without distances and angles of pairs that have no derivative at the start."""
-        parts = self.block.kind.parts
-        if not all(part.ends == 2 and part.quantity in ("distance", "angle") and not part.is_contact for part in parts):
-            return self
-        predicted = residuals.residual(self.block, chain) + self.block.data
-        most = np.array([np.pi if part.quantity == "angle" else np.inf for part in parts])
-        return replace(self, use=self.use & (np.minimum(predicted, most - predicted) >= NOT_DIFFERENTIABLE))
-
     def whitening(self, chain: Chain, coordinates: Floats, sigma_joint: Floats) -> Floats:
         """W with W S W^T = 1 of each measurement, lower triangular, shape (n, residual_dim, residual_dim).
 
@@ -264,9 +245,8 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
         if s.formed:  # each pair as if it were alone
             pairs = usable_pairs(data.tables[s.table])
             of_pairs = {"distance": pairs.sigma_distance, "angle": pairs.sigma_angle}
-            sigma = np.nan_to_num(
-                np.stack([of_pairs[part.quantity][s.number] for part in s.kind.parts], axis=1), nan=1.0
-            )
+            sigma = np.stack([of_pairs[part.quantity][s.number] for part in s.kind.parts], axis=1)
+            sigma = np.where(np.isnan(sigma), 1.0, sigma)
         specified = None if s.formed else s.covariance
         covariance = sigma[:, :, None] ** 2 * np.eye(h) if specified is None else specified
         found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], covariance[train]))
@@ -282,11 +262,8 @@ class _System:
         estimated, n, n_frames = data.estimated(), len(robot.parameters), int(unknown.sum())
         places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.landmarks.sizes]).tolist())]
         self._coordinates: Floats = data.landmarks.start
-        self._priors = [
-            (place, self._coordinates[place], item.tolerance)
-            for place, item, of in zip(places, data.landmarks.items, estimated, strict=True)
-            if of and item.tolerance is not None
-        ]
+        items = zip(places, data.landmarks.items, estimated, strict=True)
+        self._priors = [(p, self._coordinates[p], i.tolerance) for p, i, of in items if of and i.tolerance is not None]
         free = (place for place, of in zip(places, estimated, strict=True) if of)
         self._estimated = np.concatenate([np.zeros(0, np.int64), *free])
         self._n, self._edge = n, n + 6 * max(1, n_frames)
@@ -305,9 +282,7 @@ class _System:
             columns = {c: k for k, c in enumerate(chosen)}
             columns |= {n + k: len(chosen) + frame - n + k for k in range(6) if frame >= 0}
             self._chains.append(replace(build_chain(_with_frame(robot), columns), n_columns=self.n_core))
-        first = start[self._index]
-        rows = (r.differentiable(self._chain(r.table, first)) for r in _train_rows(robot, data))
-        self._rows = [r for r in rows if r.use.any()]
+        self._rows = _train_rows(robot, data)
         if not self._rows:
             models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
             raise InputError(data.source, "no row left to fit", f"train rows for model {models}")
@@ -321,9 +296,8 @@ class _System:
     def _chain(self, table: int, x: Floats) -> Chain:
         """The arm in a table's measurement frame at the unknowns x."""
         values, frame = self.parameters(x), self._frame_of[table]
-        return self._chains[table].at(
-            np.append(values[: self._n], values[frame : frame + 6] if frame >= 0 else np.zeros(6))
-        )
+        of_frame = values[frame : frame + 6] if frame >= 0 else np.zeros(6)
+        return self._chains[table].at(np.append(values[: self._n], of_frame))
 
     def _landmarks(self, x: Floats) -> Floats:
         """Coordinates of all landmarks at the unknowns x."""

@@ -134,17 +134,9 @@ def correct_targets(
     covariance = predict_poses(posterior, found.readings, table)[2]
     variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2)
     fitted = errors_at(posterior, found.readings)[1].position
-    return Correction(
-        readings=found.readings,
-        position=commanded.position,
-        rotation=commanded.rotation,
-        nominal_readings=uncorrected,
-        uncorrected=off,
-        missed=np.column_stack([found.miss_position, found.miss_rotation]),
-        expected=np.sqrt(variance),
-        expected_fitted=np.nan if fitted is None else fitted,
-        turns=turned is not None,
-    )
+    missed, expected = np.column_stack([found.miss_position, found.miss_rotation]), np.sqrt(variance)
+    at, whole = (commanded.position, commanded.rotation), np.nan if fitted is None else fitted
+    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, turned is not None)
 
 
 def _check_targets(

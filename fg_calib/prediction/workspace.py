@@ -42,12 +42,8 @@ _N_SAMPLED = 1000
 def _bounded(robot: Robot, readings: Floats) -> Robot:
     """The robot with its readings as the limits of joints that slide without any."""
     ends = zip(robot.joints, readings.min(axis=0).tolist(), readings.max(axis=0).tolist(), strict=True)
-    joints = [
-        replace(joint, lower=low, upper=high)
-        if joint.prismatic and not np.isfinite(joint.upper - joint.lower)
-        else joint
-        for joint, low, high in ends
-    ]
+    free = [joint.prismatic and not np.isfinite(joint.upper - joint.lower) for joint in robot.joints]
+    joints = [replace(j, lower=a, upper=b) if no else j for (j, a, b), no in zip(ends, free, strict=True)]
     return replace(robot, joints=tuple(joints))
 
 
@@ -240,14 +236,7 @@ def _responsible(
         shares = np.square(covariance @ v.T).sum(axis=1) / (variance * total)
         change = None if along is None else covariance @ along / np.sqrt(along @ posterior.tangent @ along)
     order = np.argsort(-np.nan_to_num(shares, nan=-1.0), kind="stable")[:_NAMED].tolist()
-    robot, names = variables.robot, variables.names
-    return tuple(
-        Responsible(
-            name=names[i],
-            unit=robot.parameters[robot.index(names[i])].unit,
-            share=float(shares[i]),
-            change=None if change is None else float(change[i]),
-        )
-        for i in order
-        if shares[i] >= _LEAST_SHARE
-    )
+    units = {p.name: p.unit for p in variables.robot.parameters}
+    changes = [None] * len(shares) if change is None else change.tolist()
+    chosen = [(variables.names[i], float(shares[i]), changes[i]) for i in order if shares[i] >= _LEAST_SHARE]
+    return tuple(Responsible(name, units[name], share, moved) for name, share, moved in chosen)

@@ -161,7 +161,7 @@ def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
     for e in others:
         assert (e.robot, e.converged) == (None, False)
         assert e.message == (
-            "could not run: pairs from measurements: the rows determine none of the parameters to estimate, "
+            "could not run: measurements: the rows determine none of the parameters to estimate, "
             "expected rows that some of them act on"
         )
     assert re.search(r"n estimated +- +2 +- +- +-\n", format_comparison(found))
