@@ -5,8 +5,8 @@ import yaml
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 
-from fg_calib.io.columns import write_csv
 from fg_calib.io.robot_file import write_robot
+from fg_calib.io.tables import write_csv
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Joint, Robot, RobotBuilder

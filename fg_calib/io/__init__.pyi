@@ -10,7 +10,6 @@ from .atomic import (
     require_writable,
     write_text,
 )
-from .columns import KNOWN, OF_CONFIGURATIONS, OF_PAIRS, Column, Table, names_of, require_own_csv, write_csv
 from .job import (
     NOISE_UNITS,
     UNSTATED,
@@ -25,21 +24,51 @@ from .job import (
     robot_of,
     units_of,
 )
-from .result import Knowledge, Observability, Result, Run, in_words, key_of, read_result
-from .robot_file import FrameValues, read_robot, robot_text, unit_of_key, write_robot
-from .saved import (
+from .result import (
     RESULT_FILES,
+    Knowledge,
+    Observability,
     ResidualFile,
+    Result,
+    Run,
     configuration_frame,
+    in_words,
     joint_frame,
+    key_of,
     read_calibrated_robot,
+    read_result,
     read_table,
     require_no_input,
     residual_frame,
     write_calibration,
 )
-from .tables import Targets, joint_columns, read_joint_table, read_measurements, read_targets
-from .urdf import ROUNDING, joint_origins, read_urdf, urdf_text, write_urdf
+from .robot_file import (
+    ROUNDING,
+    FrameValues,
+    joint_origins,
+    read_robot,
+    read_urdf,
+    robot_text,
+    unit_of_key,
+    urdf_text,
+    write_robot,
+    write_urdf,
+)
+from .tables import (
+    KNOWN,
+    OF_CONFIGURATIONS,
+    OF_PAIRS,
+    Column,
+    Table,
+    Targets,
+    joint_columns,
+    names_of,
+    read_joint_table,
+    read_measurements,
+    read_targets,
+    require_own_csv,
+    write_csv,
+)
 from .yaml import (
     ANGLES,
     LENGTHS,

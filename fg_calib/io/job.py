@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
@@ -26,9 +25,8 @@ from fg_calib.inputs import (
     did_you_mean,
 )
 from fg_calib.io.atomic import exists, is_folder, noting_reads
-from fg_calib.io.columns import Column
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
-from fg_calib.io.tables import read_measurements
+from fg_calib.io.tables import Column, read_measurements
 from fg_calib.io.yaml import (
     Count,
     FilePath,
@@ -48,8 +46,6 @@ from fg_calib.io.yaml import (
 from fg_calib.job import Job
 from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
 from fg_calib.robot import Robot, names_of
-
-_log = logging.getLogger(__name__)
 
 UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
 """Where the noise starts from if it is to be estimated and nothing was stated."""

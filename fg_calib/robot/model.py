@@ -239,7 +239,7 @@ class Robot:
     urdf: UrdfSource | None = field(default=None, repr=False)
 
     from_urdf: ClassVar[Callable[..., Robot]]
-    """`io.urdf.read_urdf`, attached by the package: this folder knows nothing of files."""
+    """`io.read_urdf`, attached by the package: this folder knows nothing of files."""
 
     @classmethod
     @checked

@@ -16,9 +16,9 @@ from tolerances import rounding
 from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
 from fg_calib.inputs import InputError, Options
-from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_job
 from fg_calib.io.robot_file import write_robot
+from fg_calib.io.tables import write_csv
 from fg_calib.job import Job
 from fg_calib.report.compare import comparison_document
 from fg_calib.robot.kinematics import pose

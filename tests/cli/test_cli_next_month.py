@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from fg_calib.cli import entry
 from fg_calib.io import read_result, write_robot
-from fg_calib.io.columns import write_csv
+from fg_calib.io.tables import write_csv
 
 
 def run(*words):

@@ -18,7 +18,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import ProblemError
 from fg_calib.io import write_robot
-from fg_calib.io.columns import write_csv
+from fg_calib.io.tables import write_csv
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose

@@ -11,7 +11,7 @@ from scenarios import CAMERA, INSTRUMENTS, scenario
 from simulated import true_robot
 
 from fg_calib import read_job, read_robot, simulate
-from fg_calib.io.columns import write_csv
+from fg_calib.io.tables import write_csv
 from fg_calib.robot.kinematics import pose
 from fg_calib.simulation import write_simulation
 

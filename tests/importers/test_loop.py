@@ -13,7 +13,7 @@ from simulated import true_robot
 
 from fg_calib.calibration import calibrate_job
 from fg_calib.importers.board import CalibrationBoard
-from fg_calib.io.columns import write_csv
+from fg_calib.io.tables import write_csv
 from fg_calib.robot.inverse import solve_inverse
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")

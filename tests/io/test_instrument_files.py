@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.calibration import calibrate, calibrate_job
 from fg_calib.inputs import InputError
-from fg_calib.io.columns import write_csv
 from fg_calib.io.job import read_camera, read_job
 from fg_calib.io.robot_file import write_robot
-from fg_calib.io.tables import read_measurements
+from fg_calib.io.tables import read_measurements, write_csv
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.kinds.board import COVARIANCE
 

@@ -12,8 +12,7 @@ from tolerances import rounding
 
 from fg_calib.inputs import InputError
 from fg_calib.io import Units
-from fg_calib.io.columns import Column, write_csv
-from fg_calib.io.tables import read_measurements
+from fg_calib.io.tables import Column, read_measurements, write_csv
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.model import Joint, RobotBuilder
 

@@ -10,8 +10,7 @@ from oracle import tool_pose
 from tolerances import rounding
 
 from fg_calib.inputs import InputError
-from fg_calib.io.robot_file import read_robot, write_robot
-from fg_calib.io.urdf import read_urdf, write_urdf
+from fg_calib.io.robot_file import read_robot, read_urdf, write_robot, write_urdf
 from fg_calib.robot.model import Joint
 
 TREE = """\
