@@ -4,8 +4,6 @@ import csv
 import json
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +22,7 @@ from fg_calib.io import Units, read_measurements
 JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"
 OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv", "configurations.csv"}
 NUMBER = (int, float)
+PARAMETER = "name unit nominal estimate correction sigma prior_sigma identifiability stands_for sigma_of_combination"
 
 
 # --- the bundled example, calibrated once ----------------------------------------------------------------------------
@@ -97,18 +96,7 @@ def test_a_result_has_every_key_of_its_schema(result):
     }
     assert {key: type(result["observability"][key]) for key in observability} == observability
     for p in result["parameters"]:
-        assert list(p) == [
-            "name",
-            "unit",
-            "nominal",
-            "estimate",
-            "correction",
-            "sigma",
-            "prior_sigma",
-            "identifiability",
-            "stands_for",
-            "sigma_of_combination",
-        ]
+        assert " ".join(p) == PARAMETER
         assert p["unit"] in {"m", "rad"}
         assert p["identifiability"] in {"independent", "relative", "ineffective", "fixed"}
         assert p["correction"] == p["estimate"] - p["nominal"]
@@ -161,16 +149,6 @@ def test_the_calibrated_robot_holds_the_estimates(calibrated, result):
         for p in nominal.parameters
     ]
     assert robot.joints == nominal.joints
-
-
-def test_the_truth_lies_within_four_sigma(calibrated, result):
-    true = {p.name: p.nominal for p in read_robot(calibrated[0] / "robot_true.yaml").parameters}
-    errors = [
-        (p["estimate"] - true[p["name"]]) / p["sigma"] for p in result["parameters"] if p["identifiability"] != "fixed"
-    ]
-    assert len(errors) == 30
-    assert np.max(np.abs(errors)) < 4
-    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6  # 30 correlated values of sigma 1: honest, not just wide
 
 
 def test_inputs_are_named_with_their_hashes(calibrated, result):
@@ -233,15 +211,6 @@ def test_the_example_is_written_and_its_next_step_named(fg_calib, tmp_path):
     )
     assert sorted(f.name for f in out.iterdir()) == names
     assert all((out / n).read_bytes() == (cli.EXAMPLES / "space-robot" / n).read_bytes() for n in names)
-
-
-@pytest.mark.slow
-def test_stdout_closed_by_its_reader_is_no_traceback(example):
-    """As in `fg-calib calibrate job.yaml | head -1`."""
-    command = [sys.executable, "-m", "fg_calib.cli", "calibrate", str(example / JOB)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        process.stdout.close()
-        assert b"Traceback" not in process.stderr.read()
 
 
 # --- what must not matter, and other forms of input ------------------------------------------------------------------

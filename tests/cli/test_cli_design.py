@@ -28,8 +28,6 @@ SCENARIO = {
     "frame": "unknown",
     "job": {"model": "pose"},
 }
-BOLTS = {"bolt": [1000.0, -2000.0, 500.0], "pin": [2000.0, 1000.0, 500.0], "nut": [-500.0, 300.0, 2500.0]}
-WIRE = {"model": "anchor", "name": "wire", "anchors": {n: dict(zip("xyz", p, strict=True)) for n, p in BOLTS.items()}}
 TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {
@@ -117,8 +115,6 @@ def measured(table, true, frame):
         found |= dict(zip("xyz", (turn.apply(p) + shift).T, strict=True))
         rotation = turn * Rotation.from_matrix(T[:, :3, :3])
         found |= dict(zip(("qx", "qy", "qz", "qw"), rotation.as_quat().T, strict=True))
-    if "anchor" in table.columns:
-        found["distance"] = np.linalg.norm(p - [BOLTS[name] for name in table["anchor"]], axis=1)
     if "plane" in table.columns:
         found["distance"] = p @ TABLE["normal"] - TABLE["distance"]
     return found

@@ -4,8 +4,6 @@ import json
 
 import pytest
 import yaml
-from jobs import ur5e, write_job
-from simulated import measure, plus, true_robot
 
 from fg_calib.report import inspection_document
 
@@ -17,20 +15,6 @@ NUMBER = (int, float)
 def width(monkeypatch):
     """As wide as a pipe: where tests run in parallel, COLUMNS is that of the terminal or 80."""
     monkeypatch.setenv("COLUMNS", "100")
-
-
-@pytest.fixture
-def job(tmp_path):
-    """`job(change)`: a healthy job of 50 poses, but for what `change` does to the measurements."""
-    import numpy as np
-
-    robot, rng = ur5e(tmp_path), np.random.default_rng(0)
-    m = measure(true_robot(robot, rng), 50, rng, sigma=(5e-5, 1e-4), readings=rng.uniform(-2, 2, (50, 6)))
-
-    def written(change=lambda m: m, **keys):
-        return write_job(tmp_path, change(m), model="pose", frame="unknown", **keys)
-
-    return written
 
 
 def changed(folder, **keys):
@@ -74,7 +58,6 @@ def _refuse(constant):
     raise AssertionError(f"{constant} is no JSON")
 
 
-@pytest.mark.slow
 def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
     ended = fg_calib("inspect", example / JOB, "--json")
     assert (ended.code, ended.err) == (0, "")
@@ -94,18 +77,6 @@ def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
     assert isinstance(found["expected_error"]["base"]["position"], NUMBER)
     assert set(found["inputs"]) == {JOB, "poses.csv", "robot_nominal.yaml", "robot_true.yaml"}
     assert all(f'"{key}"' in (inspection_document.__doc__ or "") for key in found)
-
-
-def test_json_of_a_job_with_findings_has_them(fg_calib, job):
-    from dataclasses import replace
-
-    ended = fg_calib("inspect", job(lambda m: replace(m, position=plus(m.position, [4], 0.05))), "--json")
-    assert ended.code == 3
-    found = json.loads(ended.out, parse_constant=_refuse)
-    assert not found["ready"]
-    assert len(found["findings"]) == 1
-    (one,) = found["disagreements"]
-    assert (one["name"], one["test"]) == ("4", False)
 
 
 def test_bad_input_is_the_line_that_calibrate_gives(fg_calib, example):

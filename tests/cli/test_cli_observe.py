@@ -3,6 +3,9 @@
 import json
 
 import pytest
+from exported import TREE
+
+from fg_calib import read_robot
 
 
 def test_structure_prints_the_papers_table(fg_calib, example):
@@ -16,18 +19,7 @@ def test_structure_prints_the_papers_table(fg_calib, example):
     assert "rank 23 of 30" in ended.out
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    ("model", "rank"),
-    [
-        ("pose", 29),
-        ("distance-rotation", 23),
-        ("distance", 21),
-        ("rotation", 11),
-        ("position", 25),
-        ("orientation", 15),
-    ],
-)
+@pytest.mark.parametrize(("model", "rank"), [("pose", 29), ("rotation", 11)])
 def test_json_has_every_key_of_its_schema(fg_calib, example, model, rank):
     ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, "--json")
     found = json.loads(ended.out)
@@ -73,22 +65,8 @@ def test_a_frame_may_be_unknown(fg_calib, example):
     assert json.loads(ended.out)["rank"] == 25
 
 
-Y_SHAPED = """\
-<robot name="two-hands"><link name="root"/><link name="arm"/><link name="left"/><link name="right"/>
-<joint name="j1" type="continuous"><parent link="root"/><child link="arm"/><axis xyz="0 0 1"/></joint>
-<joint name="j2" type="continuous"><parent link="arm"/><child link="left"/><axis xyz="0 1 0"/></joint>
-<joint name="j3" type="continuous"><parent link="arm"/><child link="right"/><axis xyz="1 0 0"/></joint></robot>
-"""
-
-
-def test_links_of_a_urdf_are_named_as_the_message_asks(fg_calib, tmp_path):
-    (tmp_path / "y.urdf").write_text(Y_SHAPED)
-    ended = fg_calib("observe", tmp_path / "y.urdf", "--model", "pose")
-    assert ended.code == 1
-    assert ended.err == (
-        "error: y.urdf: 2 leaf links (left, right), expected one; name one as tip_link: {urdf: y.urdf, tip_link: ...} "
-        "in a file, --tip-link of observe\n"
-    )
-    links = ("--base-link", "arm", "--tip-link", "right")
-    found = json.loads(fg_calib("observe", tmp_path / "y.urdf", "--model", "pose", *links, "--json").out)
-    assert {name.partition(".")[0] for name in found["names"]} == {"j3"}
+def test_links_of_a_urdf_are_named(fg_calib, tmp_path):
+    (tmp_path / "arm.urdf").write_text(TREE)
+    found = json.loads(fg_calib("observe", tmp_path / "arm.urdf", "--model", "pose", "--tip-link", "tip", "--json").out)
+    of_tip = read_robot(tmp_path / "arm.urdf", tip_link="tip")
+    assert found["names"] == [p.name for p in of_tip.parameters if p.estimated]
