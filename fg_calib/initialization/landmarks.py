@@ -16,7 +16,7 @@ from fg_calib.robot import nearest_rotation
 
 
 def targets_from_positions(
-    tool: tuple[Floats, Floats], measured: Floats, target: Integers, known: Floats, X: Frame, unknown_frame: bool
+    tool: tuple[Floats, Floats], measured: Floats, target: Integers, known: Floats, unknown_frame: bool
 ) -> tuple[Frame, Floats]:
     """Where targets are on the tool and, where it is unknown, the measurement frame.
 
@@ -28,8 +28,7 @@ def targets_from_positions(
         measured: Positions of the targets in the measurement frame, shape (n, 3), [m].
         target: Which target each is of, shape (n,).
         known: Places of the targets on the tool, nan where they are to be found, shape (k, 3), [m].
-        X: world_T_base as it is known so far.
-        unknown_frame: Whether it is to be found.
+        unknown_frame: Whether world_T_base is to be found; the base is the world otherwise.
 
     Returns:
         world_T_base, and the targets' places, shape (k, 3); the tool point of those that nothing says.
@@ -45,7 +44,7 @@ def targets_from_positions(
     for axis in range(3):
         lever[chosen, :, 3 * of[target[chosen]] + axis] = R[chosen, :, axis]
     at = p + np.einsum("nij,nj->ni", R, places[target])  # with the unknown targets at the tool point
-    rotations = [X.rotation]
+    rotations = [np.eye(3)]
     if unknown_frame:
         lift = np.zeros((n, 3, 12))
         for k in range(3):
@@ -57,7 +56,7 @@ def targets_from_positions(
         rotations.append(nearest_rotation(found[:9].reshape(3, 3).T))
     fits: list[tuple[float, int, Floats, Floats]] = []
     for rotation in rotations:
-        rest = measured - X.translation - at @ rotation.T
+        rest = measured - at @ rotation.T
         moves = np.tile(np.eye(3), (n, 1, 1)) if unknown_frame else np.zeros((n, 3, 0))
         A = np.concatenate([moves, rotation @ lever], axis=2).reshape(3 * n, -1)
         step = np.linalg.lstsq(A, rest.ravel(), rcond=1e-10)[0] if A.shape[1] else np.zeros(0)
@@ -66,7 +65,7 @@ def targets_from_positions(
     _, _, rotation, step = min(fits)
     shift, moved = np.split(step, [3 if unknown_frame else 0])
     places[free] = moved.reshape(-1, 3)
-    return Frame(rotation, X.translation + (shift if unknown_frame else 0.0)), places
+    return Frame(rotation, shift if unknown_frame else np.zeros(3)), places
 
 
 def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, at: Floats) -> list[tuple[Integers, Floats]]:

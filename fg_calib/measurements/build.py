@@ -48,10 +48,6 @@ class Dataset(Brief):
     names: tuple[str, ...]
     _trigs: dict[Any, tuple[Floats, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what follows from the rest."""
-        return self.__dict__ | {"_trigs": {}}
-
     def trigs(self, robot: Robot) -> tuple[Floats, ...]:
         """Readings of each table for the kernels, remembered, as parameters change nothing of them."""
         key = (tuple(joint.prismatic for joint in robot.joints), robot.bases)
@@ -259,7 +255,7 @@ def blocks_of(table: Table, number: int, landmarks: Landmarks) -> list[Measureme
     Raises:
         ProblemError: The table lacks what its model needs, or a sigma.
     """
-    m, instrument = table.measurements, None if table.model is None else INSTRUMENTS[table.model]
+    m, instrument = table.measurements, INSTRUMENTS.get(table.model or "")
     given = {"offset": table.offset, "camera": table.camera, "fixed_camera": table.fixed_camera, "group": m.groups}
     for name in (name for name, value in given.items() if value not in (None, False)):
         if instrument is None or name not in instrument.options:
@@ -295,14 +291,12 @@ def _start_landmarks(
     robot: Robot, tables: Sequence[Table], blocks: Sequence[MeasurementBlock], landmarks: Landmarks
 ) -> None:
     """Start landmarks that tool points of the nominal arm say, by the instrument that measured them."""
-    for instrument in INSTRUMENTS.values():
+    for instrument in (one for one in INSTRUMENTS.values() if one.sees_landmarks):
         train = [b.select(np.flatnonzero(~b.test)) for b in blocks if tables[b.table].model == instrument.model
                  and b.kind.n_nuisances and is_ours(b.kind) and not b.test.all()]  # fmt: skip
-        if train and instrument.sees_landmarks:
-            chain = build_chain(robot)
-            trigs = [robot.trig(tables[block.table].measurements.readings) for block in train]
-            ends = [block.ends[:, 0] for block in train]
-            points = [forward(chain, trig, rows).position for trig, rows in zip(trigs, ends, strict=True)]
+        readings = [tables[b.table].measurements.readings[b.ends[:, 0]] for b in train]
+        points = [forward(build_chain(robot), robot.trig(q)).position for q in readings]
+        if train:
             instrument.start_landmarks(train, points, landmarks)
 
 
@@ -320,15 +314,13 @@ def start_frames(robot: Robot, data: Dataset, tool: Frame, free: Booleans) -> Fr
     """
     start = FrameStart(tool, free, data.landmarks.start)
     chain, trigs = build_chain(robot), data.trigs(robot)
-    instruments = [None if table.model is None else INSTRUMENTS[table.model] for table in data.tables]
-    says = [0 if i is None or not i.is_pose else i.sees_position + i.sees_orientation for i in instruments]
-    for number in sorted(range(len(says)), key=lambda k: -says[k]):
-        instrument, table = instruments[number], data.tables[number]
-        if instrument is not None:
-            flange = forward(chain, trigs[number])
-            start.begin(number, table.unknown_frame, (flange.rotation, flange.position))
-            blocks = [block for block in data.blocks if block.table == number]
-            instrument.start_frames(start, table, blocks, data.landmarks)
+    of_model = [(n, table, INSTRUMENTS[table.model]) for n, table in enumerate(data.tables) if table.model is not None]
+    for number, table, one in sorted(
+        of_model, key=lambda of: -of[2].is_pose * (of[2].sees_position + of[2].sees_orientation)
+    ):
+        flange = forward(chain, trigs[number])
+        start.begin(number, table.unknown_frame, (flange.rotation, flange.position))
+        one.start_frames(start, table, [block for block in data.blocks if block.table == number], data.landmarks)
     return start
 
 

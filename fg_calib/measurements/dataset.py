@@ -344,14 +344,14 @@ class Measurements(FrozenArrays):
 
     def select(self, rows: Integers) -> Measurements:
         """Some rows, with what was measured at them; nothing that was measured between configurations."""
-        n, changes = self.n_configurations, dict[str, Any]()
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, np.ndarray) and f.name != "sigma_joint" and len(value) == n:
-                changes[f.name] = value[rows]
-        for name in ("labels", "columns", "sigmas"):
-            changes[name] = {key: v.of(rows) if name == "labels" else v[rows] for key, v in getattr(self, name).items()}
-        return replace(self, **changes, pairs=None, groups=None)
+        rows_of: dict[str, Any] = {
+            name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "sigma_joint"
+        }
+        named: dict[str, Any] = {
+            name: {key: v[rows] for key, v in getattr(self, name).items()} for name in ("columns", "sigmas")
+        }
+        labels = {name: of.of(rows) for name, of in self.labels.items()}
+        return replace(self, **rows_of, **named, labels=labels, pairs=None, groups=None)
 
     def value(self, name: str) -> Floats | None:
         """What was measured, by a field or a column that one instrument alone has; None where it was not."""
@@ -575,11 +575,9 @@ def check_readings(readings: Floats, robot: Robot, name: str) -> None:
         found = f"{joint.name} = {reading:.6g} {joint.unit} is outside [{lower[j]:.6g}, {upper[j]:.6g}]"
         hint = limit_hint(readings[:, j], robot, j, joint.unit)
         raise InputError(f"{name}: row {row}", found, hint=hint)
-    turning = np.array([not joint.prismatic for joint in robot.joints]) & np.isinf(lower) & np.isinf(upper)
-    suspicious = turning & ((np.abs(readings) > 4 * np.pi).mean(axis=0) > 0.5)
-    if suspicious.any():
-        joint = robot.joints[int(np.argmax(suspicious))]
-        _log.warning("%s: most readings of %s are more than two turns; are they in deg?", name, joint.name)
+    for joint, limits, q in zip(robot.joints, robot.limits, readings.T, strict=True):
+        if not joint.prismatic and np.isinf(limits).all() and np.mean(np.abs(q) > 4 * np.pi) > 0.5:
+            _log.warning("%s: most readings of %s are more than two turns; are they in deg?", name, joint.name)
 
 
 def outside_limits(readings: Floats, robot: Robot) -> Booleans:
@@ -637,8 +635,7 @@ def form_pairs(measurements: Measurements, pairing: Pairing) -> Pairs:
     chosen = [_choose(np.flatnonzero(measurements.test == test), pairing, generator) for test in (False, True)]
     a, b = np.concatenate(chosen).T
     n = len(a)
-    names = ("distance", "angle", "sigma_distance", "sigma_angle")
-    found: dict[str, Any] = {name: np.full(n, np.nan) for name in names}
+    found: dict[str, Any] = dict.fromkeys(("distance", "angle", "sigma_distance", "sigma_angle"), np.full(n, np.nan))
     if measurements.position is not None:
         step = measurements.position[b] - measurements.position[a]  # (n, 3)
         found["distance"] = np.linalg.norm(step, axis=1)

@@ -111,11 +111,6 @@ class Landmark:
         """`m` or `rad` of each coordinate."""
         return self.kind.units if len(self.start) == self.kind.size else ("m",) * len(self.start)
 
-    @property
-    def statement(self) -> tuple[list[float], float | None, bool]:
-        """Where it is said to be, and how well."""
-        return self.start.tolist(), self.tolerance, self.known
-
     def __str__(self) -> str:
         return f"{self.start.tolist()}{'' if self.tolerance is None else f' within {self.tolerance:g}'}"
 
@@ -197,7 +192,7 @@ class Landmarks:
                 self._first.append(self._first[-1] + len(new.start))
             elif not self.items[i].is_stated:
                 self.items[i] = new
-            elif new.is_stated and new.statement != self.items[i].statement:
+            elif new.is_stated and str(new) != str(self.items[i]):
                 expected = f"that of the other {new.name}: {self.items[i]}"
                 raise ProblemError(source, f"start {new} of unknown {new.name}", expected)
             span = self.span(i)

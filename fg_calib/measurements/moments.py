@@ -108,8 +108,6 @@ def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mome
 
 def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:
     """Of the length of a vector in error."""
-    if not (along.any() or across.any()):
-        return Moments(np.zeros_like(f), np.ones_like(f), np.zeros_like(f))
     near = (f < FAR * np.sqrt(np.maximum(along, across))) & (across > 0.0)
     relative = np.divide(across, f**2, out=np.zeros_like(f), where=(f > 0.0) & ~near)
     excess, slope, variance = relative * f, 1.0 - relative, along + (across - 2.0 * along) * relative
@@ -150,8 +148,6 @@ def _fold(x: Floats, variance: Floats) -> Moments:
     s = np.sqrt(variance)
     excess, slope, left = np.zeros_like(x), np.ones_like(x), variance.astype(np.float64).copy()
     near = (x <= FAR * s) & (s > 0.0)
-    if not near.any():
-        return Moments(excess, slope, left)
     a = x[near] / s[near]
     erf = special.erf(a / np.sqrt(2.0))
     mean = np.sqrt(2.0 / np.pi) * np.exp(-0.5 * a * a) + a * erf

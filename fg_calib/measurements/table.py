@@ -93,14 +93,10 @@ class MeasurementBlock(Brief):
             more: Other fields.
         """
         shape = len(rows), kind.residual_dim
-        fields: dict[str, Any] = {
-            "ends": rows[:, None],
-            "measured": np.ones(shape, dtype=np.bool_),
-            "number": rows,
-            "nuisances": np.zeros((len(rows), 0), dtype=np.int64),
-        }
+        fields: dict[str, Any] = {"ends": rows[:, None], "measured": np.ones(shape, dtype=np.bool_)}
+        fields |= {"nuisances": np.zeros((len(rows), 0), dtype=np.int64), "data": np.ascontiguousarray(data)}
         sigma = sigma if sigma.shape == shape else np.ascontiguousarray(np.broadcast_to(sigma, shape))
-        return cls(kind=kind, table=table, data=np.ascontiguousarray(data), sigma=sigma, **fields | more)
+        return cls(kind=kind, table=table, sigma=sigma, number=rows, **fields | more)
 
     @property
     def n(self) -> int:
@@ -128,14 +124,9 @@ class MeasurementBlock(Brief):
 
     def select(self, rows: Integers) -> MeasurementBlock:
         """Some of the measurements."""
-        each = ("ends", "data", "sigma", "measured", "test", "number", "nuisances")
-        return replace(
-            self,
-            **{name: getattr(self, name)[rows] for name in each},
-            covariance=None if self.covariance is None else self.covariance[rows],
-            excluded={reason: mask[rows] for reason, mask in self.excluded.items()},
-            of=None if self.of is None else self.of.of(rows),
-        )
+        arrays: dict[str, Any] = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
+        excluded = {reason: mask[rows] for reason, mask in self.excluded.items()}
+        return replace(self, **arrays, excluded=excluded, of=None if self.of is None else self.of.of(rows))
 
 
 UNKNOWN = LandmarkKind(
@@ -307,16 +298,14 @@ class Table(Brief):
         def split(pairs: Pairs, test: Booleans) -> Pairs:
             return replace(pairs, test=test[pairs.a] | test[pairs.b])
 
-        def split_own(own: CustomMeasurements) -> CustomMeasurements:
-            return replace(own, test=np.any(configurations[own.at(len(configurations))], axis=1))
-
-        changes: dict[str, Any] = {"test": configurations}
+        n, changes = len(configurations), dict[str, Any](test=configurations)
+        own = tuple(replace(one, test=np.any(configurations[one.at(n)], axis=1)) for one in self.own)
         if m.pairs is not None:
             changes["pairs"] = split(m.pairs, configurations)
         if (groups := m.groups) is not None:
             only = only_of(configurations, groups.index, len(groups.names))
             changes["groups"] = replace(groups, pairs=split(groups.pairs, only))
-        return replace(self, measurements=replace(m, **changes), own=tuple(map(split_own, self.own)))
+        return replace(self, measurements=replace(m, **changes), own=own)
 
     @property
     def unknown_frame(self) -> bool:
@@ -329,14 +318,10 @@ def by_station(table: Table) -> tuple[Table, ...]:
 
     A station that rows might have been measured from, but none were, has none.
     """
-    m = table.measurements
-    labels = m.labels.get("station")
-    if labels is None or not table.unknown_frame:
+    m, stations = table.measurements, table.measurements.labels.get("station")
+    if stations is None or not table.unknown_frame:
         return (table,)
-    left = {what: of for what, of in m.labels.items() if what != "station"}
-    parts = []
-    for k, name in enumerate(labels.names):
-        if len(rows := np.flatnonzero(labels.index == k)):
-            part = replace(m, labels=left).select(rows)
-            parts.append(replace(table, measurements=replace(part, source=f"{m.source}, station {name}", part=rows)))
-    return tuple(parts) or (table,)
+    rest = replace(m, labels={what: of for what, of in m.labels.items() if what != "station"})
+    each = [(name, np.flatnonzero(stations.index == k)) for k, name in enumerate(stations.names)]
+    parts = [replace(rest.select(r), source=f"{m.source}, station {name}", part=r) for name, r in each if len(r)]
+    return tuple(replace(table, measurements=part) for part in parts) or (table,)

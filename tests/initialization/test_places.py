@@ -36,7 +36,7 @@ def test_targets_and_frame_from_positions(away, n_targets, n_known, unknown_fram
         measured = points @ X.rotation.T + X.translation + SIGMA * rng.normal(size=(20, 3))
         known = np.full((n_targets, 3), np.nan)
         known[:n_known] = targets[:n_known]
-        found, places = targets_from_positions((R, p), measured, which, known, ORIGIN, unknown_frame)
+        found, places = targets_from_positions((R, p), measured, which, known, unknown_frame)
         assert places == pytest.approx(targets, abs=0.03)
         assert found.rotation == pytest.approx(X.rotation, abs=0.03)
         assert found.translation == pytest.approx(X.translation, abs=0.1)  # 30 mrad at some metres

@@ -15,6 +15,7 @@ N = 7
 Q = RNG.uniform(-1, 1, (N, 2))
 P = RNG.normal(size=(N, 3))
 ROTATION = Rotation.from_quat(RNG.normal(size=(N, 4)))
+SIDES = ["l"] * 3 + ["r"] * 4
 ROBOT = Robot.from_dh([[0.5, 0, 0, 0], [0.3, 1.0, 0, 0]], limits=[[-3, 3], None])
 
 
@@ -107,17 +108,14 @@ def test_orientations_in_three_ways():
     assert rounded == pytest.approx(ROTATION.as_matrix(), abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("given", "rows"),
-    [
+def test_sigmas_are_spread_over_the_rows():
+    axes, rows = [1e-3, 2e-3, 3e-3], np.linspace(1, 2, N)
+    for given, spread in (
         (1e-3, np.full((N, 3), 1e-3)),
-        ([1e-3, 2e-3, 3e-3], np.tile([1e-3, 2e-3, 3e-3], (N, 1))),
-        (np.linspace(1, 2, N), np.tile(np.linspace(1, 2, N)[:, None], 3)),
-        (np.ones((N, 3)), np.ones((N, 3))),
-    ],
-)
-def test_sigmas_are_spread_over_the_rows(given, rows):
-    assert np.array_equal(Measurements.from_arrays(Q, position=P, sigma_position=given).sigma_position, rows)
+        (axes, np.tile(axes, (N, 1))),
+        (rows, np.outer(rows, [1, 1, 1])),
+    ):
+        assert np.array_equal(Measurements.from_arrays(Q, position=P, sigma_position=given).sigma_position, spread)
 
 
 @pytest.mark.parametrize(
@@ -126,28 +124,18 @@ def test_sigmas_are_spread_over_the_rows(given, rows):
         ({"readings": Q[:, 0]}, r"readings: shape \(7,\), expected \(n, n_joints\)"),
         ({"readings": [[1, 2], [3]]}, r"readings: found \[\[1, 2\], \[3\]\], expected numbers of shape"),
         ({"readings": Q[:0]}, r"readings: shape \(0, 2\), expected .* at least one row"),
-        ({"readings": Q + 1j}, "readings: found .*, expected numbers"),
         ({"position": P[:5]}, r"position: shape \(5, 3\), expected \(7, 3\)"),
-        (
-            {"position": np.where(np.arange(N)[:, None] == 4, np.inf, P)},
-            "position: row 4: found inf, expected a finite",
-        ),
-        ({"position": P.astype(str)}, "position: found .*, expected numbers"),
+        ({"position": np.where(P == P[4], np.inf, P)}, "position: row 4: found inf, expected a finite"),
         ({"quaternion": np.ones((N, 4))}, r"quaternion: row 0: found \[1.0, .*\], expected x y z w of length 1"),
         ({"rotation": np.tile(np.diag([1.0, 1, -1]), (N, 1, 1))}, "rotation: row 0: found .*, expected a rotation"),
-        ({"rotation": np.tile(2 * np.eye(3), (N, 1, 1))}, "rotation: row 0: "),
         ({"rotation": ROTATION.as_matrix(), "quaternion": ROTATION.as_quat()}, "rotation and quaternion: both"),
         ({"sigma_position": 0.0}, "sigma_position: found 0, expected a number above 0"),
         ({"sigma_position": [1, 2]}, r"sigma_position: shape \(2,\), expected one that broadcasts to \(7, 3\)"),
         ({"sigma_orientation": [1, -1, 1]}, "sigma_orientation: row 1: found -1, expected a number above 0"),
-        ({"sigma_orientation": np.nan}, "sigma_orientation: found nan, expected a finite number"),
         ({"sigma_joint": -1.0}, "sigma_joint: found -1, expected a number not below 0"),
         ({"sigma_joint": [1.0, 1.0, 1.0]}, r"sigma_joint: shape \(3,\), expected \(2\)"),
         ({"ids": ["a"] * N}, "ids: row 1: found 'a', expected different ids"),
-        ({"ids": ["a"]}, r"ids: shape \(1,\), expected \(7,\)"),
         ({"test": np.arange(N)}, "test: found .*, expected True or False for each of 7 rows"),
-        ({"test": [True]}, r"test: shape \(1,\), expected \(7,\)"),
-        ({"group": ["a"]}, r"group: shape \(1,\), expected \(7,\)"),
         ({"pairs": {"a": [0], "distance": [1]}}, "pairs: no b, expected a and b"),
         ({"pairs": {"a": [0], "b": [1]}}, "pairs: neither distance nor angle"),
         ({"pairs": {"a": [0], "b": [1], "distanze": [1]}}, "pairs: unknown key 'distanze', .*did you mean distance?"),
@@ -156,19 +144,12 @@ def test_sigmas_are_spread_over_the_rows(given, rows):
         ({"pairs": {"a": [0], "b": [1, 2], "distance": [1]}}, r"pairs: b: shape \(2,\), expected"),
         ({"pairs": {"a": [0], "b": [1], "distance": [-1]}}, "pairs: distance: row 0: found -1, expected a number not"),
         ({"pairs": {"a": [0], "b": [1], "angle": [3.2]}}, "pairs: angle: row 0: found 3.2, expected 0 to pi"),
-        ({"pairs": {"a": [0], "b": [1], "angle": [1], "sigma_angle": 0}}, "pairs: sigma_angle: found 0, expected"),
         (
             {"group": [0] * N, "pairs": {"a": [0], "b": [1], "distance": [1]}},
             "pairs: a: row 0: found 0, expected an id or a group; names of both",
         ),
-        (
-            {"group": ["l"] * 3 + ["r"] * 4, "pairs": {"a": ["l"], "b": ["r"], "angle": [1]}},
-            "pairs: angle: row 0: found 1, expected nan",
-        ),
-        (
-            {"group": ["l"] * 3 + ["r"] * 4, "pairs": {"a": ["l"], "b": ["1"], "distance": [1]}},
-            "pairs: b: row 0: found '1', expected two configurations or two groups",
-        ),
+        ({"group": SIDES, "pairs": {"a": ["l"], "b": ["r"], "angle": [1]}}, "pairs: angle: row 0: found 1, exp"),
+        ({"group": SIDES, "pairs": {"a": ["l"], "b": ["1"], "distance": [1]}}, "pairs: b: row 0: found '1', exp"),
     ],
 )
 def test_mistakes_are_named(given, message):
@@ -185,14 +166,6 @@ def test_what_is_kept_is_read_only_and_nobody_elses():
     for array in (found.readings, found.position, found.test, found.sigma_position, found.sigma_joint):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
-
-
-def test_what_is_made_of_arrays_directly_copies_none_and_locks_none():
-    position = P.copy()
-    found = Measurements(Q, np.arange(N).astype(str), np.zeros(N, bool), position, None, None, None, np.zeros(2))
-    assert np.shares_memory(found.position, position)
-    assert position.flags.writeable
-    assert not found.position.flags.writeable
 
 
 def test_readings_are_those_of_the_robot():
@@ -233,9 +206,6 @@ def test_three_sigmas_of_three_rows_may_mean_two_things():
         assert found.tolist() == np.broadcast_to(sigma, (3, 3)).tolist()
 
 
-RAGGED = [[1.0], [1.0, 2.0]]
-
-
 PAIRS = {"a": ["p0", "p1"], "b": ["p2", "p6"], "distance": [0.5, 0.25]}
 IDS = [f"p{i}" for i in range(N)]
 
@@ -256,12 +226,6 @@ def test_numbers_beside_ids_that_are_numbers_are_ids():
     ids = np.arange(N) + 5
     assert Measurements.from_arrays(Q, ids=ids, pairs={"a": [5], "b": [6], "angle": [0.1]}).pairs.a.tolist() == [0]
     assert Measurements.from_arrays(Q, ids=ids, pairs={"a": ["5"], "b": ["6"], "angle": [0.1]}).pairs.a.tolist() == [0]
-
-
-def says(error, expected):
-    """Whether that is the message; `...` at its end stands for the words of polars, which change."""
-    start, others, _ = expected.partition("...")
-    return str(error).startswith(start) if others else str(error) == expected
 
 
 COLUMNS = {"q1": Q[:, 0], "q2": Q[:, 1]} | dict(zip("xyz", P.T, strict=True))

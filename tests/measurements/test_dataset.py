@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm
-from tolerances import rounding
 
 from fg_calib.inputs import InputError, Pairing
 from fg_calib.measurements.dataset import form_pairs
-from fg_calib.robot.rotations import rotation_angle
 
 
 @pytest.fixture
@@ -19,21 +17,18 @@ def measurements():
     return measure(small_arm(), 6, rng, n_test=4)
 
 
-@pytest.mark.parametrize(
-    ("pairing", "train", "test"),
-    [
-        (Pairing("star"), [(0, i) for i in range(1, 6)], [(6, i) for i in range(7, 10)]),
-        (Pairing("chain"), [(i, i + 1) for i in range(5)], [(i, i + 1) for i in range(6, 9)]),
-        (
-            Pairing("all"),
-            [(i, j) for i in range(6) for j in range(i + 1, 6)],
-            [(i, j) for i in range(6, 10) for j in range(i + 1, 10)],
-        ),
-    ],
-)
-def test_strategies_pair_within_train_and_within_test(measurements, pairing, train, test):
-    pairs = form_pairs(measurements, pairing)
+STRATEGIES = {
+    "star": lambda first, last: [(first, i) for i in range(first + 1, last)],
+    "chain": lambda first, last: [(i, i + 1) for i in range(first, last - 1)],
+    "all": lambda first, last: [(i, j) for i in range(first, last) for j in range(i + 1, last)],
+}
+
+
+@pytest.mark.parametrize("name", STRATEGIES)
+def test_strategies_pair_within_train_and_within_test(measurements, name):
+    pairs = form_pairs(measurements, Pairing(name))
     formed = list(zip(pairs.a.tolist(), pairs.b.tolist(), pairs.test.tolist(), strict=True))
+    train, test = STRATEGIES[name](0, 6), STRATEGIES[name](6, 10)
     assert formed == [(a, b, False) for a, b in train] + [(a, b, True) for a, b in test]
 
 
@@ -83,10 +78,3 @@ def test_pairs_need_measured_poses(measurements):
     assert (
         str(error.value) == "poses.csv: neither positions nor orientations, expected measured poses to form pairs from"
     )
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, np.pi - 1e-6, np.pi])
-def test_rotation_angle_is_exact_from_zero_to_half_a_turn(angle):
-    axis = np.array([1.0, -2.0, 0.5]) / np.sqrt(5.25)
-    found, _ = rotation_angle(Rotation.from_rotvec(angle * axis).as_matrix()[None])
-    assert found[0] == pytest.approx(angle, abs=rounding(angle if angle > 0.1 else 1e-2))

@@ -80,10 +80,8 @@ def run(tmp_path_factory):
     shutil.copytree(source, folder / "fg_calib", ignore=shutil.ignore_patterns("*.pyc"))
     (folder / "fg_calib/measurements/kinds/inclinometer.py").write_text(INCLINOMETER)
     options = folder / "fg_calib/inputs/options.py"
-    registered = options.read_text().replace(
-        '    "plane": "plane",\n', '    "plane": "plane",\n    "inclination": "inclinometer",\n'
-    )
-    options.write_text(registered)
+    plane = '    "plane": "plane",\n'
+    options.write_text(options.read_text().replace(plane, plane + '    "inclination": "inclinometer",\n'))
     (folder / "robot.yaml").write_text(ROBOT)
     (folder / "scenario.yaml").write_text(SCENARIO)
 

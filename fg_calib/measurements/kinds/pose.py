@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.initialization import Frame, FrameStart, targets_from_positions
+from fg_calib.initialization import FrameStart, targets_from_positions
 from fg_calib.inputs import POSE_MODELS, Floats
 from fg_calib.measurements import Frames, Kind, LandmarkKind, Landmarks, Rows, Table, stack
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Kinds, Quantity
@@ -148,8 +148,7 @@ class PoseTracker(Instrument):
         known = np.vstack([start.places[coordinates], np.zeros(3)])  # the tool point itself at the end, as row -1
         target = np.where(labels.index[train] < 0, len(labels.names), labels.index[train])
         tool = R_F @ start.tool.rotation, p_F + R_F @ start.tool.translation
-        world = Frame(np.eye(3), np.zeros(3))
-        frame, places = targets_from_positions(tool, p, target, known, world, start.unknown_frame)
+        frame, places = targets_from_positions(tool, p, target, known, start.unknown_frame)
         start.places[coordinates] = places[:-1]
         start.set_frame(frame)
 
