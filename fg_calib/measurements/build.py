@@ -221,7 +221,7 @@ def _rows_of(table: Table) -> tuple[Integers, dict[str, Floats]]:
     if instrument is not None and instrument.uses_pairs and pairs is not None:
         ends = np.sort(np.stack([pairs.a, pairs.b], axis=1), axis=1)
         values = {name: getattr(pairs, name) for name in instrument.noise}
-    at = m.readings[ends].reshape(len(ends), -1)
+    at = np.hstack([m.readings[k] for k in ends.T])
     return ends, {
         name: np.hstack([at, v.reshape(len(at), math.prod(v.shape[1:]))]) for name, v in values.items() if v is not None
     }

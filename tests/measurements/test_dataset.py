@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm
 
 from fg_calib.inputs import InputError, Pairing
-from fg_calib.measurements.dataset import form_pairs
+from fg_calib.measurements import Table, find_copies, form_pairs, no_pairs
 
 
 @pytest.fixture
@@ -73,8 +73,9 @@ def test_sigmas_of_formed_pairs_are_what_monte_carlo_finds():
 
 def test_pairs_need_measured_poses(measurements):
     bare = replace(measurements, position=None, rotation=None, source="poses.csv")
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match="neither positions nor orientations, expected measured"):
         form_pairs(bare, Pairing())
-    assert (
-        str(error.value) == "poses.csv: neither positions nor orientations, expected measured poses to form pairs from"
-    )
+
+
+def test_a_table_without_pairs_has_no_copies(measurements):
+    assert find_copies(Table(replace(measurements, pairs=no_pairs("pairs.csv")), "distance")) == (0, "", 0)
