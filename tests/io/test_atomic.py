@@ -56,13 +56,12 @@ def test_a_failure_leaves_nothing_and_no_folder(tmp_path, own):
     assert [*tmp_path.iterdir()] == []
 
 
-def test_asking_whether_a_folder_can_be_written_leaves_no_trace(tmp_path):
+def test_a_folder_that_cannot_be_written_is_one_line_and_leaves_no_trace(tmp_path):
     require_writable(tmp_path / "a" / "b")
     assert [*tmp_path.iterdir()] == []
     (tmp_path / "file").write_text("")
-    null = r"(mkdir: )?embedded null (byte|character in \w+)"  # in the words of any Python
-    for folder, reason in (("file", "File exists"), ("file/b", "Not a directory"), ("a\0b", null)):
-        with pytest.raises(InputError, match=f"cannot be written: {reason}, expected a folder that can be"):
+    for folder in ("file", "file/b", "a\0b"):
+        with pytest.raises(InputError, match=r"cannot be written: .*, expected a folder that can be"):
             require_writable(tmp_path / folder)
 
 

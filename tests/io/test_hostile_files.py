@@ -33,18 +33,6 @@ def test_no_table_hangs_or_ends_in_a_traceback(tmp_path, text):
     assert str(error.value) == TABLES[text]
 
 
-@pytest.mark.parametrize(
-    "damage", [lambda b: b[: len(b) // 2], lambda b: b[:4] + b"\xff" * 40 + b[44:], lambda b: b"PAR1"]
-)
-def test_a_damaged_parquet_file_is_one_line_and_silent(tmp_path, capfd, damage):
-    file = tmp_path / "poses.parquet"
-    pl.read_csv(ROWS.encode()).write_parquet(file)
-    file.write_bytes(damage(file.read_bytes()))
-    with pytest.raises(InputError, match=r"^poses\.parquet: not a Parquet file: [^\n]*$"):
-        read_measurements(file, ARM)
-    assert capfd.readouterr().err == ""
-
-
 @pytest.mark.parametrize("ending", ["csv", "parquet", "frame"])
 def test_a_column_is_no_pattern(tmp_path, ending):
     """Polars takes * for all columns, and ^...$ for those that it matches."""

@@ -101,10 +101,6 @@ JOBS = [
 ]
 
 
-
-
-
-
 XYZ = "q1,q2,x,y,z\n"
 POSES = [
     ("q1,q2\n−0.5,0\n", "poses.csv:2: q1: found '−0.5', expected a finite number; its minus is another character, a dash; write -"),
@@ -163,13 +159,8 @@ def folder(tmp_path_factory):
         "robot.yaml": TWO_JOINTS,
         "other.yaml": ONE_JOINT,
         "poses.csv": "q1,q2,x,y,z\n0,0,0,0,0\n10,20,1000,0,0\n",
-        "pairs.csv": "a,b,distance,angle\n0,1,2000,90\n",
         "ids.csv": IDS,
         "groups.csv": GROUPS,
-        "flat.csv": "q1,q2,x,y,z\n0,0,0,0,0\n1,2,1000,0,0\n",
-        "tested.csv": "q1,q2,split\n0,0,test\n1,1,test\n",
-        "escape.yaml": '"\\e[31m": 1\n',
-        "escape.csv": "q1,q2\n0,\x1b[2J\x07\n",
     }.items():
         (folder / name).write_text(text)
     return folder

@@ -5,14 +5,12 @@ import math
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from oracle import frame
 from tolerances import rounding
 
 from fg_calib.inputs import InputError
 from fg_calib.io import Units
-from fg_calib.io.tables import Column, read_measurements, write_csv
+from fg_calib.io.tables import Column, read_measurements
 from fg_calib.measurements.dataset import Noise
 from fg_calib.robot.model import Joint, RobotBuilder
 
@@ -163,20 +161,6 @@ def test_parquet_and_csv_read_the_same(write):
         assert np.array_equal(getattr(csv.pairs, name), getattr(parquet.pairs, name), equal_nan=name[:4] != "test"), (
             name
         )
-
-
-@pytest.mark.slow
-@given(
-    rows=st.lists(st.tuples(*[st.floats(-1e15, 1e15)] * 3), min_size=1, max_size=5),
-    units=st.sampled_from([Units(), Units(length="mm", angle="deg")]),
-)
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-def test_a_written_table_reads_back_exactly(tmp_path, rows, units):
-    values = np.array(rows)
-    robot = arm(Joint("q1"), Joint("q2"), Joint("lift", prismatic=True))
-    write_csv(tmp_path / "out.csv", {"q1": values[:, 0], "q2": values[:, 1], "q3": values[:, 2]})
-    m = read_measurements(tmp_path / "out.csv", robot, units=units)
-    assert np.array_equal(m.readings, values * [units.factor(j.unit) for j in robot.joints])
 
 
 def test_pairs_name_configurations_by_id(write):
