@@ -35,7 +35,7 @@ from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale, Varia
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import read_robot, write_robot, write_urdf
-from fg_calib.io.yaml import first_misfit
+from fg_calib.io.yaml import first_misfit, shown
 from fg_calib.measurements import Table
 from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
@@ -376,11 +376,8 @@ class Result(Section):
 
     def unit_of(self, kind: str) -> str:
         """The unit of a kind of residual: `m`, `rad` or `px`."""
-        for kinds in self.residual_rms.values():
-            rms = kinds.get(kind)
-            if rms is not None and rms.unit is not None:
-                return rms.unit
-        return KINDS.get(kind.partition(",")[0], "m")
+        units = [rms.unit for kinds in self.residual_rms.values() if (rms := kinds.get(kind)) and rms.unit]
+        return units[0] if units else KINDS.get(kind.partition(",")[0], "m")
 
     def rms_after(self, split: str) -> dict[str, float]:
         """RMS of the residuals of `train` or `test` rows after the calibration, by kind."""
@@ -479,21 +476,18 @@ def read_result(path: Path | str) -> Result:
         InputError: There is none, or it is damaged; the message says where.
     """
     path = Path(path)
-    if not exists(path):
-        raise InputError(str(path), "no such folder or file", "what `fg-calib calibrate --out` wrote")
     file = path / "result.json" if is_folder(path) else path
     if not exists(file):
-        raise InputError(str(path), "no result.json in this folder", "a folder that `fg-calib calibrate --out` wrote")
+        raise InputError(str(path), "no result.json", "what `fg-calib calibrate --out` wrote")
     try:
         document = json.loads(read_text(file))
     except (ValueError, RecursionError) as error:
         raise InputError(str(file), f"not JSON: {str(error).partition(';')[0]}", hint="was it cut off?") from None
-    if not isinstance(document, dict) or not str(document.get("schema")).startswith("fg-calib/result/"):
-        raise InputError(str(file), "no result of a calibration", f"a result.json of schema {SCHEMA}")
-    if document["schema"] == FORMER_SCHEMA:
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if schema == FORMER_SCHEMA:
         document = _upgraded(document)
-    if document["schema"] != SCHEMA:
-        raise InputError(str(file), f"schema {document['schema']}", SCHEMA, "calibrate its job again")
+    elif schema != SCHEMA:
+        raise InputError(str(file), f"schema {shown(schema)}", SCHEMA, "calibrate its job again")
     try:
         result = Result.model_validate(document)
     except ValidationError as error:

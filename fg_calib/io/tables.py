@@ -303,8 +303,7 @@ def _read_file(path: Path) -> Table:
     if ending not in (".parquet", ".pq"):
         hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
         raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
-    with _one_line(path.name, "not a Parquet file"):
-        return Table(path.name, (), pl.read_parquet(BytesIO(content)))
+    return Table(path.name, (), pl.read_parquet(BytesIO(content)))
 
 
 def _read_csv(name: str, text: str) -> Table:
@@ -553,22 +552,19 @@ def joint_columns(robot: Robot) -> tuple[str, ...]:
 
 def find_joint_columns(table: Table, robot: Robot) -> tuple[str, ...]:
     """The columns of joint readings, in chain order: all by the joints' names, or all by their numbers."""
-    n = robot.n_joints
-    names = tuple(joint.name for joint in robot.joints)
-    expected = tuple(f"q{i + 1}" for i in range(n))
-    if _NOT_JOINTS.intersection(names):
-        names = ()  # a prismatic joint called x, say: its column would be the tool's position
-    elif names != expected and table.present(*names) == names:
+    names = () if _NOT_JOINTS & {joint.name for joint in robot.joints} else tuple(joint.name for joint in robot.joints)
+    numbered = tuple(f"q{i + 1}" for i in range(robot.n_joints))
+    found = [name for name in table.columns if name in names or re.fullmatch(r"q\d+", name)]
+    if names and names != numbered and set(names) <= set(found):
         return names
-    numbered = tuple(name for name in table.columns if re.fullmatch(r"q\d+", name))
-    if set(numbered) == set(expected):
-        return expected
-    found = list(dict.fromkeys([*numbered, *table.present(*names)]))
+    if {name for name in found if re.fullmatch(r"q\d+", name)} == set(numbered):
+        return numbered
+    expected = "q1" if len(numbered) == 1 else f"q1 to {numbered[-1]}"
     raise InputError(
         table.name,
         f"{len(found)} joint columns ({', '.join(found)})" if found else "no joint columns",
-        f"{'q1' if n == 1 else f'q1 to q{n}'} for the robot's {n} joints"
-        + (f", or their names {', '.join(names)}" if names not in {(), expected} else ""),
+        f"{expected} for the robot's {robot.n_joints} joints"
+        + (f", or their names {', '.join(names)}" if names not in {(), numbered} else ""),
         f"the columns are {', '.join(table.columns)}",
     )
 

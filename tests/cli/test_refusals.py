@@ -115,7 +115,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "a folder without result": (
         lambda folder: (folder / "empty").mkdir(),
         ("export", "empty", "--to", "dh"),
-        "error: empty: no result.json in this folder, ",
+        "error: empty: no result.json, ",
     ),
     "an export over a file": (nothing, (*EXPORT, "--out", ROBOT), f"error: {ROBOT}: is there already, "),
     "an example over a file": (

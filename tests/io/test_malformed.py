@@ -140,7 +140,7 @@ FRAMES = [
 
 RESULTS = [
     ("{", '{folder}/result.json: not JSON: Expecting property name enclosed in double quotes: line 1 column 2 (char 1); was it cut off?'),
-    ('{"schema": "fg-calib/result/9"}', '{folder}/result.json: schema fg-calib/result/9, expected fg-calib/result/2; calibrate its job again'),
+    ('{"schema": "fg-calib/result/9"}', "{folder}/result.json: schema 'fg-calib/result/9', expected fg-calib/result/2; calibrate its job again"),
     (lambda d: d.pop("dof"), "{folder}/result.json: missing key 'dof'"),
     (lambda d: d.update(dof="many"), "{folder}/result.json: dof: found 'many', expected a whole number"),
     (lambda d: d["posterior"].update(covariance=[[1,2],[3,4]]), "{folder}/result.json: posterior: covariance: shape: found (2, 2), expected (10, 10); was the file changed?"),

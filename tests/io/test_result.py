@@ -108,8 +108,8 @@ def move(parameter):
     ("damage", "message"),
     [
         (lambda f: (f / "result.json").write_text("{"), "result.json: not JSON: .*; was it cut off?"),
-        (lambda f: (f / "result.json").write_text("[]"), "result.json: no result of a calibration, expected"),
-        (lambda f: (f / "result.json").unlink(), "no result.json in this folder"),
+        (lambda f: (f / "result.json").write_text("[]"), "result.json: schema nothing, expected"),
+        (lambda f: (f / "result.json").unlink(), "result: no result.json, expected what"),
         (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
         (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
@@ -139,7 +139,7 @@ def test_an_arm_that_was_only_evaluated_reads_back(tmp_path):
 
 
 def test_there_must_be_something_to_read(tmp_path):
-    with pytest.raises(InputError, match="nowhere: no such folder or file, expected what `fg-calib calibrate --out`"):
+    with pytest.raises(InputError, match=r"nowhere: no result\.json, expected what `fg-calib calibrate --out`"):
         read_result(tmp_path / "nowhere")
 
 
