@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from fg_calib import statistics
 from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.graph import Problem, Solution, check_graph, problem_of, solve
+from fg_calib.graph import Problem, Solution, problem_of, solve
 from fg_calib.inputs import Floats, FrozenArrays, InputError, SolverError, as_figures, checked, escaped
 from fg_calib.job import Job
 from fg_calib.monitoring import at_nominal
@@ -213,12 +213,8 @@ def assess(solution: Solution) -> Assessment:
         corrected, and get a small share of parameters that they did not have at nominal. Unknown is what has a share
         in one both at the nominal parameters and at the estimate; the others are known given that the undetermined
         directions are near nominal. Frames have no nominal value: what follows them may be off by as much as they are.
-
-    Raises:
-        ProblemError: The graph of the solution's problem has factors that are not its own.
     """
     problem = solution.problem
-    check_graph(problem)
     spread = statistics.spread_of(solution)
     whole = statistics.with_left_out(solution, spread)
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")

@@ -25,7 +25,6 @@ from .normal_system import (
 )
 from .problem import (
     Problem,
-    check_graph,
     correlation,
     directions,
     felt,
@@ -94,7 +93,6 @@ __all__ = [
     "block_diagonal",
     "build_problem",
     "build_variables",
-    "check_graph",
     "coordinates_of",
     "corrections_of",
     "correlation",

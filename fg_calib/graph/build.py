@@ -9,30 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from fg_calib import inputs
 from fg_calib.graph.normal_system import identifiable_subset
-from fg_calib.graph.problem import (
-    Problem,
-    linear_system,
-    named_rows,
-    problem_at,
-    start_of,
-    tables_of,
-    variables_of,
-)
+from fg_calib.graph.problem import Problem, linear_system, named_rows, problem_at, start_of, tables_of, variables_of
 from fg_calib.graph.variables import Variables, preference
-from fg_calib.inputs import (
-    Floats,
-    FrameKnowledge,
-    Gauge,
-    Integers,
-    Model,
-    Options,
-    PairErrors,
-    Pairing,
-    ProblemError,
-    check_names,
-    checked,
-)
+from fg_calib.inputs import Floats, Integers, Options, Pairing, ProblemError, check_names, checked
 from fg_calib.job import Job
 from fg_calib.measurements import (
     INSTRUMENTS,
@@ -124,7 +105,6 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
         first = (replace(p, tolerance=FIRST_TOLERANCE) if f else p for p, f in zip(parameters, free, strict=True))
         robot = replace(robot, parameters=tuple(first))
     data = build_dataset(robot, tables)
-    _check_frames(data)
     variables = variables_of(robot, data, options)
     start = start_of(robot, data, variables)
     _check_own_kinds(robot, data, variables, start)
@@ -177,7 +157,7 @@ def _for_evaluation(
 ) -> tuple[Robot, Options, tuple[Table, ...]]:
     """A robot whose base and tool alone are estimated, where they were, and test rows that these are fitted to."""
     of_frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
-    gauge: Gauge = "none" if options.gauge == "keep" else options.gauge
+    gauge = "none" if options.gauge == "keep" else options.gauge
     options = replace(options, gauge=gauge, encoder="propagated")
     return robot.with_estimated(of_frames), options, tuple(table.all_train() for table in tables)
 
@@ -200,11 +180,11 @@ def problem_of(job: Job, **changes: Any) -> Problem:
 def predicted_problem(
     robot: Robot,
     measurements: Measurements,
-    model: Model,
+    model: inputs.Model,
     *,
-    frame: FrameKnowledge = "known",
+    frame: inputs.FrameKnowledge = "known",
     pairing: Pairing | None = None,
-    pair_errors: PairErrors = "shared",
+    pair_errors: inputs.PairErrors = "shared",
 ) -> Problem:
     """The problem that a robot's own predictions at some configurations make: what could be measured there.
 
@@ -264,7 +244,7 @@ def _coordinates(data: Dataset, variables: Variables) -> dict[tuple[str, str], I
 
 @single_threaded
 def random_problem(
-    robot: Robot, model: Model, frame: FrameKnowledge = "known", *, n_configurations: int = 0, seed: int = 0
+    robot: Robot, model: inputs.Model, frame: inputs.FrameKnowledge, *, n_configurations: int, seed: int
 ) -> Problem:
     """`predicted_problem` at random configurations: what a model can determine at all.
 
@@ -282,15 +262,6 @@ def random_problem(
         sigma_orientation=robot.scale_of("rad"),
     )
     return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
-
-
-def _check_frames(data: Dataset) -> None:
-    """Whether every table whose measurement frame is unknown has a row that says where it is."""
-    for number, table in enumerate(data.tables):
-        n_train = sum(len(s.train) for s in data.blocks if s.table == number)
-        if table.unknown_frame and not n_train and len(data.tables) > 1:
-            found = "test rows alone, in a measurement frame of their own"
-            raise ProblemError(table.measurements.source, found, "train rows, or frame known")
 
 
 def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: Floats) -> None:

@@ -23,16 +23,7 @@ from numpy.typing import ArrayLike
 
 from fg_calib.graph.error_states import State, WhitenedRows, WhitenedSeries
 from fg_calib.graph.variables import Variable, Variables, prior_rows
-from fg_calib.inputs import (
-    CalibrationError,
-    Floats,
-    InputError,
-    ProblemError,
-    SolverError,
-    as_floats,
-    check_number,
-    shown,
-)
+from fg_calib.inputs import CalibrationError, Floats, InputError, ProblemError, SolverError, as_floats, check_number
 from fg_calib.measurements import Block, Distance, Kind, RotationAngle, unpack
 
 Sparse = scipy.sparse.csr_array
@@ -129,15 +120,13 @@ class RotationAngleFactor(MeasurementFactor):
 
     def __init__(self, variables: Variables, start: ArrayLike, end: ArrayLike, angle: float, sigma: float) -> None:
         if isinstance(angle, Real) and angle > np.pi:
-            raise InputError("angle", f"found {shown(angle)}", "0 to pi, in rad")
+            raise InputError("angle", f"found {angle}", "0 to pi, in rad")
         super().__init__(variables, _of_readings(RotationAngle(), variables, (start, end), ("angle", angle), sigma))
 
 
 def _of_readings(
     kind: Kind, variables: Variables, ends: tuple[ArrayLike, ArrayLike], measured: tuple[str, float], sigma: float
 ) -> WhitenedSeries:
-    if not isinstance(variables, Variables):
-        raise InputError("variables", f"found {shown(variables)}", "the variables of a problem")
     check_number(*measured)
     check_number("sigma", sigma, above=True)
     n = variables.robot.n_joints

@@ -19,15 +19,7 @@ import numpy as np
 import scipy.sparse
 
 from fg_calib.inputs import Booleans, Floats, InputError, Integers
-from fg_calib.measurements import (
-    Block,
-    MeasurementBlock,
-    Measurements,
-    angle_moments,
-    length_moments,
-    residuals,
-    unit_whitening,
-)
+from fg_calib.measurements import Block, MeasurementBlock, Measurements, angle_moments, length_moments, residuals
 from fg_calib.robot import Chain, forward, kernels, nearest_rotation, over_spans, rotation_angle, whiten_small
 
 Sparse = scipy.sparse.csr_array
@@ -127,7 +119,7 @@ class RowNoise:
     def as_measured(self) -> Block:
         """All rows as they were measured, to first order, not whitened."""
         s, p = self.series, self.place
-        unit = unit_whitening(s.n, s.kind.residual_dim)
+        unit = residuals.unit_whitening(s.n, s.kind.residual_dim)
         return Block(s.kind, p.trig, s.ends, s.data, unit, p.coordinates[s.nuisances], s.source)
 
     def rows_at(self, rows: Integers | slice) -> Block:
@@ -305,9 +297,6 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
     Raises:
         InputError: Rounding leaves nothing of the noise along some direction.
     """
-    if used.shape[1] == 1:
-        with np.errstate(divide="ignore"):
-            return np.where(used[:, :, None], 1.0 / np.sqrt(covariance), 0.0)
     W = np.empty(covariance.shape)
     C, mask = (np.require(given, requirements=["C", "W"]) for given in (covariance, used))  # as the kernel takes them
     if not all(over_spans(lambda start, stop: whiten_small(C, mask, start, stop, W), len(used))):

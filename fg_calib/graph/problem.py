@@ -86,7 +86,7 @@ class Problem(FrozenArrays):
     def initial(self) -> gtsam.Values:
         """GTSAM's initial values; a user inserts here those of variables that added factors bring with them."""
         values = self.variables.values(self.start)
-        values.insert(self.error_variables)
+        values.insert(self._measured[1])
         return values
 
     @cached_property
@@ -95,14 +95,9 @@ class Problem(FrozenArrays):
         known = [] if self.known is None else [self.known.factor(self.variables, self.data.landmarks)]
         return (*self._measured[0], *prior_factors(self.variables), *known, *self.added)
 
-    @property
-    def error_variables(self) -> gtsam.Values:
-        """The errors that measurements share, in units of their sigma, at their estimates."""
-        return self._measured[1]
-
     @cached_property
     def _measured(self) -> tuple[list[gtsam.NonlinearFactor], gtsam.Values]:
-        """Factors of the measurements, and the errors that they have in common."""
+        """Factors of the measurements, and estimates of the errors that they share, in units of their sigma."""
         return measurement_factors(self.rows, self.variables, self.variables.at(self.start))
 
     @property
@@ -215,11 +210,6 @@ class Problem(FrozenArrays):
         return found if found.n else None
 
     @property
-    def n_known(self) -> int:
-        """Scalar rows of what earlier rows say."""
-        return 0 if self.known is None else self.known.n
-
-    @property
     def has_more(self) -> bool:
         """Whether more than measurements and tolerances says something of the arm."""
         return bool(self.added) or self.knowledge is not None
@@ -288,21 +278,10 @@ def with_user_factors(problem: Problem) -> Problem:
     added = (*problem.added, *more)
     if more and problem.whole is not None:
         raise ProblemError("problem.graph", "added factors with gauge keep", "gauge prior or none")
-    variables, start = with_added(problem.variables, added, problem.initial, problem.error_variables)
+    variables, start = with_added(problem.variables, added, problem.initial, problem._measured[1])
     if not more and np.allclose(start, problem.start, rtol=0.0, atol=1e-12):
         return problem
     return with_factors(problem, start, variables=variables, added=added)
-
-
-def check_graph(problem: Problem) -> None:
-    """Check that nothing was added to the graph of a problem that has been solved.
-
-    Raises:
-        ProblemError: Its graph has other factors than it was solved with.
-    """
-    n = len(problem._more_factors)
-    if n:
-        raise ProblemError("solution.problem.graph", f"{n} factors added since it was solved", "to be solved again")
 
 
 def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> tuple[RowNoise, ...]:

@@ -175,12 +175,10 @@ class Variables(Brief):
     def prior_scales(self) -> Floats:
         """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
         scales = self.scales.copy()
-        for v in self.items if self.priors else ():
-            if v.kind != "frame":
-                order = [v.parameters[i] for i in _ALONG_TANGENT] if v.is_pose else v.parameters
-                tolerance = [self.robot.parameters[i].tolerance for i in order]
-                stated = np.array([t is not None for t in tolerance])
-                scales[v.columns] = np.where(stated, np.array(tolerance, dtype=np.float64), scales[v.columns])
+        for v in self.items:
+            stated, weight = self.stated[v.symbol]
+            places = [_ALONG_TANGENT.index(k) if v.is_pose else k for k in stated]
+            scales[v.columns][places] = 1.0 / weight
         return scales
 
     @property
@@ -201,10 +199,6 @@ class Variables(Brief):
 
     def nominal(self) -> Floats:
         """The parameter vector at the robot's nominal values, measurement frame and nuisance values zero."""
-        return self._nominal.copy()
-
-    @cached_property
-    def _nominal(self) -> Floats:
         return np.concatenate([self.robot.nominal, np.zeros(self.nuisance_span.stop - len(self.robot.parameters))])
 
     def values(self, parameters: Floats) -> gtsam.Values:

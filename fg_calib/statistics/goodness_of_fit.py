@@ -610,7 +610,7 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
     """
     problem = solution.problem
     chi2, n_rows, of_loss = _weighted_chi2(solution)
-    dof = n_rows + problem.n_priors + problem.n_added + problem.n_known - spread.rank
+    dof = n_rows + problem.n_priors + problem.n_added + (0 if problem.known is None else problem.known.n) - spread.rank
     dof -= linear_system(problem, solution.parameters).left.rank
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
     known = dof > 0 and problem.state.weights is None and solution.estimated_noise is None

@@ -206,7 +206,7 @@ def test_numbers_of_rows_pairs_and_priors():
     m = measure(robot, 17, rng, n_test=5)
     poses = build_problem(robot, m, model="pose", frame="unknown")
     assert (poses.n_configurations, poses.n_residuals, poses.n_priors, poses.n_pairs) == (17, 102, 8, 0)
-    assert (poses.n_independent, poses.n_added, poses.n_known, poses.has_more) == (102, 0, 0, False)
+    assert (poses.n_independent, poses.n_added, poses.known, poses.has_more) == (102, 0, None, False)
     assert "17 configurations\n  102 residuals and 8 priors on 22 unknowns in 5 variables" in repr(poses)
     star = build_problem(robot, m, model="distance-rotation")
     assert (star.n_configurations, star.n_residuals, star.n_pairs, star.n_independent) == (17, 32, 16, 32)
