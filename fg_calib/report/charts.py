@@ -162,10 +162,6 @@ class Plot:
         """A line from left to right at a height."""
         self._add("line", x1=self.x(x[0]), y1=self.y(y), x2=self.x(x[1]), y2=self.y(y), class_=kind)
 
-    def level(self, y: float) -> None:
-        """A dashed line all from left to right."""
-        self.line((self.x.low, self.x.high), y, "level")
-
     def dots(self, x: Floats, y: Floats, kind: str) -> None:
         """A dot at each pair of finite values."""
         good = np.isfinite(x) & np.isfinite(y)

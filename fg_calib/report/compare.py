@@ -27,9 +27,7 @@ PREDICTED = {"predicted_position_rms": "m", "predicted_position_rms_fitted": "m"
 EFFORT = {"n_estimated": "", "iterations": "", "seconds": "s"}
 """Units of quantities of an estimate in the document."""
 
-INDEPENDENT = (
-    "The sigma of a change assumes independent calibrations; with common priors or measurements it is too small."
-)
+INDEPENDENT = "The sigma of a change assumes independent calibrations; with common priors or rows it is too small."
 
 
 def build_comparison_report(comparison: Comparison) -> Group:
@@ -317,15 +315,13 @@ def _explanations(explanations: Sequence[Explanation]) -> Table:
 def _conclusions(found: Check) -> Iterator[str]:
     likely = [e for e in found.explanations if e.likely]
     if likely and likely[0].same:
-        same = ", ".join(likely[0].same)
-        yield f"{likely[0].parameters[0]} is equivalent to {same} for every position of the tool"
+        yield f"{likely[0].parameters[0]} is equivalent to {', '.join(likely[0].same)} for every position of the tool"
     if len(likely) > 1:
         yield f"not distinguishable by these rows: {', '.join(named(e.parameters) for e in likely)}"
         yield "do not deploy any of these changes yet"
         yield from [NO_ADVICE] * (found.advice is None)
     elif likely and found.verdict == "fail" and found.deploy:
-        change = likely[0].parameters[0]
-        yield f"no other single change explains the rows: update with --changed {change}, check again"
+        yield f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check again"
     elif likely and found.verdict == "fail":
         yield "do not deploy: residuals above noise remain after the most likely change"
 

@@ -24,6 +24,7 @@ from fg_calib.observability import missing_motions
 from fg_calib.prediction import PoseRms
 from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
+from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
 from fg_calib.simulation import instrument_keys, table_columns, to_fill_in
@@ -87,7 +88,7 @@ def _headline(design: Design) -> str:
 
 
 def _expected(design: Design) -> Iterator[str]:
-    where = "after the best rigid fit" if design.task.fitted else "in the base frame"
+    where = FRAMES["fitted" if design.task.fitted else "base"]
     yield f"RMS error of the tool over the task, {where}: {_pose(design.expected)}"
     if design.before is not None:
         yield f"with the present measurements: {_pose(design.before)}"
@@ -153,10 +154,10 @@ def draw_design(design: Design) -> Chart:
     errors = np.array([(p.designed, *p.random) for p in design.curve]).T
     n, target = np.array([float(p.n) for p in design.curve]), np.log10((design.target or np.nan) * 1e3)
     designed, low, middle, high = np.log10(np.where(errors < UNKNOWN_ABOVE, 1e3 * errors, np.nan))
-    names = "poses", "expected RMS error over the task [mm]"
-    plot = Plot(limits_of(n), limits_of(designed, low, high, target), names, powers=True)
+    limits = limits_of(n), limits_of(designed, low, high, target)
+    plot = Plot(*limits, ("poses", "expected RMS error over the task [mm]"), powers=True)
     if design.target is not None:
-        plot.level(float(target))
+        plot.line((plot.x.low, plot.x.high), float(target), "level")
     for values, kind in ((low, "b"), (high, "b"), (middle, "large b"), (designed, "large a")):
         plot.dots(n, values, kind)
     caption = f"{design.pool.robot.name}: expected error by the number of poses; blue designed, orange random"
@@ -180,14 +181,11 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     """
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     measured = design.tables if design.pool.scenario is not None else ()
-    filled = {
-        name: to_fill_in(
-            dict(columns) | (_rounded(t.measurements.readings, robot, units) if "q1" in columns else {}),
-            touched=_is_touched(t),
-        )
-        for t in measured
-        for name, columns in table_columns(t, robot, units).items()
-    }
+    filled: dict[str, Any] = {}
+    for t in measured:
+        for name, columns in table_columns(t, robot, units).items():
+            rounded = _rounded(t.measurements.readings, robot, units) if "q1" in columns else {}
+            filled[name] = to_fill_in({**columns, **rounded}, touched=_is_touched(t))
     urdf = "robot.urdf" if robot.urdf is not None and measured else None
     job = ("robot.yaml", "calibration.yaml") if measured else ()
     names = (_DOCUMENT, CONFIGURATIONS, "design.svg", *filled, *job, *([urdf] if urdf else []))
@@ -210,9 +208,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         files = {_DOCUMENT: ""} | {file.name: _digest(file) for file in into.iterdir()}
         write_text(into / _DOCUMENT, tables.json_text(design_document(design) | {"files": files}))
 
-    fill_folder(
-        folder, write, {name: b"" if name in earlier else b"none" for name in dict.fromkeys((*names, *earlier))}
-    )
+    own = {name: b"" if name in earlier else b"none" for name in dict.fromkeys((*names, *earlier))}
+    fill_folder(folder, write, own)
     return names
 
 

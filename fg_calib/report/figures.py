@@ -33,9 +33,6 @@ MAX_SIGMA = 5.0
 WORST = 5
 """Dots that are marked by name."""
 
-MIN_WIDTH_M = 1e-3
-"""Least width of a slice."""
-
 
 def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
     """All figures of a calibration by name, in the order of the page; none where its tables lack them."""
@@ -113,8 +110,7 @@ def correlation_matrix(data: ReportData) -> list[Chart]:
         if abs(value) > 0.02:
             about = f"{labels[i]}, {labels[j]}: {value:+.2f}" if abs(value) > 0.5 else ""
             sides = (j - 0.46, j + 0.46), (i - 0.46, i + 0.46)
-            kind = "plus" if value > 0.0 else "minus"
-            plot.box(*sides, about, class_=kind, opacity=f"{min(1.0, abs(value)):.2f}")
+            plot.box(*sides, about, class_="plus" if value > 0.0 else "minus", opacity=f"{min(1.0, abs(value)):.2f}")
     return [plot.chart(f"Correlations of the errors: orange positive, blue negative{more}")]
 
 
@@ -141,7 +137,7 @@ def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans, most: float 
     shown, order = np.clip(values, -most, most), np.arange(len(values), dtype=np.float64)
     plot = Plot((0.0, max(len(shown), 2)), limits_of(shown, [-4.0, 4.0]), ("row", "in its sigma"))
     for level in (-3.0, 3.0):
-        plot.level(level)
+        plot.line((plot.x.low, plot.x.high), level, "level")
     plot.dots(order[~test], shown[~test], "a")
     plot.dots(order[test], shown[test], "b")
     suspects = rows.filter(rows["suspect"]).sort(rows.filter(rows["suspect"])["studentised"].abs(), descending=True)
@@ -180,7 +176,7 @@ def error_slices(position: Floats, error: Floats, measured: Floats) -> list[Char
     if np.isnan(error).all():
         return []
     middle, low, high = np.median(measured, axis=0), position.min(axis=0), position.max(axis=0)
-    width = max(float((high - low).max()), MIN_WIDTH_M)
+    width = max(float((high - low).max()), 1e-3)  # [m]
     half = SLAB * width / 2.0
     low, high = (0.5 * (low + high) + sign * 0.52 * width for sign in (-1.0, 1.0))  # all axes on one scale
     first, last = np.nanquantile(error, [0.05, 0.95]) * 1e3

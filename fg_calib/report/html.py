@@ -56,9 +56,9 @@ def build_page(data: text.ReportData) -> str:
     """The page of a calibration, as HTML."""
     result, charts, space = data.result, figures_of(data), data.workspace
     sections = sorted(text.build_sections(data, MAX_ROWS), key=lambda one: one.title != text.NOTES)
-    figures = dict(zip(EXPLANATIONS, zip(EXPLANATIONS.values(), charts.values(), strict=True), strict=True))
-    known = {one.title for one in sections}
-    sections += [Section(title) for title, (_, drawn) in figures.items() if drawn and title not in known]
+    drawn = zip(EXPLANATIONS.items(), charts.values(), strict=True)
+    figures = {title: (about, of) for (title, about), of in drawn if of}
+    sections += [Section(title) for title in figures if title not in {one.title for one in sections}]
     if charts["workspace"] and space is not None:
         sections[-1:] = section(WORKSPACE, size_table(space), *percentages(space))
     template = _environment().get_template("page.html")
@@ -66,7 +66,7 @@ def build_page(data: text.ReportData) -> str:
         data=data,
         result=result,
         sections=sections,
-        figures={title: of for title, of in figures.items() if of[1]},
+        figures=figures,
         arm=arm_scene(data),
         ramp=RAMP,
         verdict=text.verdict_word(result),

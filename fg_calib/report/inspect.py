@@ -21,10 +21,6 @@ from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, line, section, table_of
 from fg_calib.report.text import expected_tool_error
 
-NOT_FAR = "as noise and priors allow", "larger than predicted, but not by far"
-"""What is said of residuals that noise and priors explain, and of larger ones."""
-
-
 COUNTS = {
     **{"": "name", "rows|>": "n_rows", "configurations|>": "n_configurations", "test rows|>": "n_test"},
     **{"train pairs|>": "n_pairs", "test pairs|>": "n_test_pairs", "repeats|>": "n_repeats"},
@@ -52,10 +48,9 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
 def build_identifiability_report(found: Identifiability) -> Group:
     """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
     where = "random configurations" if found.kind == "structural" else "configurations"
-    model = f"{found.model}, as poses of the board" if found.model == "pixels" else found.model
     known = line(f"With {', '.join(found.fixed)} known, as the robot's file says", "bold")
     return tables.report(
-        line(f"{found.robot}: {model}, {found.kind}, {found.n_configurations} {where}", "bold"),
+        line(f"{found.robot}: {found.model}, {found.kind}, {found.n_configurations} {where}", "bold"),
         *(line(f"NOT MODELLED: {m}", "bold red") for m in found.missing),
         *_classes(found),
         *([] if found.with_fixed_known is None else [line(""), known, *_classes(found.with_fixed_known)]),
@@ -138,9 +133,9 @@ def _residuals(found: Inspection) -> Table:
     rows = []
     for check in found.setups:
         of = f" of {check.table}" * bool(check.table)
-        most, words = (1.0, ("", "far too large")) if check.far else (2.0, NOT_FAR)
         for one in check.residuals:
-            judged = words[one.excess > most]
+            large = "far too large" if check.far else "larger than predicted, but not by far"
+            judged = large if one.excess > 2.0 else "as noise and priors allow"
             rows.append((f"{one.kind}{of}", one.unit, one.size, one.expected, one.excess, judged))
     return table_of(("", "|unit", "observed|q:.3g", "predicted|q:.3g", "ratio|.3g", ""), rows)
 

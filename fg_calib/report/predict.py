@@ -21,7 +21,7 @@ from fg_calib.report.tables import POSE_KINDS, figure, in_words, line, section, 
 from fg_calib.report.text import verdict_word
 from fg_calib.robot import Robot
 
-SI = Units()
+NOT_NEAR = ", where nothing was measured near"
 
 MAX_LISTED = 20
 """Configurations, or targets, that a report lists; the tables have all."""
@@ -100,7 +100,7 @@ FILES = {"predict.json": b'{\n "schema": "fg-calib/predict/', "predict.csv": b"i
 
 
 def write_prediction(
-    folder: Path, found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = (), units: Units = SI
+    folder: Path, found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str], units: Units
 ) -> None:
     """Write `predict.json` and `predict.csv` into a folder, all or none; over the workspace also its picture.
 
@@ -109,7 +109,7 @@ def write_prediction(
         found: The prediction.
         result: The result of the calibration.
         robot: The calibrated robot.
-        ids: Names of the configurations, where they were given.
+        ids: Names of the configurations; empty where they were not given.
         units: Of joint values and positions in the table; errors are in mm and deg.
 
     Raises:
@@ -201,7 +201,7 @@ def _worst_in_words(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
     x, y, z = (f"{v:.4f}" for v in worst.errors.position[0])
     at = "" if worst.row is None else f"{names[worst.row]}: "
     size = in_words(float(np.linalg.norm(worst.sigma)), "m", ".4f")
-    yield f"{at}{size} with the tool at x {x}, y {y}, z {z} m from the base"
+    yield f"{at}{size} with the tool at x {x}, y {y}, z {z} m from the base{NOT_NEAR * worst.far}"
     readings = zip(robot.joints, worst.errors.readings[0], strict=True)
     joints = (f"{joint.name} {in_words(q, joint.unit, '.2f')}" for joint, q in readings)
     yield f"joints: {', '.join(joints)}"
@@ -210,8 +210,6 @@ def _worst_in_words(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
     if worst.responsible:
         changes = (f"{p.name} {in_words(p.change, p.unit, '+.3g')}" for p in worst.responsible)
         yield f"with 1 sigma along it go {', '.join(changes)}"
-    if worst.far:
-        yield "nothing was measured near it"
 
 
 def _responsible(found: PredictedErrors, result: Result) -> Table:

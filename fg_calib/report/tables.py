@@ -246,8 +246,7 @@ def weak_directions(observability: Observability, most: int = 5) -> Table:
 
 def joint_columns(robot: Robot, form: str = "") -> list[str]:
     """Columns of joint readings for `table_of`."""
-    names = ((joint.name.replace("|", "/"), joint.unit) for joint in robot.joints)
-    return [f"{name} {unit_shown(unit)}|{unit}{form}" for name, unit in names]
+    return [f"{joint.name.replace('|', '/')} {unit_shown(joint.unit)}|{joint.unit}{form}" for joint in robot.joints]
 
 
 def plain(document: Any) -> Any:

@@ -156,8 +156,7 @@ def judged(judgements: Iterable[Judgement]) -> list[str]:
 
 
 def _verdict(result: Result) -> Iterator[Content]:
-    several = len(result.tables) > 1
-    measured = "; ".join(f"{label} ({words})" if several else words for label, words in result.tables)
+    measured = "; ".join(f"{label} ({words})" if len(result.tables) > 1 else words for label, words in result.tables)
     joints = ", joint positions estimated" if result.joint_values is not None else ""
     loss = "" if result.loss == "none" else f", loss {result.loss}"
     yield line(f"{result.robot}: {measured}{joints}{loss}")
@@ -369,13 +368,11 @@ def _frames(result: Result) -> list[Section]:
     sections: list[Section] = []
     for symbol, frame in result.frames.items():
         which = "" if len(result.tables) == 1 else f" of {result.tables[int(symbol[2:-1])][0]}"
-        rows = [
-            ("xyz", _vector(frame.xyz, *"mmm"), "mm"),
-            ("± along its axes", _vector(frame.sigma[3:], *"mmm"), "mm"),
-            ("quaternion xyzw", "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist()), ""),
-            ("± about its axes", _vector(frame.sigma[:3], *["rad"] * 3), "deg"),
-        ]
-        sections += section(f"Measurement frame (world_T_base{which})", table_of(("", "|>", ""), rows))
+        rows = [("xyz", *frame.xyz, "m"), ("± along its axes", *frame.sigma[3:], "m")]
+        rows.append(("± about its axes", *frame.sigma[:3], "rad"))
+        quaternion = "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist())
+        table = table_of(("", "|q", "|q", "|q", "|unit"), rows)
+        sections += section(f"Measurement frame (world_T_base{which})", table, f"quaternion xyzw: {quaternion}")
     return sections
 
 
@@ -391,11 +388,10 @@ def summary(result: Result, most: int = 4) -> list[str]:
         most: How many lines of the verdict are shown.
     """
     title, *verdict = map(str, _verdict(result))
-    more = [f"... and {len(verdict) - most} more findings"] if len(verdict) > most else []
     chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
     known = sum(p.sigma is not None for p in result.estimated)
     lines = [
-        *(title, *verdict[:most], *more),
+        *(title, *verdict[:most]),
         f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",
         f"{len(result.estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
     ]
