@@ -178,7 +178,7 @@ def check_copies(tables: Sequence[Table]) -> None:
     tables are the same where most values of the smaller one stand in the other at the same readings.
     """
     for number, table in enumerate(tables):
-        m, values = table.measurements, _rows_of(table)[1]
+        m, values = table.measurements, _rows_of(table)[1] if number else {}
         n_rows = m.n_configurations if m.pairs is None else m.pairs.n_pairs
         n, two, _ = find_copies(table) if n_rows <= MOST_LOOKED_AT else (0, "", 0)
         if n:
