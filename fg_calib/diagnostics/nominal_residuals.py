@@ -31,8 +31,6 @@ MAX_ROWS, MAX_IMAGES, MAX_CORNERS = 60, 20, 8
 MAX_STEPS = 6
 """Steps from the start in closed form that suffice where the set-up is right."""
 
-_UNITS: dict[str, Literal["m", "rad", "px"]] = {"orientation": "rad", "angle": "rad", "pixel": "px"}
-
 
 @dataclass(frozen=True)
 class TypicalResidual:
@@ -182,11 +180,11 @@ def residuals_at(
         squares, variance = noise.residual() ** 2, np.sum(J**2, axis=2) + noise.sigma**2
         kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
         for kind in dict.fromkeys(kinds.tolist()):
-            of = used & (kinds == kind)
+            of, unit = used & (kinds == kind), noise.series.kind.units[kinds.tolist().index(kind)]
             rows = of.any(axis=1)
             if rows.any():
                 size, expected = (
                     float(np.median(np.sqrt(np.sum(v, axis=1, where=of)[rows]))) for v in (squares, variance)
                 )
-                found.append(TypicalResidual(kind, _UNITS.get(kind, "m"), size, max(expected, 1e-9), int(rows.sum())))
+                found.append(TypicalResidual(kind, unit, size, max(expected, 1e-9), int(rows.sum())))
     return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()

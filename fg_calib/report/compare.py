@@ -15,8 +15,8 @@ from rich.text import Text
 
 from fg_calib.baseline import ESTIMATORS, Comparison, Estimate
 from fg_calib.diagnostics import probability
-from fg_calib.inputs import LIMITED, InputError, checked
-from fg_calib.io import Result, Run
+from fg_calib.inputs import InputError, checked
+from fg_calib.io import NOISE_UNITS, Result, Run
 from fg_calib.monitoring import Check, Explanation
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, figure, in_words, line, section, table_of
@@ -295,8 +295,8 @@ def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
 
 
 def _rms_errors(found: Check) -> Table:
-    units = {kind: LIMITED.get(kind) or ("px" if kind == "pixel" else "m") for kind in found.rms}
-    rows = [(kind, units[kind], rms, found.noise[kind], found.limits.get(kind)) for kind, rms in found.rms.items()]
+    kinds = ((kind, NOISE_UNITS.get(kind, "m"), rms) for kind, rms in found.rms.items())
+    rows = [(kind, unit, rms, found.noise[kind], found.limits.get(kind)) for kind, unit, rms in kinds]
     return table_of(("", "|unit", "error|q| ", "specified noise|q| ", "limit|q| "), rows)
 
 
