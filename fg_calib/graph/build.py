@@ -98,11 +98,14 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
         raise ProblemError(f"robot {robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
     evaluated = all(map(_all_test, tables))
     if evaluated:
-        robot, options, tables = _for_evaluation(robot, options, tables)
+        free = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
+        robot, tables = robot.with_estimated(free), [table.all_train() for table in tables]
+        gauge = "none" if options.gauge == "keep" else options.gauge
+        options = replace(options, gauge=gauge, encoder="propagated")
     elif options.estimate_tolerance is not None:
         n, parameters = robot.n_joints, robot.parameters
-        free = [p.tolerance is None and p.estimated and 1 <= p.owner <= n for p in parameters]
-        first = (replace(p, tolerance=FIRST_TOLERANCE) if f else p for p, f in zip(parameters, free, strict=True))
+        none = [p.tolerance is None and p.estimated and 1 <= p.owner <= n for p in parameters]
+        first = (replace(p, tolerance=FIRST_TOLERANCE) if t else p for p, t in zip(parameters, none, strict=True))
         robot = replace(robot, parameters=tuple(first))
     data = build_dataset(robot, tables)
     variables = variables_of(robot, data, options)
@@ -152,16 +155,6 @@ def _all_test(table: Table) -> bool:
     return bool(every.all()) and len(every) > 0
 
 
-def _for_evaluation(
-    robot: Robot, options: Options, tables: Sequence[Table]
-) -> tuple[Robot, Options, tuple[Table, ...]]:
-    """A robot whose base and tool alone are estimated, where they were, and test rows that these are fitted to."""
-    of_frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
-    gauge = "none" if options.gauge == "keep" else options.gauge
-    options = replace(options, gauge=gauge, encoder="propagated")
-    return robot.with_estimated(of_frames), options, tuple(table.all_train() for table in tables)
-
-
 @checked
 def problem_of(job: Job, **changes: Any) -> Problem:
     """The calibration problem of a job.
@@ -199,10 +192,8 @@ def predicted_problem(
     """
     options = Options(model, pairing or Pairing(), frame, gauge="none", pair_errors=pair_errors)
     options = replace(options, model=INSTRUMENTS[options.model].random_model(Table(measurements)))
-    table = Table(
-        predict_measurements(robot, measurements, options.model), options.model, options.pairing, options.frame
-    )
-    return true_problem(robot, table, options)
+    m = predict_measurements(robot, measurements, options.model)
+    return true_problem(robot, Table(m, options.model, options.pairing, options.frame), options)
 
 
 @single_threaded

@@ -103,12 +103,10 @@ class Knowledge(FrozenArrays):
         if list(self.unknowns) == kept:
             return self
         nominal = None if self.nominal is None else self.nominal.about(unknowns)
-        spans = [np.arange(SIZE) + SIZE * self.unknowns.index(name) for name in kept]
-        chosen = np.concatenate([np.zeros(0, dtype=np.int64), *spans])
-        others = np.setdiff1d(np.arange(len(self.at)), chosen)
-        order = np.concatenate([np.arange(n), n + chosen, n + others])
-        left = eliminate(self.rows[:, order], self.right, n + len(chosen))
-        return self._with(Knowledge.of_rows(self.robot, kept, self.at[chosen], left.A, left.b), nominal)
+        columns = np.concatenate([np.arange(n), *(self.span(name) for name in kept)])
+        order = np.concatenate([columns, np.setdiff1d(np.arange(n + len(self.at)), columns)])
+        left = eliminate(self.rows[:, order], self.right, len(columns))
+        return self._with(Knowledge.of_rows(self.robot, kept, self.at[columns[n:] - n], left.A, left.b), nominal)
 
     def grown(self, directions: Floats, free: NDArray[np.bool_]) -> Knowledge:
         """The same of an arm that may have changed since.

@@ -119,11 +119,9 @@ class Problem(FrozenArrays):
     def __repr__(self) -> str:
         v, models = self.variables, ", ".join(str(table.model) for table in self.data.tables)
         frame = ", measurement frame unknown" if v.frames else ""
-        return (
-            f"Problem of {self.robot.name!r}: {models}{frame}, {self.n_configurations} configurations\n"
-            f"  {self.n_residuals} residuals and {self.n_priors} priors on {v.n_columns + v.n_nuisance} unknowns in"
-            f" {len(v.keys)} variables"
-        )
+        unknowns = f"{v.n_columns + v.n_nuisance} unknowns in {len(v.keys)} variables"
+        head = f"Problem of {self.robot.name!r}: {models}{frame}, {self.n_configurations} configurations"
+        return f"{head}\n  {self.n_residuals} residuals and {self.n_priors} priors on {unknowns}"
 
     def linearize(self, parameters: Floats | None = None) -> NormalSystem:
         """The normal system of measurements, priors and added factors at a parameter vector, at `start` if None.

@@ -24,18 +24,9 @@ from numpy.typing import NDArray
 
 from fg_calib.graph.noise_models import NoiseState, RowNoise
 from fg_calib.graph.normal_system import NormalSystem
-from fg_calib.graph.problem import (
-    Problem,
-    frames_only,
-    linear_system,
-    mahalanobis_distances,
-    noises_at,
-    relinearized_at,
-    subsampled,
-    with_user_factors,
-)
+from fg_calib.graph.problem import Problem, frames_only, noises_at, relinearized_at, subsampled, with_user_factors
 from fg_calib.graph.robust import Weighting, constants, cost
-from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, Options, SolverError, check_number, checked
+from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, SolverError, check_number, checked
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 
@@ -195,7 +186,7 @@ class Solution(FrozenArrays):
         if weights is None:
             return self.cost
         total = self.weighted_cost
-        distances = mahalanobis_distances(self.problem, self.parameters)
+        distances = [noise.lengths() for noise in self.noises]
         for s, w, (e, residual_dim) in zip(self.problem.data.blocks, weights, distances, strict=True):
             more = cost(loss, e, constants(loss, residual_dim)) - 0.5 * w * e**2
             total += float(np.sum(more[s.train]))
@@ -225,7 +216,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
         SolverError: A residual or derivative is not finite, or measurements share too many errors.
     """
     problem = with_user_factors(problem)
-    options = options or options_of(problem.options)
+    options = options or SolverOptions(problem.options.max_iterations or SolverOptions.max_iterations)
     clock = time.perf_counter()
     with one_blas_thread:
         before = _fit_frames(problem, options) if start is None else np.asarray(start, dtype=np.float64)
@@ -238,12 +229,6 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
 def unsolved(problem: Problem) -> Solution:
     """A problem at its start as if that were its solution: what could be known there."""
     return Solution(problem, problem.start, problem.start)
-
-
-def options_of(options: Options) -> SolverOptions:
-    """The solver's settings that a calibration's options ask for."""
-    most = options.max_iterations
-    return SolverOptions() if most is None else SolverOptions(max_iterations=most)
 
 
 def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
@@ -285,7 +270,7 @@ class _Point:
     def system(self) -> NormalSystem:
         """The normal system."""
         try:
-            return linear_system(self.problem, self.parameters)
+            return self.problem.linearize(self.parameters)
         except CalibrationError:
             raise
         except Exception as error:  # of LAPACK or an added factor
@@ -446,7 +431,7 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
     """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
     state, final = problem.state, True
     if problem.options.loss != "none":
-        found = mahalanobis_distances(problem, parameters)
+        found = [noise.lengths() for noise in noises_at(problem, parameters)]
         test = np.concatenate([s.test for s in problem.data.blocks])
         e, residual_dim = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
         weights, final = weighting.update(e, residual_dim)

@@ -23,7 +23,7 @@ pitch and yaw. The angles themselves would not do: at a pitch of a quarter turn 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -309,22 +309,22 @@ class Variables(Brief):
         Note:
             At a pitch of a quarter turn roll and yaw have no derivative; their rows are then nan.
         """
-        D = np.eye(self.n_columns)
-        for v in self.items:
-            if v.is_pose:
-                D[v.columns, v.columns] = _frame_derivative(parameters[v.places])
-        return D
+        return self._by_pose(_frame_derivative, parameters)
 
     def tangent_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the columns in the named scalars: the inverse of `named_derivative`, finite everywhere.
 
         At a pitch of a quarter turn it is singular: there roll and yaw turn a frame about the same axis.
         """
-        E = np.eye(self.n_columns)
+        return self._by_pose(_tangent_derivative, parameters)
+
+    def _by_pose(self, derivative: Callable[[Floats], Floats], parameters: Floats) -> Floats:
+        """The identity, but for the blocks of poses, shape (n_columns, n_columns)."""
+        D = np.eye(self.n_columns)
         for v in self.items:
             if v.is_pose:
-                E[v.columns, v.columns] = _tangent_derivative(parameters[v.places])
-        return E
+                D[v.columns, v.columns] = derivative(parameters[v.places])
+        return D
 
 
 def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -> Variables:
@@ -460,12 +460,9 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
             continue
         of_v, rows, columns = v.places, slice(first, first + len(stated)), v.columns
         first = rows.stop
-        if v.is_pose:
-            off, D = _off_nominal(parameters[of_v], nominal[of_v])
-            r[rows], J[rows, columns] = weight * off[stated], weight[:, None] * D[stated]
-        else:
-            r[rows] = weight * (parameters[of_v] - nominal[of_v])[stated]
-            J[np.arange(rows.start, first), columns.start + np.array(stated)] = weight
+        x, of = parameters[of_v], nominal[of_v]
+        off, D = _off_nominal(x, of) if v.is_pose else (x - of, np.eye(len(x)))
+        r[rows], J[rows, columns] = weight * off[stated], weight[:, None] * D[stated]
     return r, J
 
 
@@ -485,15 +482,11 @@ def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
 
 def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
     """Whitened priors of the measurements' unknowns and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
-    r, J = [np.zeros(0)], [np.zeros((0, variables.n_columns + variables.n_nuisance))]
-    for v in variables.nuisance:
-        if v.prior is not None:
-            mean, sigma = (np.array(figures) for figures in v.prior)
-            rows = np.zeros((len(sigma), variables.n_columns + variables.n_nuisance))
-            rows[:, v.columns] = np.diag(1.0 / sigma)
-            r.append((parameters[v.places] - mean) / sigma)
-            J.append(rows)
-    return np.concatenate(r), np.vstack(J)
+    found = [(v, *v.prior) for v in variables.nuisance if v.prior is not None]
+    columns = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v, _, _ in found)])
+    x = np.concatenate([np.zeros(0), *(parameters[v.places] - mean for v, mean, _ in found)])
+    sigma = np.concatenate([np.ones(0), *(s for _, _, s in found)])
+    return x / sigma, np.eye(variables.n_columns + variables.n_nuisance)[columns] / sigma[:, None]
 
 
 def preference(parameter: Parameter, prefer: Sequence[str]) -> int:
@@ -503,6 +496,5 @@ def preference(parameter: Parameter, prefer: Sequence[str]) -> int:
     """
     if parameter.name in prefer:
         return list(prefer).index(parameter.name)
-    if parameter.name.startswith(("base.", "tool.")):
-        return len(prefer)
-    return len(prefer) + 1 + KEEP_ORDER.index(parameter.kind)
+    of_frame = parameter.name.startswith(("base.", "tool."))
+    return len(prefer) + (0 if of_frame else 1 + KEEP_ORDER.index(parameter.kind))
