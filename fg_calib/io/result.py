@@ -423,10 +423,11 @@ def _noise_factors(solution: Solution, fits: tuple[statistics.KindFit, ...]) -> 
     estimated = solution.estimated_noise
     if estimated is None:
         return {}
-    factors = {key_of(fit, fits): fit.own_factor for fit in fits}
+    of_noise = solution.problem.state.factors
+    factors = {key_of(fit, fits): of_noise.get((fit.table, fit.kind), 1.0) for fit in fits}
     kept = [key_of(fit, fits) for fit in fits if (fit.table, fit.kind) not in estimated]
     if np.any(solution.problem.data.sigma_joint > 0.0):
-        factors["joint"] = solution.problem.state.factors.get(JOINT_NOISE, 1.0)
+        factors["joint"] = of_noise.get(JOINT_NOISE, 1.0)
         kept += ["joint"] if JOINT_NOISE not in estimated else []
     return {"noise_factors": factors, "noise_kept": tuple(kept)}
 

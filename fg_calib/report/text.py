@@ -203,7 +203,7 @@ def _goodness(result: Result, robot: Robot) -> list[Content]:
     for fit in fits:
         specified, ratio, words = fit.stated_sigma_rms, fit.seen_over_stated, VERDICTS[fit.verdict]
         if factors is not None:
-            specified, ratio, words = fit.own_sigma_rms, fit.own_factor, _estimated_noise(result, key_of(fit, fits))
+            ratio, words = fit.factor, _estimated_noise(result, key_of(fit, fits))
         rows.append((_named(result, fit), fit.unit, specified, ratio * specified, ratio, fit.p_value, words))
     joint = (factors or {}).get("joint")
     for unit in dict.fromkeys(one.unit for one in robot.joints) if joint is not None else ():

@@ -25,7 +25,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
-from fg_calib.graph import JOINT_NOISE, Solution, effect, linear_system, mahalanobis_distances
+from fg_calib.graph import NoiseState, Solution, effect, linear_system, mahalanobis_distances, noises_at
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
@@ -95,8 +95,6 @@ class KindFit:
         n_beyond: Rows with a |studentised residual| that none of a clean table has (`suspect_level`).
         spoilt: Whether rows of this kind are among the gross errors themselves.
         rest: The same of the rows without gross errors; None where there are none, or not few.
-        own_sigma_rms: Root of the mean square of the sigmas as stated without the joints' noise; nan if not asked for.
-        own_factor: What these were multiplied by.
     """
 
     kind: str
@@ -114,8 +112,6 @@ class KindFit:
     n_beyond: int = 0
     spoilt: bool = False
     rest: KindFit | None = None
-    own_sigma_rms: Figure = np.nan
-    own_factor: Figure = 1.0
 
     @computed_field  # type: ignore[prop-decorator]
     @property
@@ -486,7 +482,7 @@ class RowStatistics:
 
     def _fit_kinds(self, part: JudgedRows, excess: Floats, known: bool) -> tuple[KindFit, ...]:
         """The fit of each of the table's groups, whose chi-square has a mean lower by `excess`."""
-        factors, table, found = self.solution.problem.state.factors, self.table, list[KindFit]()
+        table, found = self.table, list[KindFit]()
         for code, (number, family) in enumerate(table.groups):
             chosen = part.of_kind(code)
             if not len(chosen):
@@ -495,17 +491,15 @@ class RowStatistics:
             total, mean = float(np.sum(part.squares[chosen])), float(np.sum(part.means[chosen]))
             expected, degrees, size = mean - excess[code], part.degrees(chosen), np.abs(self.studentised[rows])
             of_noise = np.inf if part is self.fitted else self._degrees_of_noise(self.fitted.of_kind(code))
-            enough, own_factor = expected >= 1.0, factors.get((number, family), 1.0)
-            variance, joint_variance = (float(np.mean(v[rows])) for v in (table.sigma**2, self._joint_variance))
-            own_variance = max(variance - joint_variance, 0.0) / own_factor**2
-            specified = own_variance + joint_variance / factors.get(JOINT_NOISE, 1.0) ** 2
-            factor = float(np.sqrt(variance / specified)) if joint_variance else own_factor
+            enough = expected >= 1.0
+            variance, specified = (float(np.mean(v[rows])) for v in (table.sigma**2, self._specified_variance))
+            factor = float(np.sqrt(variance / specified))
             found.append(
                 KindFit(
                     kind=family,
                     unit=table.unit(family),
                     n=len(rows),
-                    stated_sigma_rms=float(np.sqrt(variance)) / factor,
+                    stated_sigma_rms=float(np.sqrt(specified)),
                     factor=factor,
                     seen_over_stated=factor * float(np.sqrt(total / expected)) if enough else np.nan,
                     chi2=total,
@@ -515,19 +509,18 @@ class RowStatistics:
                     degrees=degrees,
                     table=number,
                     n_beyond=int(np.sum(size > suspect_level(len(rows)))),
-                    own_sigma_rms=float(np.sqrt(own_variance)),
-                    own_factor=own_factor,
                 )
             )
         return tuple(found)
 
     @cached_property
-    def _joint_variance(self) -> Floats:
-        """Variance of each row by the noise of the joint readings, shape (n,)."""
-        variance = np.zeros(self.table.n)
-        for number, noise in enumerate(self.solution.noises):
-            of_joints = noise.loading[:, :, : noise.n_of_joints]
-            variance[self.table.rows_of(number)] = np.sum(of_joints**2, axis=2)[noise.series.measured]
+    def _specified_variance(self) -> Floats:
+        """Variance of each row by the noise as specified, shape (n,)."""
+        variance, problem = self.table.sigma**2, replace(self.solution.problem, state=NoiseState())
+        for number, noise in enumerate(
+            noises_at(problem, self.solution.parameters) if self.solution.problem.state.factors else ()
+        ):
+            variance[self.table.rows_of(number)] = noise.sigma[noise.series.measured] ** 2
         return variance
 
     def _predict(self, test: Integers, squares: Floats) -> JudgedRows:
