@@ -55,11 +55,16 @@ class Calibrated:
 
     @cached_property
     def information(self) -> graph.Knowledge | None:
-        """What rows and tolerances say."""
-        if self.knowledge is None or not self.options.has_priors:
-            return self.knowledge
-        estimated = {p.name: p.tolerance for p in self.robot.parameters if p.estimated and p.tolerance is not None}
-        return with_tolerances(self.knowledge, self.robot.nominal, estimated)
+        """What rows say, and tolerances about the nominal values as rows of their own."""
+        known = self.knowledge
+        if known is None or not self.options.has_priors:
+            return known
+        of = {p.name: p.tolerance for p in self.robot.parameters if p.estimated}
+        parameters = tuple(replace(p, tolerance=of.get(p.name)) for p in known.robot.parameters)
+        robot = replace(known.robot, parameters=parameters).with_values(self.robot.nominal)
+        variables = replace(known.variables, robot=robot, priors=True)
+        r, J = graph.prior_rows(variables, np.append(known.robot.nominal, np.zeros(6)))
+        return known.with_rows(np.hstack([J, np.zeros((len(J), len(known.at)))]), r)
 
     @property
     def arm(self) -> Robot:
@@ -129,61 +134,30 @@ def at_nominal(problem: graph.Problem, before: Floats) -> tuple[graph.Problem, F
 
 
 def _known_at(problem: graph.Problem, x: Floats, *, with_loss: bool) -> graph.Knowledge:
-    """What the rows of a problem, and those before, say, linearised at a parameter vector."""
-    v = problem.variables
-    robot = v.robot.with_values(x[v.robot_span])
-    places = {name: place for name in _staying(problem) if (place := _place(problem, name)) is not None}
-    before = problem.knowledge
-    unseen = [] if before is None else [name for name in before.unknowns if name not in places]
-    A, b = _rows(problem, x, unseen, with_loss=with_loss)
+    """What the rows of a problem, and those before, say, linearised at a parameter vector; not the arm's tolerances."""
+    v, known, unknowns = problem.variables, problem.knowledge, problem.data.landmarks
+    staying = {name: _place(problem, name) for name in unknowns.keys if name[0] in graph.STAYING}
+    places = {name: place for name, place in staying.items() if place is not None}
+    unseen = [name for name in (() if known is None else known.unknowns) if name not in places]
+    B = graph.square_root(replace(problem, knowledge=None), x, with_loss=with_loss)
+    rows = [np.column_stack([B[:, :-1], np.zeros((len(B), graph.SIZE * len(unseen))), B[:, -1]])]
+    at = [np.zeros(0), *(x[place] for place in places.values())]
+    if known is not None:
+        s, D = known.step_to(v, unknowns, x)
+        own = [known.rows[:, known.span(name)] for name in unseen]
+        rows.append(np.column_stack([known.rows @ D, *own, known.right + known.rows @ s]))
+        at += [known.place(name) for name in unseen]
+    A, b = np.split(np.vstack(rows), [-1], axis=1)
     columns = [place - v.nuisance_span.start + v.n_columns for place in places.values()]
     wide = np.arange(A.shape[1])
     kept = np.concatenate([wide[: v.n_robot_columns], *columns, wide[v.n_columns + v.n_nuisance :]])
-    left = graph.eliminate(A[:, np.concatenate([kept, np.setdiff1d(wide, kept)])], b, len(kept))
-    at = [x[place] for place in places.values()]
-    if before is not None:
-        at += [before.place(name) for name in unseen]
-    return graph.Knowledge.of_rows(robot, [*places, *unseen], np.concatenate([np.zeros(0), *at]), left.A, left.b)
-
-
-def _staying(problem: graph.Problem) -> list[graph.Name]:
-    unknowns = problem.data.landmarks
-    return [name for name in unknowns.keys if name[0] in graph.STAYING]
+    left = graph.eliminate(A[:, np.concatenate([kept, np.setdiff1d(wide, kept)])], b[:, 0], len(kept))
+    robot = v.robot.with_values(x[v.robot_span])
+    return graph.Knowledge.of_rows(robot, [*places, *unseen], np.concatenate(at), left.A, left.b)
 
 
 def _place(problem: graph.Problem, name: graph.Name) -> NDArray[np.int64] | None:
     return graph.coordinates_of(problem.variables, problem.data.landmarks, name)
-
-
-def _rows(
-    problem: graph.Problem, parameters: Floats, unseen: list[graph.Name], *, with_loss: bool
-) -> tuple[Floats, Floats]:
-    """All rows but the arm's tolerances, by the problem's columns, then by those of what was known and is not seen."""
-    v, extra = problem.variables, graph.SIZE * len(unseen)
-    B = graph.square_root(replace(problem, knowledge=None), parameters, with_loss=with_loss)
-    wide = [np.column_stack([B[:, :-1], np.zeros((len(B), extra)), B[:, -1]])]
-    known = problem.knowledge
-    if known is not None:
-        s, D = known.step_to(v, problem.data.landmarks, parameters)
-        own = [known.rows[:, known.span(name)] for name in unseen]
-        wide.append(np.column_stack([known.rows @ D, *own, known.right + known.rows @ s]))
-    every = np.vstack(wide)
-    return every[:, :-1], every[:, -1]
-
-
-def with_tolerances(known: graph.Knowledge, nominal: Floats, tolerances: dict[str, float]) -> graph.Knowledge:
-    """Knowledge with the arm's tolerances about its nominal values as rows of their own.
-
-    Args:
-        known: What rows say.
-        nominal: Nominal values of all parameters of the robot.
-        tolerances: 1 sigma by parameter.
-    """
-    parameters = tuple(replace(p, tolerance=tolerances.get(p.name)) for p in known.robot.parameters)
-    robot = replace(known.robot, parameters=parameters).with_values(nominal)
-    variables = replace(known.variables, robot=robot, priors=True)
-    r, J = graph.prior_rows(variables, np.append(known.robot.nominal, np.zeros(6)))
-    return known.with_rows(np.hstack([J, np.zeros((len(J), len(known.at)))]), r)
 
 
 def fingerprints(tables: Sequence[Table]) -> tuple[str, ...]:

@@ -82,25 +82,15 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
     if options.gauge == "prior":
         return whole
     kept = kept_of(whole, options.prefer)
-    if options.gauge == "none":
-        _require_determined(robot, kept)
-        return whole
-    return problem(robot.with_estimated(kept), whole)
-
-
-def _require_determined(robot: Robot, kept: Sequence[str]) -> None:
-    """Check that rows old and new determine all that is estimated, where neither tolerances nor gauge hold the rest.
-
-    What parameters may do unseen bends as they move, and the old rows stand as they were linearised: new rows would be
-    at odds with them about it, and a miss of one sigma move an arm by metres along it.
-
-    Raises:
-        InputError: They do not.
-    """
+    if options.gauge == "keep":
+        return problem(robot.with_estimated(kept), whole)
+    # What nothing determines is nonlinear in what it does, and the old rows stand as they were linearised: new rows
+    # would contradict them, and a miss of one sigma would move an arm by metres.
     lost = [p.name for p in robot.parameters if p.estimated and p.name not in kept]
     if lost:
         found = f"gauge none, and rows that do not determine {', '.join(lost)} beside the others"
         raise InputError("update", found, "a calibration with gauge keep or prior")
+    return whole
 
 
 def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]) -> Knowledge:
