@@ -46,7 +46,7 @@ from fg_calib.inputs import (
     checked,
 )
 from fg_calib.job import Job
-from fg_calib.measurements import LANDMARKS, Dataset, Table
+from fg_calib.measurements import LANDMARKS, Dataset, Labels, Table
 from fg_calib.parallel import Failure, map_jobs
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
 
@@ -241,11 +241,10 @@ def _observers(data: Dataset) -> Iterator[tuple[list[int], int]]:
             n = np.bincount(place[np.concatenate([m.pairs.a, m.pairs.b])])
             reference = np.flatnonzero(n > REFERENCE_SHARE * m.pairs.n_pairs).tolist()
             by_name |= {("reference", str(k)): [k] for k in reference}
-        named = [(kind, labels.names, labels.index) for kind, labels in m.labels.items()]
-        named += [] if m.groups is None else [("group", m.groups.names, m.groups.index)]
-        for kind, names, index in named:
-            for i, name in enumerate(names):
-                by_name.setdefault((kind, name), []).extend(place[index == i].tolist())
+        groups = {} if m.groups is None else {"group": Labels(m.groups.names, m.groups.index)}
+        for kind, labels in (m.labels | groups).items():
+            for i, name in enumerate(labels.names):
+                by_name.setdefault((kind, name), []).extend(place[labels.index == i].tolist())
     for (kind, _), configurations in by_name.items():
         yield sorted(set(configurations)), NEEDED.get(kind, 1)
 

@@ -49,7 +49,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy import special
@@ -138,17 +137,6 @@ class Corrections:
     preferred: Floats
     group: Integers
 
-    @cached_property
-    def member(self) -> Floats:
-        """1 where a correction is of a group, shape (n_groups, n)."""
-        return np.equal.outer(np.arange(self.group.max(initial=-1) + 1), self.group).astype(np.float64)
-
-    @cached_property
-    def prior_information(self) -> Floats:
-        """Information on the logarithms of the scales before any data, shape (n_groups, n_groups)."""
-        n = len(self.member)
-        return np.linalg.inv(COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n)).astype(np.float64)
-
 
 class ScalePosterior:
     """The corrections at given scales, and the posterior of these.
@@ -167,8 +155,10 @@ class ScalePosterior:
     """
 
     def __init__(self, corrections: Corrections, theta: Floats) -> None:
-        self.corrections, self.theta = corrections, theta
-        member, prior = corrections.member, corrections.prior_information
+        self.theta, n = theta, len(theta)
+        member = np.equal.outer(np.arange(n), corrections.group).astype(np.float64)  # 1 for those of a group
+        guess: Floats = COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n)
+        prior = np.linalg.inv(guess)
         s = np.exp(theta) @ member
         M = np.eye(len(s)) + s[:, None] * corrections.information * s
         C = np.linalg.inv(M)
@@ -217,7 +207,7 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
         at = ScalePosterior(corrections, theta)
         return -at.value, -at.gradient
 
-    n = len(corrections.member)
+    n = int(corrections.group.max(initial=-1)) + 1
     from scipy.optimize import minimize  # here, for it takes as long to import as a small calibration
 
     modes = (minimize(cost, np.full(n, start), jac=True, method="BFGS", options={"gtol": GTOL}).x for start in STARTS)

@@ -197,11 +197,8 @@ class ResidualTable(FrozenArrays):
     @cached_property
     def begins(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
-        first = np.ones(self.n, dtype=np.bool_)
-        number, family = self.measurement_number, self.family
-        first[1:] = (number[1:] != number[:-1]) | (family[1:] != family[:-1])
-        first.flags.writeable = False
-        return first
+        key = np.stack([self.measurement_number, self.family])
+        return np.asarray(np.diff(key, prepend=-1).any(axis=0))
 
     def row_ends(self, rows: Integers) -> tuple[Integers, Integers]:
         """The ends of some rows: place among these, and configuration or landmark, in `names`."""

@@ -276,9 +276,7 @@ def _steps(found: NoiseComponents, kept: frozenset[graph.NoiseName]) -> Floats:
 def _solve(T: Floats, b: Floats) -> Floats:
     """T^-1 b, of least length where T is singular; T symmetric, scaled to a diagonal of 1."""
     by = 1.0 / np.sqrt(np.maximum(np.diag(T), TINY))
-    values, vectors = np.linalg.eigh(T * by[:, None] * by)
-    kept = values > FLAT
-    out: Floats = by * (vectors[:, kept] @ ((vectors[:, kept].T @ (by * b)) / values[kept]))
+    out: Floats = by * (np.linalg.pinv(T * by[:, None] * by, rcond=FLAT, hermitian=True) @ (by * b))
     return out
 
 
