@@ -242,7 +242,7 @@ def _observers(data: Dataset) -> Iterator[tuple[list[int], int]]:
             reference = np.flatnonzero(n > REFERENCE_SHARE * m.pairs.n_pairs).tolist()
             by_name |= {("reference", str(k)): [k] for k in reference}
         groups = {} if m.groups is None else {"group": Labels(m.groups.names, m.groups.index)}
-        for kind, labels in (m.labels | groups).items():
+        for kind, labels in {**m.labels, **groups}.items():
             for i, name in enumerate(labels.names):
                 by_name.setdefault((kind, name), []).extend(place[labels.index == i].tolist())
     for (kind, _), configurations in by_name.items():
