@@ -39,7 +39,7 @@ from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
-from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel, square_root
+from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel
 from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
 
 Codes = NDArray[np.int8]
@@ -410,7 +410,7 @@ class RowStatistics:
         """Leverage of every row; what the rows to keep follow from, over sigma."""
         table, tangent, model = self.table, self.spread.tangent, self._model
         self.leverage: Floats = np.full(table.n, np.nan)
-        kept, root, asked, T = [model.empty()], square_root(tangent), keep | table.test, model.of_all(tangent)
+        kept, asked, T = [model.errors(0, np.zeros(0, dtype=np.int64))], keep | table.test, model.of_all(tangent)
         for number, noise in enumerate(self.solution.noises):
             measured, last = noise.series.measured, table.rows_of(number).start
             step = _CHUNK if model.is_plain(number) else _CHUNK_WITH_STATES
@@ -419,13 +419,13 @@ class RowStatistics:
                 first, last = last, last + int(np.sum(measured[chunk]))
                 rows = slice(first, last)
                 if model.is_plain(number) and not asked[rows].any():
-                    squares = squares_along(noise.rows_at(chunk), model.chain(number), root)
+                    squares = squares_along(noise.rows_at(chunk), model.chain(number), self.spread.root)
                     of_rows = (squares + noise.variance[chunk])[measured[chunk]]
                     self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
                     continue
                 found = model.errors(number, chunk).at(np.flatnonzero(measured[chunk])).over(table.sigma[rows])
                 self.leverage[rows] = found.with_errors(T).diagonal - 1.0
-                lost = table.test[rows] & np.isnan(self.spread.variance(found.P[:, : len(tangent)]))
+                lost = table.test[rows] & np.isnan(self.spread.variance(model.of_core(found)))
                 self.leverage[rows][lost] = np.nan
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan

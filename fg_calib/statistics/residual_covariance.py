@@ -33,9 +33,8 @@ class ResidualCovariance:
     Attributes:
         d: Diagonal of D, the variance of private noise, shape (n,).
         L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
-        P: Derivatives in the core, landmarks following it, then in the landmarks' errors of 1 sigma at a given core.
-            Where fitted and predicted rows share errors, then also `L F^T`, F what the fit made of those errors (see
-            `graph.felt`). Shape (n, k).
+        P: Derivatives in core and landmarks. Where fitted and predicted rows share errors, then also `L F^T`, F what
+            the fit made of those errors (see `graph.felt`). Shape (n, k).
         M: Symmetric, shape (k, k).
     """
 
@@ -56,9 +55,7 @@ class ResidualCovariance:
 
     def over(self, sigma: Floats) -> ResidualCovariance:
         """The covariance of rows divided by their sigma, shape (n,)."""
-        L = Sparse(
-            (self.L.data / np.repeat(sigma, np.diff(self.L.indptr)), self.L.indices, self.L.indptr), shape=self.L.shape
-        )
+        L = Sparse(scipy.sparse.diags_array(1.0 / sigma) @ self.L)
         return ResidualCovariance(self.d / sigma**2, L, self.P / sigma[:, None], self.M)
 
     @staticmethod
@@ -128,22 +125,14 @@ class RowModel:
     """
 
     def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
-        self._at = problem.variables.at(parameters)
-        self._noises, self._n = noises, problem.variables.n_columns
-        left = linear_system(problem, parameters).left
-        of_landmarks, width = np.hstack([left.follow, left.inverse]), self._n + left.rank
-        estimated, n = self._at.columns >= 0, len(self._at.columns)
-        self._follow = np.zeros((n, width))
-        self._follow[estimated] = of_landmarks[self._at.columns[estimated] - self._n]
+        v, unknowns = problem.variables, problem.data.landmarks
+        self._at, self._noises, left = v.at(parameters), noises, linear_system(problem, parameters).left
+        self._follow = np.vstack([np.eye(v.n_columns), left.follow])
+        self._alone = np.vstack([np.zeros((v.n_columns, left.rank)), left.inverse])
         self._common = np.flatnonzero((reach(noises) > 0) & (reach(noises, test=True) > 0))
-        core, landmarks = np.split(felt(problem, parameters, self._common), [self._n])
-        self._felt = np.eye(width, self._n) @ core + of_landmarks.T @ landmarks
-        blocks, unknowns = problem.data.blocks, problem.data.landmarks
-        located = estimated | np.repeat(
-            np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes
-        )
-        self._nowhere: list[Booleans] = [np.any(~located[s.nuisances], axis=1) for s in blocks]
-        self._n_errors = max((noise.place.n_errors for noise in noises), default=0)
+        self._felt = felt(problem, parameters, self._common)
+        known = np.repeat(np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes)
+        self._nowhere: Booleans = (self._at.columns < 0) & ~known
 
     def is_plain(self, number: int) -> bool:
         """Whether rows of a block follow from the core and private noise alone."""
@@ -154,45 +143,29 @@ class RowModel:
         """The chain of a block at the estimate."""
         return self._at.chains[self._noises[number].series.table]
 
-    def empty(self) -> ResidualCovariance:
-        """No rows."""
-        n = self._follow.shape[1]
-        P = np.zeros((0, 2 * n if len(self._common) else n))
-        return ResidualCovariance(np.zeros(0), Sparse((0, self._n_errors)), P, np.zeros((0, 0)))
+    def of_core(self, covariance: ResidualCovariance) -> Floats:
+        """Derivatives of rows in the core, landmarks following it, shape (n, n_columns)."""
+        out: Floats = covariance.P[:, : len(self._follow)] @ self._follow
+        return out
 
     def of_all(self, covariance: Floats) -> Floats:
-        """The covariance of core and landmarks' errors, of that of the core: shape (n_all, n_all)."""
-        return block_diag(covariance, np.eye(self._follow.shape[1] - self._n))
+        """The covariance of core and landmarks, of that of the core: shape (n_all, n_all)."""
+        out: Floats = self._follow @ covariance @ self._follow.T + self._alone @ self._alone.T
+        return out
 
     def errors(self, number: int, rows: Integers) -> ResidualCovariance:
         """What the rows of some measurements of a block follow from; M is still open."""
-        core, private, L, N = self._given_landmarks(number, rows)
-        P = np.pad(core, ((0, 0), (0, self._follow.shape[1] - self._n)))
-        if N.shape[1]:
-            nowhere = np.repeat(self._nowhere[number][rows], len(P) // max(len(rows), 1))
-            P = P + np.where(nowhere, np.nan, 0.0)[:, None] + N @ self._follow
+        noise, at = self._noises[number], self._at
+        J, nuisances = residuals.linearise(noise.rows_at(rows), self.chain(number))[1], noise.series.nuisances[rows]
+        P = np.zeros((*J.shape[:2], at.n_columns + at.n_nuisance))
+        P[:, :, : at.n_columns] = J[:, :, : at.n_columns]
+        for k, column in enumerate(at.columns[nuisances].T):
+            found = np.flatnonzero(column >= 0)
+            P[found, :, column[found]] = J[found, :, at.n_columns + k]
+        P[self._nowhere[nuisances].any(axis=1)] = np.nan
+        P, L = P.reshape(-1, P.shape[2]), noise.errors_at(rows)
         P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
-        return ResidualCovariance(private, L, P, np.zeros((0, 0)))
-
-    def _given_landmarks(self, number: int, rows: Integers) -> tuple[Floats, Floats, Sparse, Sparse]:
-        """J, private variance and L of rows were their landmarks known; derivatives in these, sparse."""
-        noise = self._noises[number]
-        J = residuals.linearise(noise.rows_at(rows), self.chain(number))[1]
-        n, h = J.shape[:2]
-        in_landmarks = J[:, :, self._n :]
-        row = np.broadcast_to(np.arange(n * h).reshape(n, h, 1), in_landmarks.shape).ravel()
-        place = np.broadcast_to(noise.series.nuisances[rows][:, None], in_landmarks.shape).ravel()
-        N = Sparse((in_landmarks.ravel(), (row, place)), shape=(n * h, len(self._follow)))
-        private = noise.variance[rows].ravel()
-        L = noise.errors_at(rows)
-        return J[:, :, : self._n].reshape(n * h, -1), private, L, N
-
-
-def square_root(covariance: Floats) -> Floats:
-    """H with H H^T a covariance, shape (n, n)."""
-    values, vectors = np.linalg.eigh(covariance)
-    out: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return out
+        return ResidualCovariance(noise.variance[rows].ravel(), L, P, np.zeros((0, 0)))
 
 
 def row_squares(L: Sparse) -> Floats:

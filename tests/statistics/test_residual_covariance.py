@@ -6,7 +6,7 @@ import scipy.sparse
 from scipy.linalg import block_diag
 
 from fg_calib.graph import PRIVATE_SHARE
-from fg_calib.statistics.residual_covariance import ResidualCovariance, square_root
+from fg_calib.statistics.residual_covariance import ResidualCovariance
 
 N = 60
 
@@ -73,4 +73,3 @@ def test_predicted_rows_are_correlated_with_the_estimate_by_the_errors_that_they
     rows = ResidualCovariance(np.ones(N // 2), scipy.sparse.csr_array(L[new]), P, np.zeros((0, 0)))
     moved = np.hstack([-J[new] @ T @ J[fit].T @ W, np.eye(N // 2)])
     np.testing.assert_allclose(dense(rows.with_errors(T, T)), moved @ C @ moved.T, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(square_root(T) @ square_root(T).T, T, rtol=1e-10)
