@@ -131,35 +131,31 @@ def _families(noise: graph.RowNoise) -> list[str]:
 
 def _robust_weights(problem: graph.Problem) -> Floats:
     """Robust weight of each row of the linear system, shape (n_rows,)."""
-    given, out = problem.state.weights, [np.zeros(0)]
-    for part in problem.rows.parts:
-        train = problem.noises[part.series].series.train
-        weights = np.ones(len(train)) if given is None else np.maximum(given[part.series][train], 1e-12)
-        out.append(np.repeat(weights, part.block.residual_dim))
-    return np.concatenate(out)
+    given, out = problem.state.weights, np.ones(problem.rows.states.loadings.shape[0])
+    if given is None:
+        return out
+    parts = [(given[p.series][problem.noises[p.series].series.train], p.block.residual_dim) for p in problem.rows.parts]
+    return np.concatenate([np.repeat(np.maximum(w, 1e-12), h) for w, h in parts])
 
 
 def _root(problem: graph.Problem, name: graph.NoiseName) -> Sparse:
-    """E with E E^T the part of the rows' covariance that noise of one origin makes, shape (n_rows, k)."""
-    rows = problem.rows
-    found = [_root_of_part(problem.noises[part.series], part, name, rows.shared) for part in rows.parts]
-    private = scipy.sparse.block_diag([own for own, _ in found])
-    return Sparse(scipy.sparse.hstack([private, scipy.sparse.vstack([common for _, common in found])]))
+    """E with E E^T the part of the rows' covariance that noise of one origin makes, shape (n_rows, k).
 
-
-def _root_of_part(
-    noise: graph.RowNoise, part: graph.WhitenedSeries, name: graph.NoiseName, shared: Booleans
-) -> tuple[Sparse, Sparse]:
-    """How whitened rows follow from noise of one origin: what is private to each measurement, and what is shared."""
-    train, W = noise.series.train, graph.whitener_of(noise, part)
-    of_joints = np.arange(noise.loading.shape[2]) < noise.n_of_joints
-    mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
-    origin = of_joints[None] if name == graph.JOINT_NOISE else mine[:, None] & ~of_joints
-    is_state = shared[noise.columns[train]][:, None]
-    alone = W @ np.where(origin & ~is_state, noise.loading[train], 0.0)
-    own = W @ _square_roots(noise.private_at(train))[:, :, mine]
-    private = graph.block_diagonal(np.concatenate([own, alone] if alone.any() else [own], axis=2))
-    return private, noise.errors_at(train, W, origin & is_state)
+    First what is private to each measurement, then what measurements share.
+    """
+    private, common = [], []
+    for part in problem.rows.parts:
+        noise = problem.noises[part.series]
+        train, W = noise.series.train, graph.whitener_of(noise, part)
+        of_joints = np.arange(noise.loading.shape[2]) < noise.n_of_joints
+        mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
+        origin = of_joints[None] if name == graph.JOINT_NOISE else mine[:, None] & ~of_joints
+        is_state = problem.rows.shared[noise.columns[train]][:, None]
+        alone = W @ np.where(origin & ~is_state, noise.loading[train], 0.0)
+        own = W @ _square_roots(noise.private_at(train))[:, :, mine]
+        private.append(graph.block_diagonal(np.concatenate([own, alone] if alone.any() else [own], axis=2)))
+        common.append(noise.errors_at(train, W, origin & is_state))
+    return Sparse(scipy.sparse.hstack([scipy.sparse.block_diag(private), scipy.sparse.vstack(common)]))
 
 
 def _square_roots(covariance: Floats) -> Floats:
