@@ -17,8 +17,6 @@ from fg_calib.baseline import comparison as comparison_module
 from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
 from fg_calib.inputs import InputError, Options
 from fg_calib.io.job import read_job
-from fg_calib.io.robot_file import write_robot
-from fg_calib.io.tables import write_csv
 from fg_calib.job import Job
 from fg_calib.report.compare import comparison_document
 from fg_calib.robot.kinematics import pose
@@ -40,27 +38,6 @@ def simulated_job(tmp_path):
     measurements = measure(true, 60, rng, sigma=(1e-3, 2e-4), sigma_joint=1e-4, n_test=25)
     # Plain least squares knows no shared errors; with them the graph has another optimum.
     return job_of(robot, true, measurements, "distance-rotation", tmp_path, pair_errors="independent")
-
-
-@pytest.fixture
-def simulated_folder(tmp_path):
-    """The same on disk, with the truth."""
-    rng = np.random.default_rng(5)
-    robot = paper_robot(tolerance=TOLERANCE)
-    true = true_robot(robot, rng)
-    m = measure(true, 60, rng, n_test=25)
-    write_robot(tmp_path / "robot.yaml", robot)
-    write_robot(tmp_path / "true.yaml", true)
-    columns = {f"q{i + 1}": m.readings[:, i] for i in range(7)}
-    columns |= dict(zip("xyz", m.position.T, strict=True))
-    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation.copy()).as_quat().T, strict=True))
-    columns["split"] = np.where(m.test, "test", "train")
-    write_csv(tmp_path / "poses.csv", columns)
-    (tmp_path / "calibration.yaml").write_text(
-        "robot: robot.yaml\nmeasurements: poses.csv\nmodel: distance-rotation\ntruth: true.yaml\n"
-        "noise: {position: 0.001, orientation: 0.0002}\n"
-    )
-    return tmp_path
 
 
 # --- what is compared -------------------------------------------------------------------------------------------------
@@ -259,13 +236,13 @@ def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
 
 
 @pytest.mark.slow
-def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, simulated_folder):
-    job = simulated_folder / "calibration.yaml"
+def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, example):
+    job = example / "calibration.yaml"
     ended = fg_calib("compare", job)
     assert (ended.code, ended.err) == (0, "")
     assert "Real error in the base frame" in ended.out
-    document = json.loads(fg_calib("compare", job, "--json", "--out", simulated_folder / "out").out)
-    written = json.loads((simulated_folder / "out" / "comparison.json").read_text())
+    document = json.loads(fg_calib("compare", job, "--json", "--out", example / "out").out)
+    written = json.loads((example / "out" / "comparison.json").read_text())
     assert list(written) == list(document)
     assert [e["name"] for e in document["estimates"]] == list(ESTIMATORS)
     given = read_job(job)

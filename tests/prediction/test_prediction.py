@@ -5,7 +5,7 @@ import pytest
 from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib import Calibration, InputError, Measurements, assess, build_problem, calibrate, predict, solve
+from fg_calib import InputError, build_problem, calibrate, predict, solve
 from fg_calib.prediction import workspace
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty
 from fg_calib.prediction.workspace import predict_errors, summed_up
@@ -77,17 +77,6 @@ def test_joint_noise_moves_the_tool_as_differences_say(calibrated):
     assert found[:, 0] == pytest.approx(np.sqrt(squares), rel=1e-7)  # differences of 1e-6: 1e-16 / 1e-6 of a metre
     turning = np.array([not joint.prismatic for joint in result.robot.joints])
     assert found[:, 1] == pytest.approx(np.sqrt(np.sum(JOINTS[turning] ** 2)), rel=1e-12)
-
-
-def test_joint_noise_is_that_of_the_measurements(calibrated):
-    assert not np.any(calibrated[0].result.sigma_joint)
-    rng = np.random.default_rng(10)
-    robot = small_arm(tolerance=LARGE)
-    q = rng.uniform(-2.0, 2.0, (20, 4))
-    m = Measurements.from_arrays(q, position=pose(robot, q).position, sigma_position=1e-4, sigma_joint=JOINTS)
-    problem = build_problem(robot, m, model="position")
-    found = Calibration.of(solution := solve(problem), assess(solution))
-    assert found.result.sigma_joint == pytest.approx(JOINTS, rel=1e-15)
 
 
 def test_drawn_configurations_are_within_the_limits_and_the_worst_is_one_of_them(calibrated, monkeypatch):
