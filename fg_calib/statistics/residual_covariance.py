@@ -163,7 +163,7 @@ class RowModel:
             found = np.flatnonzero(column >= 0)
             P[found, :, column[found]] = J[found, :, at.n_columns + k]
         P[self._nowhere[nuisances].any(axis=1)] = np.nan
-        P, L = P.reshape(-1, P.shape[2]), noise.errors_at(rows)
+        P, L = P.reshape(P.shape[0] * P.shape[1], P.shape[2]), noise.errors_at(rows)
         P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
         return ResidualCovariance(noise.variance[rows].ravel(), L, P, np.zeros((0, 0)))
 
