@@ -32,7 +32,7 @@ def gap(criterion, found, best):
 def test_the_best_of_all_sets_is_found_within_a_percent(criterion):
     """All that a design does: greedy and random starts, exchange."""
     n, of = 4, 12
-    for seed in (0, 1, 2, 3, 5, 7):
+    for seed in (0, 1, 2):
         system = random_system(np.random.default_rng(seed), of, h=1 + seed % 3)
         best = min(value(system, criterion, one) for one in combinations(range(of), n))
         found = Chooser(system, criterion).best(n, np.random.default_rng(0))

@@ -63,9 +63,9 @@ def test_p_values_of_noise_are_uniform(name, model):
     """Kolmogorov-Smirnov at 0.1 %, and no more below 1 % than chance allows once in a thousand times."""
     rng = np.random.default_rng(3)
     solver, unit, model = (estimate_noise, 0.2, "pose") if model == "own" else (solve, 1.0, model)
-    p = [probability_of_noise(solver(problem_of(*measured(name, rng, unit=unit), model))) for _ in range(100)]
+    p = [probability_of_noise(solver(problem_of(*measured(name, rng, unit=unit), model))) for _ in range(50)]
     assert kstest(p, "uniform").pvalue > 1e-3
-    assert np.sum(np.array(p) < 0.01) <= binom.ppf(0.999, 100, 0.01)
+    assert np.sum(np.array(p) < 0.01) <= binom.ppf(0.999, 50, 0.01)
 
 
 def test_a_warning_of_systematic_residuals_goes_by_the_p_value():
