@@ -291,6 +291,8 @@ def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> 
         fitted: Whether they are the train rows alone; else train and test.
     """
     data, at, trigs = problem.data, problem.variables.at(parameters), problem.data.trigs(problem.robot)
+    if (nowhere := np.isnan(data.landmarks.start) & (at.columns < 0)).any():  # points of test rows alone
+        at = replace(at, coordinates=np.where(nowhere, contact_points(data, at.chains, trigs), at.coordinates))
     width = problem.robot.n_joints + POSE_SLOTS * len(data.tables)
     n_errors = width * data.n_configurations
     places = [
@@ -336,11 +338,14 @@ def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
 
 
 def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
-    """Of each coordinate of a contact point the mean of what touched it, of other landmarks the start as given."""
+    """Of each coordinate of a contact point the mean of what touched it, of other landmarks the start as given.
+
+    Train touches say where a point is; test touches do where there are no others.
+    """
     found: Floats = data.landmarks.start
-    for s in data.blocks:
+    for s, test in ((s, test) for test in (True, False) for s in data.blocks):
         if s.kind.is_contact and s.kind.n_nuisances:
-            touches = np.flatnonzero(~s.test)
+            touches = np.flatnonzero(s.test == test)
             p = forward(chains[s.table].without_columns(), trigs[s.table], s.ends[touches, 0]).position
             place = s.nuisances[touches].ravel()
             n, total = np.bincount(place), np.bincount(place, p.ravel())

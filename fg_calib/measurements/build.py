@@ -146,6 +146,11 @@ def build_dataset(robot: Robot, tables: Sequence[Table]) -> Dataset:
         blocks += blocks_of(table, number, landmarks)
     _check_same_readings(tables, places, len(names))
     _check_known(tables)
+    touched = _touched(blocks, landmarks)  # what is between landmarks that no train row is of is a test row
+    blocks = [
+        b if b.kind.ends or not is_ours(b.kind) else replace(b, test=b.test | ~touched[b.nuisances].all(axis=1))
+        for b in blocks
+    ]
     _check_fitted(blocks, landmarks)
     _start_landmarks(robot, tables, blocks, landmarks)
     return Dataset(tuple(tables), tuple(blocks), landmarks, tuple(places), (*names, *landmarks.names))

@@ -118,6 +118,9 @@ class ResidualCovariance:
 class RowModel:
     """What the rows of every block follow from at the estimate.
 
+    Test rows that touch a point which no train row touched are judged about their mean: with W what takes the mean of
+    each coordinate off, W J and W L, their private noise one more column of L each.
+
     Args:
         problem: The problem.
         parameters: The estimate.
@@ -133,6 +136,12 @@ class RowModel:
         self._felt = felt(problem, parameters, self._common)
         known = np.repeat(np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes)
         self._nowhere: Booleans = (self._at.columns < 0) & ~known
+        alone = [
+            np.flatnonzero(self._nowhere[n.series.nuisances].any(axis=1) & n.series.kind.is_contact) for n in noises
+        ]
+        counts = [len(rows) * noise.series.kind.residual_dim for rows, noise in zip(alone, noises, strict=True)]
+        n_errors = max((noise.place.n_errors for noise in noises), default=0)
+        self._of_alone, self._first = alone, n_errors + np.cumsum([0, *counts])
 
     def is_plain(self, number: int) -> bool:
         """Whether rows of a block follow from the core and private noise alone."""
@@ -155,6 +164,34 @@ class RowModel:
 
     def errors(self, number: int, rows: Integers) -> ResidualCovariance:
         """What the rows of some measurements of a block follow from; M is still open."""
+        alone, width = self._of_alone[number], int(self._first[-1])
+        P, L = self._derivatives(number, rows)
+        d, n = self._noises[number].variance[rows].ravel(), len(P) // max(len(rows), 1)
+        L = Sparse((L.data, L.indices, L.indptr), shape=(len(P), width))
+        mine = np.flatnonzero(np.repeat(np.isin(rows, alone), n))
+        if len(mine):
+            at = (np.searchsorted(alone, rows)[:, None] * n + np.arange(n)).ravel()[mine]
+            P[mine], others = self._about_means(number, alone, at)
+            kept = np.where(np.isin(np.arange(len(d)), mine), 0.0, 1.0)
+            put = Sparse((np.ones(len(mine)), (mine, np.arange(len(mine)))), shape=(len(d), len(mine)))
+            d, L = d * kept, Sparse(scipy.sparse.diags_array(kept) @ L + put @ others)
+        P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
+        return ResidualCovariance(d, L, P, np.zeros((0, 0)))
+
+    def _about_means(self, number: int, alone: Integers, at: Integers) -> tuple[Floats, Sparse]:
+        """W P and W L of touches of points that no train row touched, their rows `at`."""
+        P, L = self._derivatives(number, alone)
+        private = np.sqrt(self._noises[number].variance[alone].ravel())
+        row, column = np.arange(len(private)), self._first[number] + np.arange(len(private))
+        own = Sparse((private, (row, column)), shape=(len(private), int(self._first[-1])))
+        L = Sparse((L.data, L.indices, L.indptr), shape=own.shape) + own
+        coordinate = self._noises[number].series.nuisances[alone].ravel()
+        same = (coordinate[at][:, None] == coordinate).astype(np.float64)
+        W = (at[:, None] == row) - same / same.sum(axis=1, keepdims=True)
+        return W @ P, Sparse(Sparse(W) @ L)
+
+    def _derivatives(self, number: int, rows: Integers) -> tuple[Floats, Sparse]:
+        """Of the rows of some measurements of a block in core and landmarks, and in errors."""
         noise, at = self._noises[number], self._at
         J, nuisances = residuals.linearise(noise.rows_at(rows), self.chain(number))[1], noise.series.nuisances[rows]
         P = np.zeros((*J.shape[:2], at.n_columns + at.n_nuisance))
@@ -162,10 +199,9 @@ class RowModel:
         for k, column in enumerate(at.columns[nuisances].T):
             found = np.flatnonzero(column >= 0)
             P[found, :, column[found]] = J[found, :, at.n_columns + k]
-        P[self._nowhere[nuisances].any(axis=1)] = np.nan
-        P, L = P.reshape(P.shape[0] * P.shape[1], P.shape[2]), noise.errors_at(rows)
-        P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
-        return ResidualCovariance(noise.variance[rows].ravel(), L, P, np.zeros((0, 0)))
+        if not noise.series.kind.is_contact:
+            P[self._nowhere[nuisances].any(axis=1)] = np.nan
+        return P.reshape(P.shape[0] * P.shape[1], P.shape[2]), noise.errors_at(rows)
 
 
 def row_squares(L: Sparse) -> Floats:

@@ -90,18 +90,23 @@ def test_what_moves_arm_and_points_as_one_body_stays_where_it_is():
         assert abs(again.parameters[robot.index(name)] - robot.nominal[robot.index(name)]) < 1e-9
 
 
-def test_test_rows_at_fitted_points_are_predicted_and_train_rows_alone_are_fitted():
+def test_points_of_test_rows_are_predicted_and_train_rows_alone_are_fitted():
     """Fitted points are the means of their touches, moved by what the distance between them pulls."""
-    robot, _, m = case(distances=((0, 1, 1e-4),))
-    m = replace(m, test=np.arange(len(m.test)) == 0)  # a row of group 0
+    robot, _, m = case(distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))
+    m = replace(m, test=m.test | (np.arange(len(m.test)) == 0))  # a row of group 0
+    specified = replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.zeros(2, dtype=bool))))
     problem = build_problem(robot, m, model="distance")
-    found = assess(solve(problem))
-    assert problem.n_residuals == 3 * 47 + 1
-    assert [(p.name, p.n) for p in found.estimates.landmarks] == [("g0", 11), ("g1", 12), ("g2", 12), ("g3", 12)]
+    solution, other = (solve(build_problem(robot, x, model="distance")) for x in (m, specified))
+    assert np.array_equal(other.parameters, solution.parameters)  # a distance to a test point is a test row
+    found = assess(solution)
+    assert problem.n_residuals == 3 * 35 + 1
+    assert [v.symbol for v in problem.variables.nuisance] == ["L(0)", "L(1)", "L(2)"]
+    assert [(p.name, p.n) for p in found.estimates.landmarks] == [("g0", 11), ("g1", 12), ("g2", 12), ("g3", 0)]
     table = found.fit.residuals
     kind = np.array(table.families)[table.family]
     contact, distances = kind == "point", np.flatnonzero(kind == "distance")
-    assert np.sum(table.test & contact) == 3
+    assert np.sum(table.test & contact) == 3 * 13
+    assert table.test[distances].tolist() == [False, True]
     p, d = pose(found.robot, m.readings).position, m.groups.pairs.distance
     means = [p[1:12].mean(axis=0), *(p[12 * g : 12 * (g + 1)].mean(axis=0) for g in (1, 2, 3))]
     along, pull = means[1] - means[0], (SIGMA / 1e-4) ** 2
@@ -109,13 +114,8 @@ def test_test_rows_at_fitted_points_are_predicted_and_train_rows_alone_are_fitte
     means[0], means[1] = means[0] + off / 11 * along, means[1] - off / 12 * along
     expected = np.array([p[k] - means[g] for k, g in enumerate(m.groups.index)])
     assert table.after[contact] == pytest.approx(expected.ravel(), abs=1e-10)
-    assert table.after[distances] == pytest.approx(np.linalg.norm(means[1] - means[0]) - d[0], abs=1e-10)
-
-
-def test_a_point_that_test_rows_alone_touched_is_refused():
-    robot, _, m = case(test=(3,))
-    with pytest.raises(ProblemError, match="point g3 has test rows alone, expected train rows too"):
-        build_problem(robot, m, model="distance")
+    miss = [np.linalg.norm(means[g] - means[0]) - d[i] for i, g in enumerate((1, 3))]
+    assert table.after[distances] == pytest.approx(miss, abs=1e-10)
 
 
 def test_groups_of_a_table_and_distances_between_them_are_read(tmp_path):

@@ -31,7 +31,9 @@ from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, P
 from fg_calib.measurements.kinds.pose import ORIENTATION, POSE_COLUMNS, POSITION
 from fg_calib.robot import Poses, kernels, over_spans
 
-POINT = LandmarkKind("L", "point", "the unknown contact points", "Contact points (in the base frame), mm")
+POINT = LandmarkKind(
+    "L", "point", "the unknown contact points", "Contact points (in the base frame), mm", must_be_fitted=False
+)
 
 
 class SamePoint(Coincidence):
