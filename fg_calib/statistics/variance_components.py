@@ -216,7 +216,8 @@ def _settle(
     names, factors = _origins(problem), problem.state.factors
 
     def refit(theta: Floats) -> tuple[graph.Solution, Floats, NoiseComponents]:
-        now = {name: factors.get(name, 1.0) * float(np.exp(t)) for name, t in zip(names, theta, strict=True)}
+        moved = {name: float(np.exp(t)) for name, t in zip(names, theta, strict=True) if t}
+        now = {name: factors.get(name, 1.0) * factor for name, factor in moved.items()}
         solution = graph.solve(_scaled(problem, now), options)
         found = noise_components(solution)
         return solution, _steps(found, kept), found

@@ -108,7 +108,7 @@ def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
     [
         ({"position": "0.5 deg"}, "accept: position: found '0.5 deg', expected a number with one of m, cm, mm, um, in"),
         ({"position": "0.5 Mm"}, "expected a number with one of m, cm, mm, um, in; did you mean mm?"),
-        ({"position": "a lot"}, "accept: position: found 'a lot', expected a finite number, with its unit or without"),
+        ({"position": "a lot"}, "accept: position: found 'a lot', expected a number, with its unit or without"),
         ({"position": -1}, "accept: position: found -1, expected a number above 0"),
         ({"orientation": "5 mm"}, "accept: orientation: found '5 mm', expected a number with one of rad, deg, mrad"),
         ({"posiion": 1}, "accept: unknown limit 'posiion', expected one of position, orientation, distance, angle"),
