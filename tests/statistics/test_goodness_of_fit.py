@@ -7,7 +7,7 @@ import pytest
 from reported import format_report
 from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
-from touches import TOOL_POINT, corners, touch
+from touches import SIGMA, TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
 from fg_calib.graph import problem as problem_module
@@ -264,6 +264,38 @@ def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_th
         if None not in p:
             assert kstest(p, "uniform").pvalue > 1e-3, key
     assert sum(None in p for p in p_values.values()) == name.startswith("touches")  # the one fitted distance
+
+
+@pytest.mark.slow
+def test_touches_of_a_point_that_is_their_mean_share_its_noise():
+    """Leverages by the arm's own derivatives: those of the row less the mean's; of n touches -1 / n for the noise.
+
+    To 1e-3 of it or of the noise: derivatives of rows are less `a x (p - point)`, the noise times an angle's error.
+    """
+    rng = np.random.default_rng(22)
+    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    m = touched(robot, rng)
+    m = replace(m, test=m.groups.index >= 3)
+    solution = solve(build_problem(robot, m, model="distance"))
+    judged = assess(solution)
+    table, goodness, arm = judged.fit.residuals, judged.fit.goodness, judged.robot
+    columns = [arm.index(name) for name in judged.names]
+    h = 1e-6
+    moved = np.empty((len(m.readings), 3, len(columns)))
+    for k, column in enumerate(columns):
+        step = h * np.eye(len(arm.nominal))[column]
+        up, down = (pose(arm.with_values(arm.nominal + s * step), m.readings).position for s in (1, -1))
+        moved[:, :, k] = (up - down) / (2 * h)
+    C, n = judged.covariance, 8
+    for g in (3, 4):
+        mine = np.flatnonzero(m.groups.index == g)
+        J = moved[mine] - moved[mine].mean(axis=0)
+        expected = np.einsum("nij,jk,nik->ni", J, C, J) / SIGMA**2 - 1 / n
+        rows = np.isin(table.a, mine) & (table.family == table.families.index("point"))
+        # The rows are turned; the sum over the three axes is not.
+        assert goodness.leverage[rows].reshape(-1, 3).sum(axis=1) == pytest.approx(
+            expected.sum(axis=1), rel=1e-3, abs=1e-3
+        )
 
 
 def differences(function, x, step=1e-5):
