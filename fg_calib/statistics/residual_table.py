@@ -198,7 +198,9 @@ class ResidualTable(FrozenArrays):
     def begins(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
         key = np.stack([self.measurement_number, self.family])
-        return np.asarray(np.diff(key, prepend=-1).any(axis=0))
+        begins: Booleans = np.diff(key, prepend=-1).any(axis=0)
+        begins.flags.writeable = False
+        return begins
 
     def row_ends(self, rows: Integers) -> tuple[Integers, Integers]:
         """The ends of some rows: place among these, and configuration or landmark, in `names`."""
