@@ -112,7 +112,10 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     start = start_of(robot, data, variables)
     _check_own_kinds(robot, data, variables, start)
     problem = problem_at(robot, data, options, variables, start, evaluated=evaluated)
-    _check_rows(problem)
+    if problem.n_residuals == 0:
+        reasons = [f"{n} excluded for {reason.replace('_', ' ')}" for reason, n in problem.n_excluded.items() if n]
+        found = ", ".join(["no row left to fit", *reasons])
+        raise ProblemError(problem.data.source, found, "train rows that the model uses")
     if options.gauge != "keep":
         return problem
     kept = kept_of(problem, options.prefer)
@@ -258,19 +261,8 @@ def random_problem(
 def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: Floats) -> None:
     """Compare the derivatives of kinds of one's own with differences at some measurements, where they are started."""
     at = variables.at(start)
-    for s in data.blocks:
-        if is_ours(s.kind):
-            continue
+    for s in (s for s in data.blocks if not is_ours(s.kind)):
         table = data.tables[s.table].measurements
         poses = forward(at.chains[s.table].without_columns(), robot.trig(table.readings), s.ends.ravel())
         rotation, position = poses.rotation.reshape(*s.ends.shape, 3, 3), poses.position.reshape(*s.ends.shape, 3)
-        nuisances = at.coordinates[s.nuisances]
-        check_rows(s.kind, Frames(rotation, position), s.data, nuisances, s.source)
-
-
-def _check_rows(problem: Problem) -> None:
-    """Check that a measurement takes part."""
-    if problem.n_residuals == 0:
-        reasons = [f"{n} excluded for {reason.replace('_', ' ')}" for reason, n in problem.n_excluded.items() if n]
-        found = ": ".join(["no row left to fit", *filter(None, [", ".join(reasons)])])
-        raise ProblemError(problem.data.source, found, "train rows that the model uses")
+        check_rows(s.kind, Frames(rotation, position), s.data, at.coordinates[s.nuisances], s.source)

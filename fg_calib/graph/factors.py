@@ -162,10 +162,9 @@ def measurement_factors(
             found, common = _pair_factors(part.only(k), variables, errors, private[these], _error("e", number))
             factors += found
             estimates += common
-        elif kind.turned_back:  # by a rotation of all together
-            factors.append(MeasurementFactor(variables, part, errors, k))
-        else:
-            factors.append(MeasurementFactor(variables, part.only(k), errors))
+        else:  # a contact is turned back by a rotation of all together
+            one, place = (part, k) if kind.turned_back else (part.only(k), 0)
+            factors.append(MeasurementFactor(variables, one, errors, place))
     for v, value in estimates:
         factors.append(gtsam.PriorFactorVector(v.key, np.zeros(len(value)), gtsam.noiseModel.Unit.Create(len(value))))
         values.insert(v.key, value)

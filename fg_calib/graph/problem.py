@@ -149,6 +149,13 @@ class Problem(FrozenArrays):
         """
         return ("", *self.data.names)
 
+    def names_of(self, key: int) -> tuple[str, ...]:
+        """Names of the entries of a variable of the arm, in their order."""
+        names = {v.key: self.variables.names[v.columns] for v in self.variables.items}
+        if key not in names:
+            raise ProblemError("key", "no variable of the arm", "that of one of problem.variables.items")
+        return names[key]
+
     @property
     def estimated(self) -> list[Parameter]:
         """The robot's estimated parameters, in the order of the columns."""
@@ -257,9 +264,8 @@ def with_factors(problem: Problem, start: Floats, state: NoiseState | None = Non
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
-    weights = p.state.weights
-    if weights is not None:
-        weights = tuple(w[s.train] for w, s in zip(weights, p.data.blocks, strict=True))
+    given = p.state.weights
+    weights = None if given is None else [w[s.train] for w, s in zip(given, p.data.blocks, strict=True)]
     noises, sharing = noises_at(p, start, fitted=True), p.options.pair_errors == "shared"
     return replace(p, rows=whitened_rows(noises, sharing=sharing, joints=p.joints_estimated, weights=weights))
 
@@ -564,8 +570,7 @@ def tables_of(
     given = [measurements] if isinstance(measurements, Measurements | Table) else list(measurements)
     if not given:
         raise ProblemError("measurements", "no table", "at least one")
-    o = options
-    tables = [t if isinstance(t, Table) else Table(t, o.model, o.pairing, o.frame) for t in given]
+    tables = [t if isinstance(t, Table) else Table(t, options.model, options.pairing, options.frame) for t in given]
     return tuple(part for table in tables for part in by_station(table))
 
 

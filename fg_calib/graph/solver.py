@@ -65,9 +65,8 @@ class SolverOptions:
     decrement: float = 3e-7
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            least, whole = float(f.name == "max_iterations"), f.name.startswith("max_")
-            check_number(f"solver: {f.name}", getattr(self, f.name), least=least, whole=whole)
+        check_number("solver: max_iterations", self.max_iterations, least=1.0, whole=True)
+        check_number("solver: decrement", self.decrement, least=0.0)
 
 
 @dataclass(frozen=True)
@@ -171,8 +170,7 @@ class Solution(FrozenArrays):
     @property
     def robot(self) -> Robot:
         """The calibrated robot: nominal, with the estimate's values."""
-        variables = self.problem.variables
-        return variables.robot.with_values(self.parameters[variables.robot_span])
+        return self.problem.variables.robot.with_values(self.parameters[self.problem.variables.robot_span])
 
     @cached_property
     def values(self) -> gtsam.Values:
@@ -186,8 +184,8 @@ class Solution(FrozenArrays):
         if weights is None:
             return self.cost
         total = self.weighted_cost
-        distances = [noise.lengths() for noise in self.noises]
-        for s, w, (e, residual_dim) in zip(self.problem.data.blocks, weights, distances, strict=True):
+        for s, w, noise in zip(self.problem.data.blocks, weights, self.noises, strict=True):
+            e, residual_dim = noise.lengths()
             more = cost(loss, e, constants(loss, residual_dim)) - 0.5 * w * e**2
             total += float(np.sum(more[s.train]))
         return total

@@ -198,7 +198,7 @@ class ResidualTable(FrozenArrays):
     def begins(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
         key = np.stack([self.measurement_number, self.family])
-        begins: Booleans = np.diff(key, prepend=-1).any(axis=0)
+        begins = np.asarray(np.diff(key, prepend=-1).any(axis=0))
         begins.flags.writeable = False
         return begins
 

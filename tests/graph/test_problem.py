@@ -169,7 +169,7 @@ def test_what_cannot_be_solved_is_refused_in_one_line():
     )
     still = planar_pairs([0.0, 0.0])
     assert refused(planar_robot(), still, model="rotation") == (
-        "measurements: no row left to fit: 2 excluded for same configuration, expected train rows that the model uses"
+        "measurements: no row left to fit, 2 excluded for same configuration, expected train rows that the model uses"
     )
 
 

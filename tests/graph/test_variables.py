@@ -14,7 +14,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.factors import CheckedFactor
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import build_variables, corrections_of, frame_of, pose_of, prior_rows
-from fg_calib.inputs import SolverError
+from fg_calib.inputs import ProblemError, SolverError
 from fg_calib.robot.kinematics import forward
 
 BASE = [name.replace("tool", "base") for name in TOOL]
@@ -68,6 +68,13 @@ def test_each_of_many_unknown_frames_has_its_own_columns():
         of_frames = acts[variables.n_robot_columns :].reshape(4, 6)
         assert np.flatnonzero(of_frames.all(axis=1)).tolist() == [table]
         assert np.flatnonzero(of_frames.any(axis=1)).tolist() == [table]
+
+
+def test_names_of_a_variables_entries_and_of_no_variable():
+    problem = build_problem(small_arm(), measure(small_arm(), 12, np.random.default_rng(0)), model="pose")
+    assert problem.names_of(gtsam.symbol("K", 2)) == ("a2", "alpha2", "d2", "theta2")
+    with pytest.raises(ProblemError, match=r"^key: no variable of the arm, "):
+        problem.names_of(gtsam.symbol("q", 3))
 
 
 def test_steps_values_and_parameter_vector_agree():
