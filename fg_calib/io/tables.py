@@ -297,13 +297,13 @@ def _read_file(path: Path) -> Table:
     """
     import polars as pl
 
-    content, ending = read_bytes(path), path.suffix.lower()
+    ending = path.suffix.lower()
     if ending == ".csv":
-        return _read_csv(path.name, decoded(content, path.name))
+        return _read_csv(path.name, decoded(read_bytes(path), path.name))
     if ending not in (".parquet", ".pq"):
         hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
         raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
-    return Table(path.name, (), pl.read_parquet(BytesIO(content)))
+    return Table(path.name, (), pl.read_parquet(BytesIO(read_bytes(path))))
 
 
 def _read_csv(name: str, text: str) -> Table:
@@ -317,9 +317,9 @@ def _read_csv(name: str, text: str) -> Table:
     if not text.strip(" \t\r\n,;"):
         raise InputError(f"{name}:1", "an empty file", "a header and rows")
     read = partial(pl.read_csv, has_header=False, infer_schema=False)
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
-    lines = read(text.encode(), separator="\x1f", quote_char=None, new_columns=["line"]).with_row_index("number", 1)
-    lines = lines.filter(pl.col("line").str.strip_chars(" \t,;") != "")
+    content = text.replace("\r\n", "\n").replace("\r", "\n").encode()
+    every = read(content, separator="\x1f", quote_char=None, new_columns=["line"]).with_row_index("number", 1)
+    lines = every.filter(pl.col("line").str.strip_chars(" \t,;") != "")
     unquoted = lines["line"].str.replace_all('"[^"]*"', "") if '"' in text else lines["line"]
     separator = max(",;\t", key=unquoted[0].count)
     header = next(csv.reader([lines["line"][0].removeprefix("#")], delimiter=separator))  # as numpy writes it
@@ -331,8 +331,11 @@ def _read_csv(name: str, text: str) -> Table:
         if '"' in unquoted[row]:
             raise InputError(place, "a quote that is not closed", "whole cells in quotes, or none")
         raise InputError(place, f"{n} cell{'s' * (n != 1)}", f"{len(header)} as in the header")
-    frame = read(lines["line"].str.join("\n").item().encode(), separator=separator).slice(1)
-    return Table(name, tuple(header), frame, separator, lines["number"].to_numpy()[1:])
+    if lines.height < every.height:
+        content = lines["line"].str.join("\n").item().encode()
+    numbers = lines["number"].to_numpy()[1:]
+    del text, every, lines, unquoted, n_cells, misfits  # of a large table each takes as much memory as its file
+    return Table(name, tuple(header), read(content, separator=separator).slice(1), separator, numbers)
 
 
 def _understood(
