@@ -521,6 +521,7 @@ def _shapes(result: Result) -> Iterator[tuple[str, Any, Any]]:
         matrices.append(("posterior: covariance", posterior.covariance, sum(map(len, posterior.variables.values()))))
     for key, M, n in matrices:
         yield f"{key}: shape", M.shape if M.size else (0, 0), (n, n)
+        yield f"{key}: negative variances", int(np.sum(np.diag(M) < 0.0)) if n else 0, 0
     yield "covariance: names", len(known.intersection(names)), len(names)
     for frame in (*result.frames.values(), *filter(None, [result.frame_estimate])):
         yield "frames: shape", [*frame.xyz.shape, *frame.quaternion_xyzw.shape, *frame.sigma.shape], [3, 4, 6]

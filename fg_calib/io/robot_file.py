@@ -151,6 +151,9 @@ def read_urdf(
     )
 
 
+_CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
+"""Elements of a joint of a URDF."""
+
 _XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
 
 
@@ -159,6 +162,12 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
     n_joints = 0
     for joint, backwards in chain:
         here = f"{place}: joint {joint.name!r}"
+        tags = [child.tag for child in joint.element if isinstance(child.tag, str)]
+        for tag in tags:  # of a misspelt or doubled element a default or the first would take the place
+            if tag in _CHILDREN and tags.count(tag) > 1:
+                raise InputError(here, f"two elements <{tag}>", "one")
+            if tag not in _CHILDREN and (hint := did_you_mean(tag, _CHILDREN)):
+                raise InputError(here, f"element <{tag}>", hint=hint)
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue

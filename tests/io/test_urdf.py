@@ -204,6 +204,10 @@ MISTAKES = [
     (TREE, {"base_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
     (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "left_tip"},
      "torso.urdf: links 'island' and 'left_tip' are not connected, expected two links of one tree"),
+    (changed('<origin xyz="0.3 0 0.1"', '<orign xyz="0.3 0 0.1"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l2': element <orign>; did you mean origin?"),
+    (changed('<origin xyz="0.3 0 0.1"', '<origin/><origin xyz="0.3 0 0.1"'), {"tip_link": "left_tip"},
+     "torso.urdf: joint 'l2': two elements <origin>, expected one"),
     (changed("</robot>", "<xacro:arm/></robot>"), {},
      "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11; "
      "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"),
