@@ -621,7 +621,7 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
 
     Args:
         path: The folder that `save` or `calibrate --out` wrote, or its `result.json`.
-        folder: Where to; beside the result if None.
+        folder: Where to; the folder of the result if None.
         figures: Whether to write its figures too, as SVG files.
 
     Raises:

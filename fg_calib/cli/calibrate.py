@@ -48,7 +48,7 @@ def calibrate(
     names = job_names(jobs) if several else [""]
     if out is not None and several:
         require_writable(out)
-    if scheduler is not None:  # its workers run elsewhere
+    if scheduler is not None:  # its workers run on other machines
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     saved = {"report": report, "figures": figures, "residuals": residuals}
     folders = [None if out is None else out / name for name in names]

@@ -364,7 +364,7 @@ N_FITTED, N_JUDGED = 300, 1000
 """Configurations drawn within the joint limits to fit, and others to judge by."""
 
 HOLD = 1e-2
-"""What a change of a figure by 1 m or 1 rad counts beside a miss of the tool by 1 m: a fit that gains hundredths of a
+"""What a change of a figure by 1 m or 1 rad counts against a miss of the tool by 1 m: a fit that gains hundredths of a
 millimetre by figures of metres is none. Of a UR10 off by 0.5 mm and 0.5 mrad, 1e-3 to 1e-1 give the same fit, 0.168 mm
 RMS; 1e-4 gives 0.163 mm with d of 16 m."""
 

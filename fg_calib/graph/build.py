@@ -37,7 +37,7 @@ Places = Mapping[tuple[str, str], Floats]
 """Coordinates of landmarks, and unknown frames as X, by letter and name."""
 
 QUARTER_TURN = 1e-3
-"""Cosine of a pitch at which yaw and roll of a frame may be told apart no more."""
+"""Cosine of a pitch at which yaw and roll of a frame are no longer distinct."""
 
 FIRST_TOLERANCE = 1e-3
 """Prior sigma that a joint's parameter starts from where scales are estimated and none is specified, [m] and [rad]."""
@@ -203,7 +203,7 @@ def predicted_problem(
 def true_problem(
     robot: Robot, tables: Table | Sequence[Table], options: Options, places: Places | None = None
 ) -> Problem:
-    """The problem of tables at a robot that is the true one: what is unknown beside it is where the tables put it.
+    """The problem of tables at a robot that is the true one: what else is unknown is where the tables put it.
 
     Args:
         robot: The robot.

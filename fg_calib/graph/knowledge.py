@@ -7,7 +7,7 @@ variables. What the rows depended on besides, such as measurement frames, is eli
 Growth: where x may have wandered since by g with 1 sigma G, `|z + R (s - G h)|^2 + |h|^2` with h eliminated; where G is
 unlimited h has no row of its own.
 
-What rows determine at all is asked where the arm is as drawn: there lost directions are exact. So they are kept as
+What rows determine at all is asked at the nominal arm: there lost directions are exact. So they are kept as
 linearised there, too (`nominal`), without what tolerances say.
 """
 
@@ -29,7 +29,7 @@ from fg_calib.measurements import LANDMARKS, Landmarks
 from fg_calib.robot import Robot
 
 STAYING = tuple(letter for letter, kind in LANDMARKS.items() if kind.stays)
-"""Letters of the unknowns that may stay where they are: targets on the tool, anchors beside the arm."""
+"""Letters of the unknowns that may stay where they are: targets on the tool, anchors around the arm."""
 
 SIZE = 3
 """Coordinates of each of them."""
@@ -52,7 +52,7 @@ class Knowledge(FrozenArrays):
         rows: R, shape (k, n_columns + len(at)): columns of the arm's variables, then of the unknowns.
         right: z, shape (k,).
         views: Models of the tables that they are of with the knowledge of their frames, each once.
-        nominal: The same rows linearised at the arm as drawn, z = 0: by them parameters are classed; None where that
+        nominal: The same rows linearised at the nominal arm, z = 0: by them parameters are classed; None where that
             was not kept.
     """
 

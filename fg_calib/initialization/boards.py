@@ -1,7 +1,7 @@
 """Where a board is, from one image of its points: the start of what cameras measure.
 
 A homography takes the board to the image without its distortion. What it is at the middle of the board, and how it
-changes there, leaves two poses (Collins & Bartoli 2014): a board that is small beside its distance looks nearly the
+changes there, leaves two poses (Collins & Bartoli 2014): a board that is small against its distance looks nearly the
 same tilted either way. Both are refined on the pixels by least squares: on the half of the points that is nearest, then
 on all that are not far beyond what most are off by. The better one is first.
 

@@ -272,7 +272,7 @@ def as_names(name: str, given: object, *, missing: bool = False) -> list[str | N
     """
     found: list[str | None] = []
     listed = given if isinstance(given, list | tuple) else as_array(name, given, "iufUO", "names").tolist()
-    for row, one in enumerate(listed):  # numpy would make words of what stands beside words in a list, even of None
+    for row, one in enumerate(listed):  # numpy would make words of what shares a list with words, even of None
         whole = missing and isinstance(one, float) and one.is_integer()  # so pandas has whole numbers with nan
         cell: Any = int(one) if whole else one
         none = missing and (cell is None or type(cell).__name__ == "NAType" or cell == "" or cell != cell)  # noqa: PLR0124

@@ -38,7 +38,7 @@ class InputError(CalibrationError):
         place: File, with row or key where there is one: `poses.csv:17`, `robot.yaml: joints[2].a`.
         found: What stands there.
         expected: What should stand there.
-        hint: A likely cause or cure, where there is one.
+        hint: A likely cause or remedy, where there is one.
     """
 
     def __init__(self, place: str, found: str, expected: str = "", hint: str = "") -> None:

@@ -100,7 +100,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, bytes] | None = None) -> None:
-    """Write several files to a folder, after all of them were written elsewhere.
+    """Write several files to a folder, after all of them were written to another folder.
 
     An interruption while they are moved may leave old files with new ones. The first of `own` is moved last: where it
     holds digests of the others, a reader detects that.

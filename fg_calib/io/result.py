@@ -644,7 +644,7 @@ def write_calibration(
         folder: Where to.
         result: The result.
         robot: The calibrated robot; base and tool of a robot from a URDF, which cannot hold them, go to a
-            `robot_calibrated.yaml` beside `robot_calibrated.urdf`.
+            `robot_calibrated.yaml` next to `robot_calibrated.urdf`.
         tables: Tables by file name.
         pages: Text of other files by name.
 
@@ -683,7 +683,7 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     files = [folder / f"robot_calibrated.{ending}" for ending in ("yaml", "urdf")]
     file = next(filter(exists, files), None)
     if file is None:
-        raise InputError(str(folder), "neither robot_calibrated.yaml nor robot_calibrated.urdf beside its result.json")
+        raise InputError(str(folder), "neither robot_calibrated.yaml nor robot_calibrated.urdf next to its result.json")
     links = result.links or (None, None)
     robot = read_robot(file, base_link=links[0], tip_link=links[1])
     names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]

@@ -476,7 +476,7 @@ class _UrdfRobot(_Robot):
 
 @checked
 def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
-    """The robot in a YAML file or a URDF, told apart by the ending `.urdf`.
+    """The robot in a YAML file or a URDF, recognised by the ending `.urdf`.
 
     Args:
         path: The file.
@@ -635,7 +635,7 @@ def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
 
 
 def _tolerances(robot: Robot, units: Units) -> dict[str, float]:
-    """Tolerances by kind where all parameters of the kind share one, by name elsewhere."""
+    """Tolerances by kind where all parameters of the kind share one, by name of the others."""
     kinds, tolerances = [tolerance_kind(p) for p in robot.parameters], {}
     for p, kind in zip(robot.parameters, kinds, strict=True):
         if p.tolerance is not None:

@@ -1,7 +1,7 @@
 """Tables of configurations, of pairs, and of targets: CSV, Parquet or frames, read into measurements; one writer.
 
 An empty cell means not measured under `distance` and `angle`, no contact point under `group`, the noise's default under
-`sigma_*`, and train under `split`; elsewhere it is an error. Columns without a meaning are ignored.
+`sigma_*`, and train under `split`; in other columns it is an error. Columns without a meaning are ignored.
 """
 
 from __future__ import annotations

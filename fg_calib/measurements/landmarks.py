@@ -174,7 +174,7 @@ class Landmarks:
         Args:
             landmarks: The landmarks, one at least.
             source: The table, for messages.
-            frame: The table in whose own measurement frame they are, -1 for the base: elsewhere a name is another.
+            frame: The table in whose own measurement frame they are, -1 for the base: names are of one frame.
             named: Whether they have names; all are new otherwise.
 
         Returns:

@@ -20,9 +20,9 @@ pi - m = |pi - f + e|.
 
 An instrument that measures a length or an angle directly has an error of its own, which acts along v alone: fold.
 
-The mean M is smooth and even in f, so that it has a slope everywhere, 0 at a kink: a row `M(f) - m` of variance V has
-mean 0 wherever f is. Weighted least squares of such rows is a quasi-likelihood (Wedderburn 1974): no row need be
-chosen by its distance from a kink, which by the measured value would bias the estimate.
+The mean M is smooth and even in f, so that it has a slope everywhere, 0 at 0 and pi: a row `M(f) - m` of variance V has mean
+0 wherever f is. Weighted least squares of such rows is a quasi-likelihood (Wedderburn 1974): no row need be
+chosen by its distance from an end, which by the measured value would bias the estimate.
 
 References:
     Johnson, Kotz, Balakrishnan (1995), Continuous Univariate Distributions 2, ch. 29: noncentral chi.
@@ -40,7 +40,7 @@ from scipy import special
 from fg_calib.inputs import Floats
 
 FAR = 8.5
-"""Distance from a kink, in sigma, beyond which the exponentials are rounding."""
+"""Distance from an end of the range, in sigma, beyond which the exponentials are rounding."""
 
 WIDE = 0.25
 """Variance of a rotation error, [rad^2], beyond which it is taken for this: angles go no further than half a turn."""

@@ -88,7 +88,7 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
     # would contradict them, and a miss of one sigma would move an arm by metres.
     lost = [p.name for p in robot.parameters if p.estimated and p.name not in kept]
     if lost:
-        found = f"gauge none, and rows that do not determine {', '.join(lost)} beside the others"
+        found = f"gauge none, and rows that do not determine {', '.join(lost)} given the others"
         raise InputError("update", found, "a calibration with gauge keep or prior")
     return whole
 

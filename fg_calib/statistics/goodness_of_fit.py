@@ -15,7 +15,7 @@ that of all rows, shared among the kinds by leverage.
 
 Rows that were predicted, never fitted, miss by their own noise and by what the estimate is off. Each kind is judged by
 the sum of its studentised squares. All of them together are judged by `r^T A^-1 r`, which is sensitive where the arm is
-well known although it may be off by more elsewhere. Where the noise was estimated, this is a ratio of two variances
+well known although it may be off by more at others. Where the noise was estimated, this is a ratio of two variances
 (F); with a robust loss measurements with suspect rows count for nothing.
 
 References:

@@ -54,7 +54,7 @@ def test_moments_are_those_of_drawn_lengths(f, spread):
     drawn = np.abs(np.sqrt((f + s * x) ** 2 + t**2 * (y**2 + z**2)) + own * e)
     excess, _, variance = of_length(f, s**2, t**2, own**2)
     sd = drawn.std()
-    # A drawn mean is off by 1 / sqrt(n) = 0.0016 sd. Beyond 8.5 t the series leaves out (t / f)^4, beside s.
+    # A drawn mean is off by 1 / sqrt(n) = 0.0016 sd. Beyond 8.5 t the series leaves out (t / f)^4, next to s.
     assert f + excess == pytest.approx(drawn.mean(), abs=5.0 * sd / np.sqrt(n) + 1e-3 * t)
     assert np.sqrt(variance) == pytest.approx(sd, rel=0.01, abs=3e-3 * t)
 
@@ -74,14 +74,14 @@ def small_turns(sigma, n):
     return Rotation.from_rotvec(sigma * np.random.default_rng(7).normal(size=(n, 3)))
 
 
-KINKS = [0.0, 0.5, 1.0, 2.0, 5.0, 20.0]
+ENDS = [0.0, 0.5, 1.0, 2.0, 5.0, 20.0]
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize(("from_kink", "pi", "sigma"), diagonal(KINKS, [False, True], [1e-4, 0.02]))
-def test_moments_are_those_of_drawn_rotations(from_kink, pi, sigma):
+@pytest.mark.parametrize(("from_end", "pi", "sigma"), diagonal(ENDS, [False, True], [1e-4, 0.02]))
+def test_moments_are_those_of_drawn_rotations(from_end, pi, sigma):
     n = 100_000
-    f = np.pi - from_kink * sigma if pi else from_kink * sigma
+    f = np.pi - from_end * sigma if pi else from_end * sigma
     axis = np.array([0.6, 0.0, 0.8])
     drawn = (Rotation.from_rotvec(f * axis) * small_turns(sigma, n)).magnitude()
     excess, _, variance = of_angle(f, sigma**2, sigma**2)
@@ -106,7 +106,7 @@ def test_what_has_no_noise_is_left_as_it_is():
         assert np.all(moments.variance == 0.0)
 
 
-def test_an_error_of_the_instrument_alone_changes_nothing_away_from_the_kinks():
+def test_an_error_of_the_instrument_alone_changes_nothing_far_from_0_and_half_a_turn():
     f = np.array([0.01, 1.0, 3.0])
     own, zero = np.full(3, 1e-6), np.zeros(3)
     for moments in (length_moments(f, zero, zero, own), angle_moments(f, zero, zero, own)):

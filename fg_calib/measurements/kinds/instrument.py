@@ -84,7 +84,7 @@ class Instrument:
         model: Model of its tables.
         kind: What it measures, of one configuration; those with several kinds override `kinds`.
         quantities: The data of its kinds, in their order; its generic columns if empty.
-        columns: Columns beside those of every table.
+        columns: Columns besides those of every table.
         labels: Those of names: what a row is of.
         optional_labels: Those of `labels` whose cells may be empty.
         noise: Keys of `noise` that it needs.
