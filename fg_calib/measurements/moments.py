@@ -20,8 +20,8 @@ pi - m = |pi - f + e|.
 
 An instrument that measures a length or an angle directly has an error of its own, which acts along v alone: fold.
 
-The mean M is smooth and even in f, so that it has a slope everywhere, 0 at 0 and pi: a row `M(f) - m` of variance V has mean
-0 wherever f is. Weighted least squares of such rows is a quasi-likelihood (Wedderburn 1974): no row need be
+The mean M is smooth and even in f, so that it has a slope everywhere, 0 at 0 and pi: a row `M(f) - m` of variance V has
+mean 0 wherever f is. Weighted least squares of such rows is a quasi-likelihood (Wedderburn 1974): no row need be
 chosen by its distance from an end, which by the measured value would bias the estimate.
 
 References:

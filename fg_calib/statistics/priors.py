@@ -34,7 +34,7 @@ mean. What unknown scales add to the covariance of the corrections is by the law
 points: the mean of W C W, minus that at the mean scales, and the covariance of W a.
 
 At each solution the scales are estimated, then everything is solved again with their prior sigmas, until no scale
-moves: two or three rounds where the arm is nearly linear. In other cases they may oscillate, so steps back are shortened.
+moves: two or three rounds where the arm is nearly linear. In others they may oscillate, so steps back are shortened.
 
 References:
     Baarda (1968), A testing procedure for use in geodetic networks. Netherlands Geodetic Commission 2(5).

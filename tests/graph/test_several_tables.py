@@ -9,10 +9,9 @@ import pytest
 import yaml
 from custom_kinds import lengths_to_anchors
 from scipy.spatial.transform import Rotation
-from simulated import measure, paper_robot, small_arm, true_robot, write_job
+from simulated import measure, paper_robot, small_arm, true_robot
 from touches import corners, touch
 
-from fg_calib import read_job
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
@@ -308,36 +307,6 @@ def test_a_loss_that_drops_a_whole_table_is_a_finding():
     found = assess(solve(build_problem(robot, [good, bad], model="position", loss="gnc")))
     said = "loss gnc takes 8 of 8 measurements of position of bad.csv for outliers: more than it can tell from noise"
     assert said in found.verdict.errors
-
-
-@pytest.mark.slow
-def test_a_distance_between_points_that_another_table_touched(tmp_path):
-    """The distance may stand in another table than the touches."""
-    rng = np.random.default_rng(7)
-    robot = small_arm(tolerance=TOLERANCE)
-    true = true_robot(robot, rng)
-    m = touch(true, corners(robot, 3, rng), 8, rng, distances=((1, 2, 1e-5),))
-    tracker = measure(true, 10, rng, sigma=SIGMA)
-    path = write_job(tmp_path, robot, m)
-    columns = {f"q{i + 1}": q for i, q in enumerate(tracker.readings.T)}
-    write_csv(tmp_path / "tracker.csv", columns | dict(zip("xyz", tracker.position.T, strict=True)))
-    noise = {"position": SIGMA[0], "point": float(m.sigma_point[0])}
-    touches, poses = {"table": "poses.csv", "model": "distance"}, {"table": "tracker.csv", "model": "distance"}
-    found = []
-    for tables in (
-        [touches | {"pairs": "pairs.csv"}, poses],
-        [touches, poses | {"pairs": "pairs.csv"}],
-        [poses | {"pairs": "pairs.csv"}, touches],
-    ):
-        path.write_text(yaml.safe_dump({"robot": "robot.yaml", "noise": noise, "measurements": tables}))
-        job = read_job(path)
-        (between,) = [t.measurements.groups.pairs for t in job.tables
-                      if t.measurements.groups is not None and t.measurements.groups.pairs.n_pairs]  # fmt: skip
-        assert not between.test.any()
-        problem = build_problem(job.robot, job.tables)
-        of_points = [s for s in problem.data.blocks if s.kind.n_nuisances]
-        found.append({s.kind.names[0]: len(s.train) for s in of_points})
-    assert found == 3 * [{"point.x": 24, "distance": 1}]
 
 
 @pytest.mark.parametrize("apart", [False, True])
