@@ -20,6 +20,7 @@ from fg_calib import graph
 from fg_calib.inputs import Floats, Options
 from fg_calib.measurements import LANDMARKS, Measurements, Table
 from fg_calib.observability import ObservedQuantities
+from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot
 
 Words = NDArray[np.uint64]
@@ -92,6 +93,7 @@ class Calibrated:
         return graph.NoiseState(factors=factors)
 
 
+@single_threaded
 def knowledge_of(solution: graph.Solution) -> graph.Knowledge | None:
     """What the rows of a solution say of the arm, targets and anchors, with what was known before.
 
