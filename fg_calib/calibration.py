@@ -85,7 +85,7 @@ def calibrate(
     Args:
         robot: The nominal robot.
         measurements: What was measured: a table, or several; those that are no `Table` are understood as the options
-            say. With `estimate_noise` sigmas that are not stated start at 1 mm and 1 mrad.
+            say. With `estimate_noise` sigmas that are not specified start at 1 mm and 1 mrad.
         options: What is estimated from what.
         executor: Where folds are calibrated, such as `local_processes(4)`; in this process if None.
         choices: Instead of `options`, any of theirs as keywords: model, frame, pairing, loss, ...

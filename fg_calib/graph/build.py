@@ -186,7 +186,7 @@ def predicted_problem(
 
     Args:
         robot: The robot.
-        measurements: The configurations (train rows) and their noise, 1 mm and 1 mrad where it is not stated; measured
+        measurements: The configurations (train rows) and their noise, 1 mm and 1 mrad where unknown; measured
             values are not looked at.
         model: Which measurements take part.
         frame: Whether the measurement frame is estimated too.

@@ -88,12 +88,12 @@ class Iteration:
 
 @dataclass(frozen=True)
 class ToleranceScale:
-    """A factor on the tolerances stated of a group of parameters, estimated with them.
+    """A factor on the tolerances specified of a group of parameters, estimated with them.
 
     Attributes:
         group: What shares the scale: `a`, `theta`, `tool`; or a joint's name.
         parameters: The parameters.
-        scale: Tolerance estimated over tolerance stated.
+        scale: Tolerance estimated over tolerance specified.
         low: Lower end of its 95 % interval.
         high: Upper end.
         seen: How many of the parameters' corrections the data tell of.

@@ -129,9 +129,9 @@ class Options:
         encoder: `propagated`: the noise of joint readings is added to that of the rows, to first order. `estimated`:
             the true joint values of every configuration are estimated too, with the readings as their priors.
         loss: What becomes of large residuals: `none` or a robust loss (see `graph.robust`).
-        estimate_noise: Whether the sigmas stated are only a start, and scaled to what is seen.
+        estimate_noise: Whether the sigmas specified are only a start, and scaled to what is seen.
         estimate_tolerance: Whether the robot's tolerances are only a start, and scaled to the corrections seen: one
-            scale for each kind of parameters, or each joint; None if they are taken as stated.
+            scale for each kind of parameters, or each joint; None if they are taken as specified.
         max_iterations: Steps after which the solver gives up; None for its default.
         accept: How large errors may be where rows are held out; by name (`{"position": 5e-4}`) as well.
         folds: Into how many folds configurations are dealt for cross-validation; None for none.

@@ -101,7 +101,7 @@ LABELS = ("target", "station", "anchor", "plane", "board")
 
 @dataclass(frozen=True)
 class Noise:
-    """Measurement noise, 1 sigma; None where it is not stated.
+    """Measurement noise, 1 sigma; None where it is not specified.
 
     Attributes:
         position: Per axis, [m].
@@ -220,23 +220,23 @@ class Measurements(FrozenArrays):
         test: True for rows that are predicted but never fitted, shape (n_configurations,).
         position: world_p_tool, shape (n_configurations, 3), [m]; None where not measured.
         rotation: world_R_tool, shape (n_configurations, 3, 3); None where not measured.
-        sigma_position: Along the world's axes, shape (n_configurations, 3), [m]; None where it is not stated. It may be
+        sigma_position: Along the world's axes, shape (n_configurations, 3), [m]; None where unknown. It may be
             stated without a measurement: what one would be like.
         sigma_orientation: The same of the rotation vector about the tool's axes, shape (n_configurations, 3), [rad].
         sigma_joint: Of the readings, shape (n_joints,), [rad] (prismatic: [m]).
         pairs: Directly measured pairs; None if pairs are to be formed from the poses.
         source: File name, for messages.
         groups: Which configurations touched the same point; None if none did.
-        sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not stated.
+        sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not specified.
         named: Whether the names were given, so that another table may have the same configurations.
         roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
         labels: What the rows are of, by `target`, `station`, `anchor`, `plane` or `board`, where that was said.
         length: Distance to the row's anchor, or from its plane, shape (n_configurations,), [m]; None where not
             measured.
-        sigma_length: Shape (n_configurations,), [m]; None where it is not stated.
+        sigma_length: Shape (n_configurations,), [m]; None where it is not specified.
         image: Where a point of the row's board was seen, u and v, [px], and where it is on the board, x and y, [m],
             shape (n_configurations, 4); None where nothing was.
-        sigma_pixel: Along u and v, shape (n_configurations, 2), [px]; None where it is not stated.
+        sigma_pixel: Along u and v, shape (n_configurations, 2), [px]; None where it is not specified.
         covariance: Of a board's measured pose, about and along the camera's axes, shape (n_configurations, 6, 6), [rad]
             and [m]; None where sigmas say it.
         part: Which rows of a table these are, shape (n_configurations,); None where they are all.
@@ -359,7 +359,7 @@ class Measurements(FrozenArrays):
         return found
 
     def sigma(self, noise: str) -> Floats | None:
-        """1 sigma by kind of noise; None where it is not stated."""
+        """1 sigma by kind of noise; None where it is not specified."""
         name = "sigma_length" if noise == "distance" else f"sigma_{noise}"
         found: Floats | None = self.sigmas.get(noise, getattr(self, name, None))
         return found

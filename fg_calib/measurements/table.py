@@ -56,7 +56,7 @@ class MeasurementBlock(Brief):
         number: Number of each in its table, shape (n,).
         nuisances: Coordinates of nuisances that each depends on, in the problem's list, shape (n, kind.n_nuisances).
         formed: Whether they are pairs formed from measured poses, whose noise they have.
-        covariance: Of each measurement's own noise, where more than `sigma` was stated, shape (n, kind.residual_dim,
+        covariance: Of each measurement's own noise, where more than `sigma` was specified, shape (n, kind.residual_dim,
             kind.residual_dim); its diagonal is that of sigma.
         excluded: Measured ones that take no part: masks by reason, shape (n,) each.
         source: File name, for messages.

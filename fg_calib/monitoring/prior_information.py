@@ -43,8 +43,8 @@ class Calibrated:
         values: Its parameters as calibrated, shape (n_parameters,).
         knowledge: What the calibration's rows say; None where the arm was evaluated only.
         options: Its options.
-        noise: What stated sigmas are multiplied by, by table and kind, where noise was estimated.
-        noise_degrees: Degrees of freedom that it was estimated by; None where it was stated, or is not known.
+        noise: What specified sigmas are multiplied by, by table and kind, where noise was estimated.
+        noise_degrees: Degrees of freedom that it was estimated by; None where it was specified, or is not known.
     """
 
     robot: Robot

@@ -134,7 +134,7 @@ def observe_configurations(
 
     Args:
         robot: The robot; what is fixed counts as known.
-        measurements: The configurations (train rows) and their noise; 1 mm and 1 mrad where it is not stated.
+        measurements: The configurations (train rows) and their noise; 1 mm and 1 mrad where it is not specified.
         model: What would be measured.
         frame: Whether the measurement frame is unknown too.
         pairing: How pairs are formed; a star if None.

@@ -83,9 +83,9 @@ class KindFit:
         kind: `distance`, `angle`, `orientation`, `position`, `point`, or that of a kind of one's own.
         unit: `m`, `rad` or `px`.
         n: Number of scalar rows.
-        stated_sigma_rms: Root of the mean square of their sigmas as stated.
+        stated_sigma_rms: Root of the mean square of their sigmas as specified.
         factor: What they were multiplied by, all noise together: 1 unless the noise was estimated.
-        seen_over_stated: Noise seen over noise stated; nan where the fit leaves less than one degree of freedom.
+        seen_over_stated: Noise seen over noise specified; nan where the fit leaves less than one degree of freedom.
         chi2: Sum of squared residuals over sigma, as it was taken.
         expected: Its mean, were the noise as taken: the rows' redundancy.
         p_value: Probability of a sum as large, were the noise as taken; None where it is not known.
@@ -125,17 +125,17 @@ class KindFit:
         else:
             unlikely = min(p, 1.0 - p) < ALARM / 2.0
         if not unlikely or abs(ratio - 1.0) < 0.05:
-            return "as stated"
+            return "as specified"
         if ratio < 1.0 or self.rest is None:
             return "too large" if ratio < 1.0 else "too small"
-        if self.rest.verdict in ("as stated", "too large"):
+        if self.rest.verdict in ("as specified", "too large"):
             return "outliers" if self.spoilt else "others"
         excess, left = self.seen_over_stated**2 - 1.0, self.rest.seen_over_stated**2 - 1.0
         return "both" if left < LEAST_GAIN * excess else "too small"
 
 
 VERDICTS = {
-    "as stated": "as specified",
+    "as specified": "as specified",
     "too large": "noise specified too large",
     "too small": "most rows too large: noise specified too small, or effects not modelled",
     "outliers": "few rows far too large: outliers",
@@ -146,7 +146,7 @@ VERDICTS = {
 """What a fit by kind means, in words."""
 
 PREDICTION_VERDICTS = VERDICTS | {
-    "as stated": "as expected",
+    "as specified": "as expected",
     "too large": "smaller than expected",
     "too small": "larger than expected",
 }
@@ -161,7 +161,7 @@ class SuspectConfiguration:
         configuration: Its row among the measurements; a touched group counts on from the number of configurations.
         n: Scalar rows that it takes part in.
         chi2: Sum of their squared residuals over sigma.
-        expected: Its mean, were the noise as stated.
+        expected: Its mean, were the noise as specified.
     """
 
     configuration: int
@@ -219,7 +219,7 @@ class PredictedFit(FrozenArrays):
 
 @dataclass(frozen=True)
 class Goodness(FrozenArrays):
-    """How well residuals and stated noise agree; arrays are in the order of the residual table, shape (n,).
+    """How well residuals and specified noise agree; arrays are in the order of the residual table, shape (n,).
 
     Attributes:
         kinds: The fit by kind.
@@ -255,7 +255,7 @@ class Goodness(FrozenArrays):
     @property
     def spoilt(self) -> bool:
         """Whether a few gross errors are all that is wrong with the fit."""
-        fine = ("as stated", "too large", "outliers", "others", "unknown")
+        fine = ("as specified", "too large", "outliers", "others", "unknown")
         return self.gross is not None and all(kind.verdict in fine for kind in self.kinds)
 
 
@@ -569,7 +569,7 @@ class ChiSquare:
         dof: Residuals and priors, less the determined directions.
         expected: Its mean; not `dof` where rows that share errors count as independent.
         bounds: Interval of the reduced chi-square that is taken as good.
-        p_value: Probability of one as large, were the noise as stated; None where that is not known.
+        p_value: Probability of one as large, were the noise as specified; None where that is not known.
     """
 
     value: float

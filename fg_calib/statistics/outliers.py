@@ -29,7 +29,7 @@ MAX_ROWS = 20_000
 MAX_ROUNDS = 10
 """How often the fit is made again."""
 
-FINE = ("as stated", "too large", "unknown")
+FINE = ("as specified", "too large", "unknown")
 """Verdicts of kinds that nothing spoils."""
 
 _State = tuple[Solution, Spread, ResidualTable]

@@ -196,7 +196,7 @@ def test_two_small_slips_are_not_taken_for_noise_that_is_a_little_too_small(unkn
 
 
 def test_few_rows_that_a_slip_explains_are_not_said_to_be_explained_by_none(known):
-    """Too few to tell it from noise stated too small."""
+    """Too few to tell it from noise specified too small."""
     calibration, true, _ = known
     found = calibration.check(measured(slipped(true, theta4=2.5e-4), 2, np.random.default_rng(1)))
     assert found.explanations == ()

@@ -98,7 +98,7 @@ def test_what_the_convention_lacks_is_an_error_only_where_it_explains_the_misfit
 
 @pytest.mark.parametrize(("pitch", "told"), [(90.0, True), (-84.0, True), (60.0, False)])
 def test_a_joint_origin_pitched_by_a_quarter_turn_hardly_holds_a_tilt(pitch, told, fg_calib, tmp_path):
-    """Roll and yaw of a URDF origin turn about one axis there: a truly tilted joint made `noise stated too small`."""
+    """Roll and yaw of a URDF origin turn about one axis there: a truly tilted joint made `noise too small`."""
     joint = '<joint name="{0}" type="revolute"><parent link="l{1}"/><child link="l{2}"/><axis xyz="0 1 0"/>{3}</joint>'
     origins = ['<origin xyz="0 0 0.2"/>', f'<origin xyz="0 0.1 0.3" rpy="0 {float(np.deg2rad(pitch))!r} 0"/>']
     joints = "".join(joint.format(f"j{i}", i, i + 1, origin) for i, origin in enumerate(origins))

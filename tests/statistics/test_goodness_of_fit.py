@@ -39,7 +39,7 @@ def measured_directly(m, robot, rng, a, b, sigma=(1e-3, 5e-4), sigma_joint=0.0):
 
 
 def case(name, robot, rng, n=16, stated=1.0):
-    """A problem of a drawn true robot; noise stated is `stated` times the noise there is."""
+    """A problem of a drawn true robot; noise specified is `stated` times the noise there is."""
     true = true_robot(robot, rng)
     if name.startswith("direct"):
         sigma_joint = 3e-4 if "joint" in name else 0.0
@@ -121,13 +121,13 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
     rng = np.random.default_rng(6)
     robot = small_arm(tolerance=TOLERANCE)
     found = {}
-    for what, stated in (("as stated", 1.0), ("too small", 0.5), ("too large", 2.0)):
+    for what, stated in (("as specified", 1.0), ("too small", 0.5), ("too large", 2.0)):
         found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, stated))).fit.goodness.kinds}
     assert found == {what: {what} for what in found}
     m = measure(true_robot(robot, rng), 50, rng)
     m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
     fits = assess(solve(build_problem(robot, m, model="pose"))).fit.goodness.kinds
-    assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as stated", "position": "outliers"}
+    assert {fit.kind: fit.verdict for fit in fits} == {"orientation": "as specified", "position": "outliers"}
 
 
 @pytest.mark.slow
@@ -196,7 +196,7 @@ def test_robust_weights_count_rows_and_flag_outliers():
 
 
 def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
-    """Some 12 degrees of freedom see noise within a fifth: 0.75 times the noise stated is no news, 0.3 times is."""
+    """Some 12 degrees of freedom see noise within a fifth: 0.75 times the noise specified is no news, 0.3 times is."""
     fit = {
         "kind": "angle",
         "unit": "rad",
@@ -206,7 +206,7 @@ def test_without_a_p_value_noise_is_judged_by_what_its_rows_vary():
         "chi2": 20.0,
     }
     known = {**fit, "expected": 40.0, "p_value": None, "typical": 0.7, "degrees": 12.0}
-    assert KindFit(**known, seen_over_stated=0.75).verdict == "as stated"
+    assert KindFit(**known, seen_over_stated=0.75).verdict == "as specified"
     assert KindFit(**known, seen_over_stated=0.3).verdict == "too large"
 
 

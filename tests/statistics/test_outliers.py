@@ -60,7 +60,7 @@ def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     problem, wrong = spoilt(name, min(by, 300.0) if name == "all" else by, np.random.default_rng(5))
     found = assess(solve(problem))
     verdicts = {fit.verdict for fit in found.fit.goodness.kinds}
-    assert "outliers" in verdicts <= {"outliers", "others", "as stated"}
+    assert "outliers" in verdicts <= {"outliers", "others", "as specified"}
     assert [name.removeprefix("0 and ") for name in found.fit.goodness.gross.names] == [wrong]
     assert found.fit.goodness.gross.ratio < 1.5
     assert not found.noise_may_be_estimated

@@ -129,7 +129,7 @@ TRUE = {"a": 3e-3, "d": 3e-4, "alpha": 8e-3, "theta": 1e-3}
 
 
 def drawn_problem(model="pose", n=12, seed=0, n_test=0, **choices):
-    """A problem of an arm whose errors are other than stated, and its true robot."""
+    """A problem of an arm whose errors are other than specified, and its true robot."""
     rng = np.random.default_rng(seed)
     true = true_robot(small_arm(tolerance=TRUE), rng)
     m = measure(true, n, rng, sigma=(1e-4, 1e-4), n_test=n_test)
