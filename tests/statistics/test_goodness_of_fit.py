@@ -266,7 +266,6 @@ def test_fitted_and_predicted_rows_have_the_sums_of_squares_and_p_values_that_th
     assert sum(None in p for p in p_values.values()) == name.startswith("touches")  # the one fitted distance
 
 
-@pytest.mark.slow
 def test_touches_of_a_point_that_is_their_mean_share_its_noise():
     """Leverages by the arm's own derivatives: those of the row less the mean's; of n touches -1 / n for the noise.
 
