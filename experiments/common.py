@@ -134,11 +134,14 @@ def one(work: Callable[[Task], Row], task: Task) -> Row:
 
 def provenance() -> Row:
     """Commit, date and versions of what a record was made with."""
-    command = ["git", "describe", "--always", "--dirty"]
-    asked = subprocess.run(command, cwd=HERE, capture_output=True, text=True, check=False)
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], cwd=HERE, capture_output=True, text=True, check=False).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ":/", ":!results", ":!README.md")
     names = ("gtsam", "numba", "numpy", "scipy")
     return {
-        "commit": asked.stdout.strip() or "unknown",
+        "commit": (git("rev-parse", "--short", "HEAD") or "unknown") + ("-dirty" if changed else ""),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in names}},
     }
