@@ -140,12 +140,12 @@ class Assessment(FrozenArrays):
     def noise_may_be_estimated(self) -> bool:
         """Whether the residuals look like noise that is a little larger than specified."""
         fit, verdict = self.fit, self.verdict
-        too_large = [kind for kind in fit.goodness.kinds if kind.verdict in ("too small", "both")]
+        too_large = [kind for kind in fit.goodness.kinds if kind.verdict == "too small"]
         return (
             not fit.residuals.evaluated
             and not verdict.setup.explanations
             and verdict.change is None
-            and not any(kind.verdict in ("outliers", "others", "both") for kind in fit.goodness.kinds)
+            and fit.goodness.gross is None
             and not (too_large and self.identifiability.missing)
             and all(kind.typical <= MOST_ESTIMATED for kind in too_large)
             and (verdict.noise_like is None or verdict.noise_like > LIKE_NOISE)

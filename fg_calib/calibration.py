@@ -140,10 +140,10 @@ def _with_first_sigmas(m: Measurements) -> Measurements:
     first: dict[str, Any] = {}
     for name, measured in (("position", m.position), ("orientation", m.rotation)):
         if measured is not None and getattr(m, f"sigma_{name}") is None:
-            first[f"sigma_{name}"] = np.full((m.n_configurations, 3), getattr(io.UNSTATED, name))
+            first[f"sigma_{name}"] = np.full((m.n_configurations, 3), getattr(io.UNSPECIFIED, name))
     if m.pairs is not None:
-        distance = np.nan_to_num(m.pairs.sigma_distance, nan=io.UNSTATED.distance or 0.0)
-        angle = np.nan_to_num(m.pairs.sigma_angle, nan=io.UNSTATED.angle or 0.0)
+        distance = np.nan_to_num(m.pairs.sigma_distance, nan=io.UNSPECIFIED.distance or 0.0)
+        angle = np.nan_to_num(m.pairs.sigma_angle, nan=io.UNSPECIFIED.angle or 0.0)
         first["pairs"] = replace(m.pairs, sigma_distance=distance, sigma_angle=angle)
     return replace(m, **first)
 

@@ -166,13 +166,14 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
 @pytest.mark.slow
 def test_noise_is_estimated_from_nothing_stated():
     robot, m, _ = given("priors", n=40)
-    stated = calibrate(robot, m, model="pose", estimate_noise=True)
+    specified = calibrate(robot, m, model="pose", estimate_noise=True)
     bare = replace(m, sigma_position=None, sigma_orientation=None)
     free = calibrate(robot, bare, model="pose", estimate_noise=True)
     # The factors settle to 1e-5 wherever they start (see `variance_components`).
     for kind, true in (("position", 1e-3), ("orientation", 2e-4)):
         seen, seen_too = (
-            r.result.goodness[kind].stated_sigma_rms * r.result.goodness[kind].seen_over_stated for r in (free, stated)
+            r.result.goodness[kind].specified_sigma_rms * r.result.goodness[kind].observed_over_specified
+            for r in (free, specified)
         )
         assert seen == pytest.approx(seen_too, rel=1e-4)
         assert seen == pytest.approx(true, rel=0.3)  # 120 residuals: 1 sigma of their RMS is 7 %

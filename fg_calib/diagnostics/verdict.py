@@ -67,9 +67,6 @@ MAX_PRIOR_SCALE = 10.0
 NAMED = 3
 """Configurations, rows or parameters that a statement names."""
 
-_TOO_LARGE = frozenset(("too small", "both"))
-"""Verdicts on a kind of noise specified too small."""
-
 
 @dataclass(frozen=True)
 class Statement:
@@ -146,7 +143,7 @@ class Case:
         if priors is None:
             return chi2.too_large
         rest, dof = chi2.value - priors.chi2, chi2.dof - len(priors.names)
-        return rest > max(chi2.bounds[1] * dof, 0.0) or any(k.verdict in _TOO_LARGE for k in self.fit.goodness.kinds)
+        return rest > max(chi2.bounds[1] * dof, 0.0) or any(k.verdict == "too small" for k in self.fit.goodness.kinds)
 
     @property
     def high(self) -> bool:
@@ -165,7 +162,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         missing: What the robot's convention has no parameter for.
     """
     problem, verdicts = solution.problem, {kind.verdict for kind in fit.goodness.kinds}
-    tested = not problem.evaluated and bool(verdicts & _TOO_LARGE or solution.estimated_noise is not None)
+    tested = not problem.evaluated and ("too small" in verdicts or solution.estimated_noise is not None)
     change = effects.find_change(solution) if tested or ("outliers" in verdicts and not problem.evaluated) else None
     noise_like = effects.probability_of_noise(solution) if tested and change is None else None
     case = Case(solution, spread, fit, missing, change, noise_like)
@@ -275,7 +272,7 @@ def check_test_rows(case: Case) -> Iterator[Statement]:
     yield Statement("error", f"{text}: more than a robust loss can tell from noise", many)
     large = ratio >= NOTABLE_RATIO**2 and fit.p_value < SIGNIFICANT
     if large and not many and not FACTOR < of_fitted > ratio / FACTOR:  # noise specified too small is reported once
-        worst = [case.problem.end_names[c.configuration + 1] for c in fit.configurations]
+        worst = [configuration.id for configuration in fit.configurations]
         text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
         text += f"; suspicious: {listed(worst)}" if worst else ""
         yield Statement("error" if ratio > FACTOR else "warning", text)
@@ -352,7 +349,7 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
     at = pose(case.problem.robot, readings).jacobian[:, :, -readings.shape[1] :] * readings.std(axis=0)
     turn, shift = (float(np.sqrt(np.mean(np.sum(part**2, axis=2)))) for part in (at[:, :3], at[:, 3:]))
     for fit in case.fit.goodness.kinds:
-        ratio = fit.factor * fit.stated_sigma_rms / {"m": shift, "rad": turn}.get(fit.unit, np.inf)
+        ratio = fit.factor * fit.specified_sigma_rms / {"m": shift, "rad": turn}.get(fit.unit, np.inf)
         text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as what the joints move"
         text += ": the arm explains next to nothing; check the table and the job"
         yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)

@@ -12,7 +12,7 @@ from .atomic import (
 )
 from .job import (
     NOISE_UNITS,
-    UNSTATED,
+    UNSPECIFIED,
     camera_in,
     check_choices,
     is_job,
@@ -98,7 +98,7 @@ __all__ = [
     "OF_PAIRS",
     "RESULT_FILES",
     "ROUNDING",
-    "UNSTATED",
+    "UNSPECIFIED",
     "Bound",
     "Column",
     "Count",

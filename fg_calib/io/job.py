@@ -47,7 +47,7 @@ from fg_calib.job import Job
 from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
 from fg_calib.robot import Robot, names_of
 
-UNSTATED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
+UNSPECIFIED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
 """Where the noise starts from if it is to be estimated and nothing was specified."""
 
 NOISE_UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
@@ -423,7 +423,7 @@ def _noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[Noise, b
     file: Any = validate(_Noise, given, place)
     specified = {key: sigma for key in NOISE_UNITS if (sigma := getattr(file, key)) is not None}
     sigmas = {key: units.sigma(one, NOISE_UNITS[key], f"{place}: {key}") for key, one in specified.items()}
-    start = {f.name: getattr(UNSTATED, f.name) for f in fields(Noise)[:-1]} if file.estimate else {}
+    start = {f.name: getattr(UNSPECIFIED, f.name) for f in fields(Noise)[:-1]} if file.estimate else {}
     return Noise(**start).updated(**sigmas, joint=joint_noise(file.joint, units, robot, place)), file.estimate
 
 

@@ -148,15 +148,6 @@ class Posterior(Section):
     undetermined_at_nominal: Floats = of("loose_at_nominal")
 
 
-class SuspectConfiguration(Section):
-    """A configuration whose residuals together are larger than noise."""
-
-    id: str
-    n: int
-    chi2: Figure
-    expected: Figure
-
-
 class Knowledge(Section):
     """The information of the rows, linearised at the estimate, for the next calibration.
 
@@ -263,7 +254,7 @@ class Result(Section):
     chi2_bounds: tuple[Figure, Figure] = of("assessed.fit.chi_square.bounds", (np.nan, np.nan))
     goodness: dict[str, statistics.KindFit] = {}
     suspect_level: Figure = of("assessed.fit.goodness.level", np.nan)
-    suspect_configurations: tuple[SuspectConfiguration, ...] = ()
+    suspect_configurations: tuple[statistics.SuspectConfiguration, ...] = of("assessed.fit.goodness.configurations", ())
     evaluated_only: bool = of("problem.evaluated", False)
     test: statistics.PredictedFit | None = of("assessed.fit.goodness.test", None)
     acceptance: statistics.Acceptance | None = of("assessed.acceptance", None)
@@ -329,10 +320,6 @@ class Result(Section):
             tables=tuple((label, in_words(table)) for label, table in zip(data.labels, data.tables, strict=True)),
             n_unknowns=len(problem.variables.all_scales),
             goodness={key_of(kind, goodness.kinds): kind for kind in goodness.kinds},
-            suspect_configurations=tuple(
-                {"id": problem.end_names[c.configuration + 1], "n": c.n, "chi2": c.chi2, "expected": c.expected}
-                for c in goodness.configurations
-            ),
             residual_rms=_residual_rms(assessed.fit.residuals),
             frames={v.symbol: frame for v, frame in zip(frames, assessed.estimates.frames, strict=True)},
             links=None if urdf is None else (urdf.base_link, urdf.tip_link),
@@ -554,7 +541,6 @@ def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
     import polars as pl
 
     table, fit = assessed.fit.residuals, assessed.fit.goodness
-    suspects = np.append(fit.suspects, () if fit.test is None else fit.test.suspects)
     ends, sources = solution.problem.end_names, solution.problem.data.labels
     measured = table.measured - table.excess  # so that predicted minus measured is 0 on average
     columns = {
@@ -576,7 +562,7 @@ def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
         "weight": fit.weight,
         "flag": _coded(FLAGS, fit.flag),
         "noise_adds": table.excess,
-        "suspect": np.isin(np.arange(table.n), suspects),
+        "suspect": fit.suspect,
     }
     if len(sources) > 1:
         columns["table"] = _coded([sources[kind.table] for kind in table.kinds], table.kind_code)

@@ -201,7 +201,7 @@ def _goodness(result: Result, robot: Robot) -> list[Content]:
     """Specified and estimated noise by kind, and what their ratio means."""
     factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[Any, ...]]()
     for fit in fits:
-        specified, ratio, words = fit.stated_sigma_rms, fit.seen_over_stated, VERDICTS[fit.verdict]
+        specified, ratio, words = fit.specified_sigma_rms, fit.observed_over_specified, VERDICTS[fit.verdict]
         if factors is not None:
             ratio, words = fit.factor, _estimated_noise(result, key_of(fit, fits))
         rows.append((_named(result, fit), fit.unit, specified, ratio * specified, ratio, fit.p_value, words))
@@ -227,7 +227,7 @@ def _prediction(result: Result) -> Iterator[Content]:
     """How well the test rows are predicted, by kind."""
     if (fit := result.test) is None:
         return
-    ratios = [(k.n, k.chi2, k.expected, k.seen_over_stated / k.factor, k.p_value) for k in fit.kinds]
+    ratios = [(k.n, k.chi2, k.expected, k.observed_over_specified / k.factor, k.p_value) for k in fit.kinds]
     words = [PREDICTION_VERDICTS[k.verdict] for k in fit.kinds]
     rows = [(_named(result, k), *of, word) for k, of, word in zip(fit.kinds, ratios, words, strict=True)]
     yield table_of(("", "rows|d", "chi-square|.4g", "expected|.4g", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
@@ -426,7 +426,7 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
     yield from _undetermined(solution, assessed)
     if not assessed.fit.residuals.split.any():
         yield "no test rows: the prediction of new configurations was not checked"
-    if assessed.fit.goodness.suspects.size and weights is None:
+    if np.any(assessed.fit.goodness.suspect & assessed.fit.residuals.used) and weights is None:
         yield "suspicious rows may be weighted down by a robust loss: loss in the job"
 
 
@@ -437,7 +437,7 @@ def _noise_notes(solution: Solution, assessed: Assessment) -> Iterator[str]:
         kinds = " and ".join(dict.fromkeys(kind for _, kind in estimated))
         used = f"{len(estimated)} degrees of freedom are used for it"
         yield f"{kinds} noise was estimated from these residuals: chi-square does not test it, and {used}"
-    elif estimated is None and verdicts & {"too large", "too small", "both"} and assessed.noise_may_be_estimated:
+    elif estimated is None and verdicts & {"too large", "too small"} and assessed.noise_may_be_estimated:
         yield "to use the observed noise instead of the specified one: estimate: true in noise of the job"
 
 

@@ -59,9 +59,6 @@ FLAGS = ("", "suspect", "outlier", "excluded", "test")
 LEAST_VARIANCE = 1e-6
 """Variance of a residual, over that of its noise, below which the row is met whatever was measured."""
 
-LEAST_GAIN = 0.3
-"""Part of the excess of chi-square that is left at most without outliers, where more than these is wrong."""
-
 CONFIDENCE = 0.999
 """A sum of squares outside this central interval of its distribution is not by chance."""
 
@@ -83,26 +80,25 @@ class KindFit:
         kind: `distance`, `angle`, `orientation`, `position`, `point`, or that of a kind of one's own.
         unit: `m`, `rad` or `px`.
         n: Number of scalar rows.
-        stated_sigma_rms: Root of the mean square of their sigmas as specified.
+        specified_sigma_rms: Root mean square of their specified sigmas.
         factor: What they were multiplied by, all noise together: 1 unless the noise was estimated.
-        seen_over_stated: Noise seen over noise specified; nan where the fit leaves less than one degree of freedom.
+        observed_over_specified: Observed over specified noise; nan where less than one degree of freedom is left.
         chi2: Sum of squared residuals over sigma, as it was taken.
         expected: Its mean, were the noise as taken: the rows' redundancy.
         p_value: Probability of a sum as large, were the noise as taken; None where it is not known.
-        typical: Noise seen over noise taken, from the median, which a few rows do not move.
+        typical: Observed noise over noise as taken, from the median, which a few rows do not move.
         degrees: Degrees of freedom of chi-square.
         table: Number of its table.
         n_beyond: Rows with a |studentised residual| that none of a clean table has (`suspect_level`).
-        spoilt: Whether rows of this kind are among the gross errors themselves.
-        rest: The same of the rows without gross errors; None where there are none, or not few.
+        cause: Why the sum is too large where the other rows are as specified: `outliers` of this kind, or of `others`.
     """
 
     kind: str
     unit: str
     n: int
-    stated_sigma_rms: Figure
+    specified_sigma_rms: Figure
     factor: Figure
-    seen_over_stated: Figure
+    observed_over_specified: Figure
     chi2: Figure
     expected: Figure
     p_value: float | None
@@ -110,14 +106,13 @@ class KindFit:
     degrees: Figure
     table: int = 0
     n_beyond: int = 0
-    spoilt: bool = False
-    rest: KindFit | None = None
+    cause: str = ""
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def verdict(self) -> str:
         """What the figures say, as a key of `VERDICTS`."""
-        ratio, p = self.seen_over_stated / self.factor, self.p_value
+        ratio, p = self.observed_over_specified / self.factor, self.p_value
         if not np.isfinite(ratio):
             return "unknown"
         if p is None:  # weights or factors came from the residuals: their spread alone is known
@@ -126,12 +121,7 @@ class KindFit:
             unlikely = min(p, 1.0 - p) < ALARM / 2.0
         if not unlikely or abs(ratio - 1.0) < 0.05:
             return "as specified"
-        if ratio < 1.0 or self.rest is None:
-            return "too large" if ratio < 1.0 else "too small"
-        if self.rest.verdict in ("as specified", "too large"):
-            return "outliers" if self.spoilt else "others"
-        excess, left = self.seen_over_stated**2 - 1.0, self.rest.seen_over_stated**2 - 1.0
-        return "both" if left < LEAST_GAIN * excess else "too small"
+        return "too large" if ratio < 1.0 else self.cause or "too small"
 
 
 VERDICTS = {
@@ -140,7 +130,6 @@ VERDICTS = {
     "too small": "most rows too large: noise specified too small, or effects not modelled",
     "outliers": "few rows far too large: outliers",
     "others": "as specified once the outliers are left out",
-    "both": "noise specified too small or effects not modelled, and outliers",
     "unknown": "too few rows to tell",
 }
 """What a fit by kind means, in words."""
@@ -158,13 +147,13 @@ class SuspectConfiguration:
     """A configuration whose rows are too large together.
 
     Attributes:
-        configuration: Its row among the measurements; a touched group counts on from the number of configurations.
+        id: Its name, or that of a landmark.
         n: Scalar rows that it takes part in.
         chi2: Sum of their squared residuals over sigma.
         expected: Its mean, were the noise as specified.
     """
 
-    configuration: int
+    id: str
     n: int
     chi2: Figure
     expected: Figure
@@ -200,7 +189,6 @@ class PredictedFit(FrozenArrays):
         chi2: Sum of the squares of the rows, whitened by their noise and by what the estimate may be off.
         expected: Its mean, were the noise as taken and the arm known as well as is claimed.
         p_value: Probability of a sum as large.
-        suspects: Rows of the table that are too large, the largest |studentised| first.
         configurations: Configurations whose rows are too large together, the worst first.
     """
 
@@ -213,7 +201,6 @@ class PredictedFit(FrozenArrays):
     chi2: Figure
     expected: Figure
     p_value: Figure
-    suspects: Integers
     configurations: tuple[SuspectConfiguration, ...]
 
 
@@ -228,7 +215,7 @@ class Goodness(FrozenArrays):
         weight: Robust weight of each row's measurement.
         flag: What is said of each row, in `FLAGS`.
         level: |studentised| above which a row is suspect.
-        suspects: Fitted rows that are suspect or outliers, the largest |studentised| first.
+        suspect: Rows that are too large, and outliers among the fitted ones.
         configurations: Suspect configurations among the fitted rows, the worst first.
         test: The predicted rows; None without any that can be judged.
         gross: The few gross errors that spoil the fit; None if there are none, or it cannot be told.
@@ -241,7 +228,7 @@ class Goodness(FrozenArrays):
     weight: Floats
     flag: Codes
     level: float
-    suspects: Integers
+    suspect: Booleans
     configurations: tuple[SuspectConfiguration, ...]
     test: PredictedFit | None
     gross: GrossErrors | None = None
@@ -255,8 +242,7 @@ class Goodness(FrozenArrays):
     @property
     def spoilt(self) -> bool:
         """Whether a few gross errors are all that is wrong with the fit."""
-        fine = ("as specified", "too large", "outliers", "others", "unknown")
-        return self.gross is not None and all(kind.verdict in fine for kind in self.kinds)
+        return self.gross is not None and all(kind.verdict != "too small" for kind in self.kinds)
 
 
 @dataclass(frozen=True)
@@ -289,11 +275,6 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
     with np.errstate(invalid="ignore"):
         suspect, outlier = np.abs(rows.studentised) > level, rows.weight < OUTLIER_WEIGHT
     which = {"excluded": table.reason_code != 0, "test": table.test, "outlier": outlier, "suspect": suspect}
-
-    def worst_first(chosen: Booleans) -> Integers:
-        found = np.flatnonzero(chosen)
-        return found[np.argsort(-np.abs(rows.studentised[found]), kind="stable")]
-
     return Goodness(
         kinds=rows.fit_kinds(),
         leverage=rows.leverage,
@@ -301,9 +282,9 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
         weight=rows.weight,
         flag=np.select(list(which.values()), [np.int8(FLAGS.index(name)) for name in which], np.int8(0)),
         level=level,
-        suspects=worst_first(table.used & (suspect | outlier)),
+        suspect=(table.reason_code == 0) & (suspect | (outlier & table.used)),
         configurations=rows.fitted.suspect_configurations() if not rows.robust else (),
-        test=rows.fit_predicted(worst_first(suspect & table.test & (table.reason_code == 0))),
+        test=rows.fit_predicted(),
     )
 
 
@@ -352,7 +333,7 @@ class JudgedRows:
             ratio = chi2[k] / expected[k]
             p = upper_probability(ratio, max(1.0, self.degrees(np.unique(place[end == k]))))
             if p < limit:
-                one = SuspectConfiguration(k, int(count[k]), float(chi2[k]), float(expected[k]))
+                one = SuspectConfiguration(self.table.names[k], int(count[k]), float(chi2[k]), float(expected[k]))
                 found.append((p, -ratio, k, one))
         return tuple(one for *_, one in sorted(found))
 
@@ -440,12 +421,8 @@ class RowStatistics:
         known = not self.robust and self.solution.estimated_noise is None
         return self._fit_kinds(part, excess, known and (part.covariance is not None or not self._shared))
 
-    def fit_predicted(self, suspects: Integers) -> PredictedFit | None:
-        """The fit of the predicted rows; None without any that can be judged.
-
-        Args:
-            suspects: The rows of the table among them that are too large.
-        """
+    def fit_predicted(self) -> PredictedFit | None:
+        """The fit of the predicted rows; None without any that can be judged."""
         part, table, n = self.predicted, self.table, len(self.predicted.rows)
         test = table.test & (table.reason_code == 0)
         able = test & (self.leverage >= LEAST_VARIANCE - 1.0)
@@ -471,7 +448,6 @@ class RowStatistics:
             chi2=chi2,
             expected=expected,
             p_value=upper_probability(chi2 / expected, nu, of_noise) if n else 1.0,
-            suspects=suspects,
             configurations=part.suspect_configurations() if not self.robust else (),
         )
 
@@ -499,9 +475,9 @@ class RowStatistics:
                     kind=family,
                     unit=table.unit(family),
                     n=len(rows),
-                    stated_sigma_rms=float(np.sqrt(specified)),
+                    specified_sigma_rms=float(np.sqrt(specified)),
                     factor=factor,
-                    seen_over_stated=factor * float(np.sqrt(total / expected)) if enough else np.nan,
+                    observed_over_specified=factor * float(np.sqrt(total / expected)) if enough else np.nan,
                     chi2=total,
                     expected=max(float(expected), 0.0),
                     p_value=upper_probability(total / mean, degrees, of_noise) if enough and known else None,

@@ -121,11 +121,9 @@ def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, r
     """The fit's kinds with those of the fit without the rows left out."""
     size = np.where(out, np.abs(rest.studentised), 0.0)
     wrong = {table.groups[code] for code in np.unique(table.group[size > rest.level])}
-    left = {(kind.table, kind.kind): kind for kind in rest.kinds}
-    kinds = tuple(
-        replace(kind, rest=left.get((kind.table, kind.kind)), spoilt=(kind.table, kind.kind) in wrong)
-        for kind in fit.kinds
-    )
+    fine = {(kind.table, kind.kind) for kind in rest.kinds if kind.verdict in ("as specified", "too large")}
+    causes = {group: "outliers" if group in wrong else "others" for group in fine}
+    kinds = tuple(replace(kind, cause=causes.get((kind.table, kind.kind), "")) for kind in fit.kinds)
     rows = np.flatnonzero(out)
     rows, names = rows[np.argsort(-size[rows], kind="stable")], ("", *table.names)
     ends = dict.fromkeys((names[table.a[i] + 1], names[table.b[i] + 1]) for i in rows)

@@ -68,12 +68,13 @@ def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 5])
-def test_a_loud_table_with_outliers_is_both(n):
+def test_noise_specified_too_small_is_named_next_to_outliers(n):
     rng = np.random.default_rng(8)
     robot, m = measured("6R", rng, unit=0.5)
     m = replace(m, position=plus(m.position, rng.choice(60, n, replace=False), 0.05))
     found = assess(solve(problem_of(robot, m, "position")))
-    assert [fit.verdict for fit in found.fit.goodness.kinds] == ["both"]
+    assert [fit.verdict for fit in found.fit.goodness.kinds] == ["too small"]
+    assert found.fit.goodness.gross.names
     assert not found.fit.goodness.spoilt
 
 
