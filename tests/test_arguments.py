@@ -37,8 +37,10 @@ def test_arguments_that_fit_pass_as_they_are():
 
 
 def test_a_wrong_call_fails_in_pythons_own_words():
-    with pytest.raises(TypeError, match="missing a required argument: 'path'"):
+    with pytest.raises(TypeError, match=r"^named\(\) missing 1 required positional argument: 'path'$"):
         named()
+    with pytest.raises(TypeError, match=r"^named\(\) got an unexpected keyword argument 'option'"):
+        named("a", option=3)
 
 
 def test_choices_and_switches_are_checked_and_numbers_where_they_are_used():

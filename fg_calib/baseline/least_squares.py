@@ -36,7 +36,7 @@ import numpy as np
 from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check_names, checked
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Chain, Element, Parameter, Robot, build_chain, names_of
+from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Chain, Element, Parameter, Robot, build_chain, names_of
 
 RCOND = 1e-10
 """Singular values of J below this part of the largest count as zero in J^+."""
@@ -346,6 +346,6 @@ class _System:
 def _with_frame(robot: Robot) -> Robot:
     """The robot after a frame, whose six parameters come last."""
     n = len(robot.parameters)
-    frame = [Element(AXIS_OF_KIND[kind], parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
+    frame = [Element(PARAMETER_KINDS[kind].axis, parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
     parameters = (Parameter(f"frame.{kind}", kind, 0, 0.0) for kind in FRAME_KINDS)
     return replace(robot, parameters=(*robot.parameters, *parameters), elements=(*frame, *robot.elements))

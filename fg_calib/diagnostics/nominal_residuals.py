@@ -170,7 +170,7 @@ def residuals_at(
     some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in series)
     variables = build_variables(robot, [t.unknown_frame for t in problem.data.tables])
     arm = {p.name: p for p in robot.parameters if 1 <= p.owner <= robot.n_joints}
-    usual = {p.name: USUAL[p.unit] if p.tolerance is None else p.tolerance for p in arm.values()}
+    usual = {p.name: p.tolerance or USUAL.get(p.unit, p.scale) for p in arm.values()}
     scale = np.array([usual.get(name, 0.0) for name in variables.names])
     values = np.concatenate([parameters[problem.variables.robot_span], parameters[problem.variables.frame_span]])
     found: list[TypicalResidual] = []

@@ -25,7 +25,7 @@ from fg_calib.graph import Problem
 from fg_calib.inputs import Booleans, Brief, Floats, FrameKnowledge, Model, checked
 from fg_calib.measurements import Measurements, Table
 from fg_calib.parallel import one_blas_thread
-from fg_calib.robot import CONVENTIONS, Robot
+from fg_calib.robot import CONVENTIONS, SCALES, Robot
 
 FAR = 5.0
 """Excess above which residuals before a calibration are not what noise and prior sigmas predict."""
@@ -107,7 +107,7 @@ class SetupCheck(Brief):
 
 def shown(residual: TypicalResidual) -> str:
     """A typical size with its unit, in mm, degrees or pixels: `812 mm`."""
-    factor, unit = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "px": (1.0, "px")}[residual.unit]
+    unit, factor, *_ = SCALES[residual.unit]
     size = residual.size * factor
     return f"{size:.0f} {unit}" if 1e3 <= size < 1e9 else f"{size:.3g} {unit}"
 
@@ -298,14 +298,14 @@ def setup_hypotheses(setup: Setup) -> Iterator[Mistake]:
 def _robot_in_units(setup: Setup) -> _Found:
     """Lengths of the robot, where no arm has such a size, and angles."""
     robot = setup.robot
-    in_m = np.array([parameter.unit == "m" for parameter in robot.parameters])
+    in_m, in_rad = (np.array([p.unit == unit for p in robot.parameters]) for unit in ("m", "rad"))
     reach = float(np.sum(np.abs(robot.nominal[in_m])))
     for factor, unit in LENGTHS.items():
         if not MIN_REACH <= reach <= MAX_REACH and MIN_REACH <= factor * reach <= MAX_REACH:
             values = robot.nominal * np.where(in_m, factor, 1.0)
             yield f"the robot's lengths are in {unit}", replace(setup, robot=robot.with_values(values))
-    for factor, unit in ANGLES.items() if robot.convention in CONVENTIONS and robot.nominal[~in_m].any() else ():
-        values = robot.nominal * np.where(in_m, 1.0, factor)
+    for factor, unit in ANGLES.items() if robot.convention in CONVENTIONS and robot.nominal[in_rad].any() else ():
+        values = robot.nominal * np.where(in_rad, factor, 1.0)
         yield f"the robot's angles are in {unit}", replace(setup, robot=robot.with_values(values))
 
 

@@ -38,7 +38,7 @@ from fg_calib.graph import Problem, Solution, build_variables, prior_rows, unkno
 from fg_calib.inputs import Floats
 from fg_calib.measurements import Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
-from fg_calib.robot import AXIS_OF_KIND, FRAME_KINDS, Chain, Element, Parameter, Robot, pose
+from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Chain, Element, Parameter, Robot, pose
 
 MAX_ROWS = 10_000
 """Rows up to which residuals are tested: more would take long, and are seldom needed."""
@@ -177,7 +177,7 @@ def find_change(solution: Solution) -> Change | None:
         return None
     fit, J, names = regress(solution)
     links = {"tool": problem.robot.n_joints, "base": 0}
-    motions = {what: J[:, np.char.startswith(names, f"{LINK}{link}:")] for what, link in links.items()}
+    motions = {what: J[:, np.char.startswith(names, f"{LINK}{link}.")] for what, link in links.items()}
     at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in blocks])
     first = np.unique(at)[LEAST_SIDE : 1 - LEAST_SIDE]
     first = first[np.unique(np.linspace(0, len(first) - 1, min(MAX_TRIED, len(first))).astype(np.int64))]
@@ -197,8 +197,8 @@ def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:
     problem = solution.problem
     if problem.n_residuals > MAX_ROWS:
         return True
-    kinds = {AXIS_OF_KIND[kind]: kind for kind in FRAME_KINDS}
-    wanted = [f"{LINK}{axis}: {kinds[one]}" for axis in motion.axes[:-1] for one in motion.motions]
+    kinds = {PARAMETER_KINDS[kind].axis: kind for kind in FRAME_KINDS}
+    wanted = [f"{LINK}{axis}.{kinds[one]}" for axis in motion.axes[:-1] for one in motion.motions]
     fit, J, names = regress(solution)
     p, left, _ = fit.test(J[:, np.isin(names, wanted)])
     return p < P_VALUE and left <= MISSING_LEFT
@@ -275,8 +275,8 @@ def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], 
     for owner in range(robot.n_joints, -1, -1):
         place = end_of_link(robot, owner)
         for kind in FRAME_KINDS:
-            more = Parameter(f"{LINK}{owner}: {kind}", kind, owner, 0.0)
-            elements.insert(place, Element(more.axis, parameter=len(parameters)))
+            more = Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0)
+            elements.insert(place, Element(PARAMETER_KINDS[kind].axis, parameter=len(parameters)))
             parameters.append(more)
     wide = replace(robot, elements=tuple(elements), parameters=tuple(parameters))
     variables = build_variables(wide, [table.unknown_frame for table in problem.data.tables])

@@ -20,7 +20,7 @@ from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.graph import JOINT_NOISE, Problem, Solution
 from fg_calib.measurements import missing_values
 from fg_calib.observability import MissingMotion
-from fg_calib.robot import pose
+from fg_calib.robot import SCALES, pose
 from fg_calib.statistics import (
     CONFIDENCE,
     FACTOR,
@@ -417,7 +417,7 @@ def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
         apart = np.abs(there - here) / [p.scale for p in robot.parameters]
         words = []
         for i in [i for i in np.argsort(-apart, kind="stable")[:most].tolist() if apart[i] > 0.3 * apart.max()]:
-            factor, unit = (1e3, "mm") if robot.parameters[i].unit == "m" else (180.0 / np.pi, "deg")
+            unit, factor, *_ = SCALES[robot.parameters[i].unit]
             words.append(f"{robot.parameters[i].name} {factor * here[i]:+.3g} or {factor * there[i]:+.3g} {unit}")
         text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"
         yield Statement("error", text + advice)

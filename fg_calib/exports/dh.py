@@ -60,8 +60,8 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, InputError, shown
 from fg_calib.robot import (
-    AXIS_OF_KIND,
     CONVENTIONS,
+    PARAMETER_KINDS,
     Axis,
     Element,
     Poses,
@@ -344,7 +344,7 @@ def transform(**values: float) -> Floats:
     """Elementary transforms by kind (theta, d, a, alpha, beta), multiplied from left to right, shape (4, 4)."""
     T = np.eye(4)
     for kind, value in values.items():
-        axis = AXIS_OF_KIND[kind]
+        axis = PARAMETER_KINDS[kind].axis
         if axis < Axis.RX:
             T[:3, 3] += value * T[:3, axis]
         else:

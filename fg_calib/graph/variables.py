@@ -37,10 +37,6 @@ from fg_calib.inputs import Brief, Floats
 from fg_calib.measurements import Landmarks
 from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Parameter, Robot, build_chain, names_of, yaw_pitch_roll
 
-KEEP_ORDER = ("theta", "d", "a", "alpha", "beta", "x", "y", "z", "yaw", "pitch", "roll")
-"""Of parameters that only act together the earlier kind is kept, and of one kind the later joint, as in the paper."""
-
-
 VariableKind = Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
 
 
@@ -490,11 +486,11 @@ def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats
 
 
 def preference(parameter: Parameter, prefer: Sequence[str]) -> int:
-    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `KEEP_ORDER`.
+    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `PARAMETER_KINDS`.
 
     Base and tool are estimated only where the user asks for it, and may be far from nominal.
     """
     if parameter.name in prefer:
         return list(prefer).index(parameter.name)
     of_frame = parameter.name.startswith(("base.", "tool."))
-    return len(prefer) + (0 if of_frame else 1 + KEEP_ORDER.index(parameter.kind))
+    return len(prefer) + (0 if of_frame else 1 + parameter.order)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache, wraps
 from inspect import signature
 from numbers import Integral, Real
@@ -60,7 +61,9 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
     @wraps(function)
     def with_checked(*args: P.args, **kwargs: P.kwargs) -> R:
         hints = _hints(function)
-        given = _signature(function).bind(*args, **kwargs).arguments
+        given: dict[str, Any] = {}
+        with suppress(TypeError):  # the call below fails in Python's own words
+            given = _signature(function).bind(*args, **kwargs).arguments
         for name in given.keys() & hints.keys():
             check_type(name, given[name], hints[name])
         return function(*args, **kwargs)

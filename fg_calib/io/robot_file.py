@@ -46,12 +46,10 @@ from fg_calib.io.yaml import (
     validate,
 )
 from fg_calib.robot import (
-    AXIS_OF_KIND,
     CONVENTIONS,
     FRAME_KINDS,
     IN_RAD,
     MOST_ANGLE,
-    Axis,
     Joint,
     Parameter,
     Robot,
@@ -60,6 +58,7 @@ from fg_calib.robot import (
     frame_values,
     names_of,
     tolerance_kind,
+    unit_of,
 )
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
@@ -414,7 +413,7 @@ def _si(kind: str, value: float, units: Units, place: str) -> float:
     Raises:
         InputError: An angle in rad is one in deg.
     """
-    unit = unit_of_key(kind)
+    unit = unit_of(kind)
     if units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
         raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
     return value * units.factor(unit)
@@ -448,7 +447,7 @@ class _Robot(Schema):
             InputError: A tolerance is too small.
         """
         sigma, where = self.units.sigma, f"{place}: tolerance"
-        tolerance = {key: sigma(value, unit_of_key(key), f"{where}: {key}") for key, value in self.tolerance.items()}
+        tolerance = {key: sigma(value, unit_of(key), f"{where}: {key}") for key, value in self.tolerance.items()}
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
@@ -614,12 +613,6 @@ def robot_text(
         mapping, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf
     )
     return str(text)
-
-
-def unit_of_key(key: str) -> str:
-    """The unit, `m` or `rad`, of a kind of parameter (`a`, `tool`) or of one by its name (`alpha3`, `elbow.yaw`)."""
-    kind = re.sub(r".*\.|\d+$", "", key)
-    return "rad" if kind in AXIS_OF_KIND and AXIS_OF_KIND[kind] >= Axis.RX else "m"
 
 
 def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from fg_calib.inputs import (
     did_you_mean,
 )
 from fg_calib.io.atomic import read_text
+from fg_calib.robot import SCALES
 
 Number = Annotated[float, Field(strict=True, ge=-MOST_SIZE, le=MOST_SIZE)]
 """A finite number."""
@@ -276,8 +277,8 @@ class Units:
         check_fields(self, "units: ")
 
     def name(self, unit: str) -> str:
-        """The file's unit for what is in `m` or `rad` inside the program."""
-        return self.length if unit == "m" else self.angle
+        """The file's unit for what is in `m` or `rad` inside the program; of others that unit itself."""
+        return {"m": self.length, "rad": self.angle}.get(unit, unit)
 
     def factor(self, unit: str) -> float:
         """What a value of the file is multiplied by to be in `unit`: `m`, `rad`, or one that no file has another of."""
@@ -312,19 +313,19 @@ def quantity(given: object, unit: str, units: Units | None, place: str) -> float
 
     Args:
         given: What the file holds.
-        unit: `m` or `rad`.
+        unit: `m`, `rad`, or another of `SCALES`.
         units: Of the file; None where a figure must have its own.
         place: File and key, for messages.
 
     Raises:
         InputError: It is neither.
     """
-    known = LENGTHS if unit == "m" else ANGLES
+    known = {"m": LENGTHS, "rad": ANGLES}.get(unit, {SCALES[unit].unit: 1.0 / SCALES[unit].factor})
     number, name = given, "" if units is None else units.name(unit)
     if isinstance(given, str) and (read := _QUANTITY.fullmatch(given)):
         number, name = read["number"], read["unit"] or name
         if not name:
-            raise InputError(place, number, hint=f"give a unit, such as {number}{'mm' if unit == 'm' else 'deg'}")
+            raise InputError(place, number, hint=f"give a unit, such as {number}{SCALES[unit].unit}")
     if name not in known:
         expected = f"a number with one of {', '.join(known)}"
         raise InputError(place, f"found {shown(given)}", expected, did_you_mean(name, known))

@@ -166,7 +166,8 @@ def observability_of_rows(
         parameters: The n parameters of the columns.
         scales: A change of ordinary size in each of them, shape (n,), [m] and [rad].
         n_measurements: Number of configurations or pairs, for O1.
-        prefer: Parameters to keep, first choice first, where only combinations are determined; then `KEEP_ORDER`.
+        prefer: Parameters to keep, first choice first, where only combinations are determined; then those first in
+            `PARAMETER_KINDS`.
         floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
     n, names = len(parameters), names_of(parameters)

@@ -91,7 +91,7 @@ def _large(value: float | None, unit: str, sign: str = "", unknown: str = "-") -
     if isinstance(value, int):
         return str(value)
     large = value is not None and abs(value) * tables.factor(unit) >= 1e5
-    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{tables.shown_in(unit)[2] - 1}f", unknown)
+    return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{tables.shown_in(unit).decimals - 1}f", unknown)
 
 
 def _comparison_notes(comparison: Comparison) -> Iterator[str]:

@@ -13,6 +13,7 @@ from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of
 from fg_calib.report.tables import factor, unit_shown
 from fg_calib.report.text import ReportData
+from fg_calib.robot import SCALES
 from fg_calib.simulation import link_points
 
 if TYPE_CHECKING:
@@ -73,7 +74,8 @@ def _colours(test: Booleans) -> str:
 def parameter_whiskers(data: ReportData) -> list[Chart]:
     """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
     found = []
-    for unit, what in (("m", "Lengths"), ("rad", "Angles")):
+    for unit in SCALES:
+        what = {"m": "Lengths", "rad": "Angles"}.get(unit, "Effects of joints")
         shown = [p for p in data.result.estimated if p.unit == unit]
         if not shown:
             continue

@@ -20,6 +20,7 @@ from fg_calib.observability import CORRELATED, Identifiability, Observability
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, line, section, table_of
 from fg_calib.report.text import expected_tool_error
+from fg_calib.robot import unit_of
 
 COUNTS = {
     **{"": "name", "rows|>": "n_rows", "configurations|>": "n_configurations", "test rows|>": "n_test"},
@@ -71,7 +72,7 @@ def _classes(found: Identifiability) -> Iterator[Content | Section]:
     if practical:
         indices = "  ".join(f"{name} {value:.4g}" for name, value in o.indices.items())
         combined = {name: " ".join(group.parameters) for group in o.relative for name in group.keep}
-        rows = [(name, sigma, tables.unit_of(name), combined.get(name, "")) for name, sigma in o.sigma.items()]
+        rows = [(name, sigma, unit_of(name), combined.get(name, "")) for name, sigma in o.sigma.items()]
         sigmas = table_of(("", "sigma|q", "|unit", "stands for"), rows)
         correlated = table_of(("", "|+.3f"), [(f"{', '.join(c.parameters)}:", c.correlation) for c in o.correlations])
         yield from section("Observability indices", line(f"{indices}  condition number {o.condition_number:.4g}"))

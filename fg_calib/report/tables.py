@@ -21,7 +21,7 @@ from fg_calib.diagnostics import probability
 from fg_calib.inputs import check_number, escaped
 from fg_calib.io import fill_folder, write_text
 from fg_calib.observability import LostDirection, Observability
-from fg_calib.robot import AXIS_OF_KIND, Axis, Robot
+from fg_calib.robot import SCALES, Robot, Scale, unit_of
 
 WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"
 WEAKLY = f"Weakly determined ({WEAK})"
@@ -29,9 +29,6 @@ WEAKLY = f"Weakly determined ({WEAK})"
 
 WIDTH = 100
 """Columns of a report that is not printed to a terminal."""
-
-SHOWN = {"m": (1e3, "mm", 4), "rad": (180.0 / np.pi, "deg", 5), "px": (1.0, "px", 3), "s": (1e3, "ms", 2)}
-"""Factor, unit and decimals in which a quantity is shown."""
 
 POSE_KINDS = {"position": "m", "orientation": "rad"}
 """The two kinds of error of a pose, and their units."""
@@ -156,26 +153,26 @@ def _cell(value: Any, form: str, unknown: str, unit: str) -> Text:
         return line(unit_shown(value))
     if isinstance(value, str) or form in ("", ">"):
         return line(str(value))
-    if kind == "q" or kind in SHOWN:
+    if kind == "q" or kind in SCALES:
         return line(figure(value, unit if kind == "q" else kind, digits, unknown or "unknown"))
     if value is None or not np.isfinite(value):
         return line(unknown or "-")
     return line(probability(value) if form == "p" else f"{value:{form}}")
 
 
-def shown_in(unit: str) -> tuple[float, str, int]:
-    """Factor, unit and decimals in which a quantity in [m], [rad] or [px] is shown; its own unit of others."""
-    return SHOWN.get(unit, (1.0, unit, 6))
+def shown_in(unit: str) -> Scale:
+    """How a quantity in an SI unit is shown; in that unit itself where `SCALES` has none."""
+    return SCALES.get(unit, Scale(unit, 1.0, 6))
 
 
 def factor(unit: str) -> float:
     """The factor from [m], [rad] or [px] to the unit in which a quantity is shown."""
-    return shown_in(unit)[0]
+    return shown_in(unit).factor
 
 
 def unit_shown(unit: str) -> str:
     """The name of the unit in which a quantity is shown: `mm`, `deg`, `px`, or its own."""
-    return shown_in(unit)[1]
+    return shown_in(unit).unit
 
 
 def figure(value: float | None, unit: str, form: str = "", unknown: str = "unknown") -> str:
@@ -189,7 +186,7 @@ def figure(value: float | None, unit: str, form: str = "", unknown: str = "unkno
     """
     if value is None or not np.isfinite(value):
         return unknown
-    return f"{value * factor(unit):{form if '.' in form else f'{form}z.{shown_in(unit)[2]}f'}}"
+    return f"{value * factor(unit):{form if '.' in form else f'{form}z.{shown_in(unit).decimals}f'}}"
 
 
 def in_words(value: float | None, unit: str, form: str = ".3g") -> str:
@@ -227,12 +224,6 @@ def format_relation(relation: Mapping[str, float]) -> str:
     text = " with ".join(f"{n} by {v:+.4g} {unit_of(n)}" for n, v in large.items())
     n_small = len(relation) - len(large)
     return text + (f" and a little of {n_small} other parameter{'s' * (n_small > 1)}" if n_small else "")
-
-
-def unit_of(name: str) -> str:
-    """`m` or `rad`, by a parameter's name."""
-    kind = name.rsplit(".", 1)[-1].rstrip("0123456789") if "." not in name else name.rsplit(".", 1)[-1]
-    return "m" if AXIS_OF_KIND[kind] < Axis.RX else "rad"
 
 
 def weak_directions(observability: Observability, most: int = 5) -> Table:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from fg_calib.inputs import Brief, Floats, Integers, as_figures, check_sizes, checked
 from fg_calib.parallel import processors
 from fg_calib.robot.kernels import ChainArrays, walk_all
-from fg_calib.robot.model import AXIS_OF_KIND, FRAME_KINDS, Axis, Element, Robot
+from fg_calib.robot.model import FRAME_KINDS, PARAMETER_KINDS, Axis, Element, Robot
 
 T = TypeVar("T")
 
@@ -145,7 +145,7 @@ def build_chain(
     end_of_base = max((i for i, e in enumerate(robot.elements) if e.parameter in base), default=-1)
     elements: list[tuple[Element, int, int]] = []  # element, source, column
     if frame:
-        elements += [(Element(AXIS_OF_KIND[k]), n_parameters + i, -1) for i, k in enumerate(FRAME_KINDS)]
+        elements += [(Element(PARAMETER_KINDS[k].axis), n_parameters + i, -1) for i, k in enumerate(FRAME_KINDS)]
         elements += _tangent(frame_tangent)
     for i, element in enumerate(robot.elements):
         source = -1 if element.parameter is None else element.parameter

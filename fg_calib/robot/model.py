@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,12 +57,50 @@ class Axis(IntEnum):
     RZ = 5
 
 
-AXIS_OF_KIND: Mapping[str, Axis] = {
-    **{"a": Axis.TX, "alpha": Axis.RX, "d": Axis.TZ, "theta": Axis.RZ, "beta": Axis.RY},
-    **{"x": Axis.TX, "y": Axis.TY, "z": Axis.TZ},
-    **{"roll": Axis.RX, "pitch": Axis.RY, "yaw": Axis.RZ},
+class Scale(NamedTuple):
+    """How values in an SI unit are shown: the unit, its factor and decimals; and an ordinary change, in the SI unit."""
+
+    unit: str
+    factor: float
+    decimals: int
+    ordinary: float = 1e-3
+
+
+SCALES: Mapping[str, Scale] = {
+    "m": Scale("mm", 1e3, 4),
+    "rad": Scale("deg", 180.0 / np.pi, 5),
+    "1": Scale("ppm", 1e6, 1),
+    "rad/(N m)": Scale("mrad/(kN m)", 1e6, 3, 1e-5),
+    "px": Scale("px", 1.0, 3),
+    "s": Scale("ms", 1e3, 2),
 }
-"""The elementary transform that a kind of parameter is the value of."""
+"""Each SI unit of a parameter or a residual, and how reports show it."""
+
+
+class ParameterKind(NamedTuple):
+    """What a kind of parameter is: its SI unit, a key of `SCALES`, and the elementary transform that it is a value of.
+
+    A joint's effect, such as a gain, acts along the joint's own axis.
+    """
+
+    unit: str
+    axis: Axis = Axis.RZ
+
+
+PARAMETER_KINDS: Mapping[str, ParameterKind] = {
+    "theta": ParameterKind("rad", Axis.RZ),
+    "d": ParameterKind("m", Axis.TZ),
+    "a": ParameterKind("m", Axis.TX),
+    "alpha": ParameterKind("rad", Axis.RX),
+    "beta": ParameterKind("rad", Axis.RY),
+    "x": ParameterKind("m", Axis.TX),
+    "y": ParameterKind("m", Axis.TY),
+    "z": ParameterKind("m", Axis.TZ),
+    "yaw": ParameterKind("rad", Axis.RZ),
+    "pitch": ParameterKind("rad", Axis.RY),
+    "roll": ParameterKind("rad", Axis.RX),
+}
+"""The kinds of parameters. Of those that only act together the earlier kind is kept, as in the paper."""
 
 CONVENTIONS: Mapping[str, tuple[str, ...]] = {
     "dh": ("theta", "d", "a", "alpha"),
@@ -96,11 +134,11 @@ class Parameter:
     """One kinematic parameter.
 
     Attributes:
-        name: `a3`, `theta7`, `elbow.x`, `tool.z`.
-        kind: `a`, `alpha`, `x`, `roll`, ...: a key of `AXIS_OF_KIND`.
+        name: `a3`, `theta7`, `elbow.x`, `tool.z`: its kind and a number, or a name, a dot and its kind.
+        kind: `a`, `alpha`, `x`, `roll`, ...: a key of `PARAMETER_KINDS`.
         owner: 0 for the base, 1 to n for the joints, n + 1 for the tool.
-        nominal: Nominal value, [m] or [rad].
-        tolerance: 1-sigma prior on true minus nominal, [m] or [rad]; None if there is none.
+        nominal: Nominal value, [m], [rad] or in the kind's unit.
+        tolerance: 1-sigma prior on true minus nominal, in the same unit; None if there is none.
         estimated: Whether a calibration may change it.
     """
 
@@ -111,20 +149,26 @@ class Parameter:
     tolerance: float | None = None
     estimated: bool = True
 
-    @property
-    def axis(self) -> Axis:
-        """The elementary transform that this parameter is the value of."""
-        return AXIS_OF_KIND[self.kind]
+    def __post_init__(self) -> None:
+        """Refuse a kind that is not known, or that the name does not say."""
+        if self.kind not in PARAMETER_KINDS or kind_of(self.name) != self.kind:
+            expected = f"a name that ends in its kind, one of {', '.join(PARAMETER_KINDS)}"
+            raise InputError(f"parameter {shown(self.name)}", f"kind {shown(self.kind)}", expected)
 
     @property
     def unit(self) -> str:
-        """`m` or `rad`."""
-        return "m" if self.axis < Axis.RX else "rad"
+        """Its SI unit: `m`, `rad`, or another of `SCALES`."""
+        return PARAMETER_KINDS[self.kind].unit
+
+    @property
+    def order(self) -> int:
+        """The place of its kind in `PARAMETER_KINDS`: of parameters that only act together the first kind is kept."""
+        return list(PARAMETER_KINDS).index(self.kind)
 
     @property
     def scale(self) -> float:
-        """How far it may be off: the tolerance, else 1 mm or 1 mrad, [m] or [rad]. Not for ranks: see `scale_of`."""
-        return self.tolerance if self.tolerance is not None else 1e-3
+        """How far it may be off: the tolerance, else 1 mm, 1 mrad, or as `SCALES` says. Not for ranks: `scale_of`."""
+        return self.tolerance if self.tolerance is not None else SCALES[self.unit].ordinary
 
 
 BASES: Mapping[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]] = {
@@ -285,9 +329,7 @@ class Robot:
         kinds = CONVENTIONS[convention]
         if figures.shape[1] > 4 and "beta" not in kinds:
             raise InputError("rows", f"shape {figures.shape}", f"(n, 4): the convention {convention} has no beta")
-        angles = figures[
-            :, [i for i, kind in enumerate(DH_COLUMNS[: figures.shape[1]]) if AXIS_OF_KIND[kind] >= Axis.RX]
-        ]
+        angles = figures[:, [unit_of(kind) == "rad" for kind in DH_COLUMNS[: figures.shape[1]]]]
         require(np.abs(angles) <= MOST_ANGLE, "rows", angles, IN_RAD, "are they in deg?")
         builder = RobotBuilder(name, convention)
         builder.add_frame("base", frame_values("base", base), 0, False)
@@ -371,9 +413,9 @@ class Robot:
     def scale_of(self, unit: str) -> float:
         """A change that moves the tool by about as much in either unit: 1 mrad, or what that moves at the arm's reach.
 
-        By it lengths and angles are compared where only geometry counts, such as in a rank; [m] and [rad].
+        By it lengths and angles are compared where only geometry counts, such as in a rank.
         """
-        return 1e-3 * (self.reach if unit == "m" else 1.0)
+        return SCALES.get(unit, SCALES["1"]).ordinary * (self.reach if unit == "m" else 1.0)
 
     @checked
     def index(self, name: str) -> int:
@@ -439,7 +481,7 @@ class RobotBuilder:
 
     def add_constant_frame(self, values: Mapping[str, float], *, backwards: bool = False) -> None:
         """Append a frame that has no parameters, such as a fixed joint of a URDF, or its inverse (`backwards`)."""
-        elements = [Element(AXIS_OF_KIND[kind], values.get(kind, 0.0)) for kind in FRAME_KINDS]
+        elements = [Element(PARAMETER_KINDS[kind].axis, values.get(kind, 0.0)) for kind in FRAME_KINDS]
         self._elements += _inverse(elements) if backwards else elements
 
     @checked
@@ -487,6 +529,21 @@ class RobotBuilder:
         ]
         if backwards:
             self._elements[start:] = _inverse(self._elements[start:])
+
+    @checked
+    def add_effect(self, kind: str, function: str, nominal: float = 0.0) -> None:
+        """Add to the value of the joint added last: a parameter `<joint>.<kind>` times a function of its reading.
+
+        Args:
+            kind: A key of `PARAMETER_KINDS`.
+            function: A key of `BASES`.
+            nominal: Nominal value of the parameter, in the kind's unit.
+        """
+        index = len(self._joints) - 1
+        place, moved = next((i, e) for i, e in enumerate(self._elements) if e.joint == index)
+        self._add_parameter(f"{self._joints[index].name}.{kind}", kind, index + 1, nominal, True)
+        effect = replace(self._elements.pop(), axis=moved.axis, sign=moved.sign, basis=Basis(function, index))
+        self._elements.insert(place + 1, effect)
 
     @checked
     def build(
@@ -554,7 +611,7 @@ class RobotBuilder:
         self, name: str, kind: str, owner: int, nominal: float, estimated: bool, joint: int | None = None
     ) -> None:
         parameter = Parameter(name, kind, owner, float(nominal), estimated=estimated)
-        self._elements.append(Element(parameter.axis, parameter=len(self._parameters), joint=joint))
+        self._elements.append(Element(PARAMETER_KINDS[kind].axis, parameter=len(self._parameters), joint=joint))
         self._parameters.append(parameter)
 
 
@@ -638,9 +695,21 @@ def names_of(parameters: Iterable[Parameter]) -> list[str]:
     return [p.name for p in parameters]
 
 
+def kind_of(name: str) -> str:
+    """The kind of a parameter by its name: `alpha` of `alpha3`, `yaw` of `elbow.yaw`; a kind itself as it is."""
+    last = name.rpartition(".")[2]
+    return last if "." in name else last.rstrip("0123456789")
+
+
+def unit_of(name: str) -> str:
+    """The SI unit of a parameter or kind by its name; `m` of `base`, `tool`, and what is no kind."""
+    kind = kind_of(name)
+    return PARAMETER_KINDS[kind].unit if kind in PARAMETER_KINDS else "m"
+
+
 def tolerance_kind(parameter: Parameter) -> str | None:
     """The key under which a tolerance by kind reaches `parameter`: `a`, `x`, `tool`; None if there is none."""
     frame = re.match(r"(base|tool)\.", parameter.name)
-    if frame is None:
+    if frame is None or parameter.kind not in FRAME_KINDS:
         return parameter.kind
     return frame.group(1) if parameter.unit == "m" else None

@@ -131,11 +131,10 @@ from fg_calib.io import (
     refuse_unknown_keys,
     robot_of,
     shown,
-    unit_of_key,
     validate,
 )
 from fg_calib.measurements import Noise
-from fg_calib.robot import Robot, names_of, tolerance_kind
+from fg_calib.robot import Robot, names_of, tolerance_kind, unit_of
 
 MOST_DRAWN = 1_000_000
 """The largest number of configurations that are drawn."""
@@ -163,10 +162,6 @@ class FileContext:
     folder: Path
     robot: Robot
 
-    def factor(self, unit: str) -> float:
-        """SI units in one of the file's, for `m` and `rad`; 1 for pixels and pure numbers."""
-        return self.units.factor(unit) if unit in ("m", "rad") else 1.0
-
 
 def _convert(function: Callable[[Any, FileContext | None], Any]) -> BeforeValidator:
     """Annotation of a field that a function makes of what is given: by a file in its context, by Python without."""
@@ -187,7 +182,7 @@ def _in_file(function: Callable[[Any, FileContext], Any]) -> BeforeValidator:
 
 def _scale(unit: str) -> AfterValidator:
     """Annotation of a field in [m] or [rad], in a file in the units of that."""
-    return AfterValidator(lambda value, info: value if info.context is None else value * info.context.factor(unit))
+    return AfterValidator(lambda value, info: value if (at := info.context) is None else value * at.units.factor(unit))
 
 
 def _fit(read: Callable[[], Any], place: str) -> Any:
@@ -470,7 +465,7 @@ _NoiseInFile: Any = pydantic.create_model("_NoiseInFile", __base__=Schema, joint
 
 def _noise(given: Any, context: FileContext) -> Noise:
     file = validate(_NoiseInFile, given, "")
-    specified = {kind: (getattr(file, kind), context.factor(unit)) for kind, unit in NOISE_UNITS.items()}
+    specified = {kind: (getattr(file, kind), context.units.factor(unit)) for kind, unit in NOISE_UNITS.items()}
     values = {kind: sigma * factor for kind, (sigma, factor) in specified.items() if sigma is not None}
     return Noise(joint=joint_noise(file.joint, context.units, context.robot, "")).updated(**values)
 
@@ -554,7 +549,7 @@ def board_corners(columns: int, rows: int, square: float) -> Floats:
 
 def _corners(given: Any, context: FileContext) -> Floats:
     file = validate(_CornersInFile, given, "")
-    return board_corners(file.columns, file.rows, file.square * context.factor("m"))
+    return board_corners(file.columns, file.rows, file.square * context.units.factor("m"))
 
 
 # --- instruments ------------------------------------------------------------------------------------------------------
@@ -679,7 +674,7 @@ def _errors(given: Any, context: FileContext) -> Errors:
     given = refuse_unknown_keys(*laws)(given)
     law, values = _the_one_of({key: given.get(key) for key in laws})
     values = _read(dict[str, Number], values, law, context)
-    values = {key: value * context.factor(unit_of_key(key)) for key, value in values.items()}
+    values = {key: value * context.units.factor(unit_of(key)) for key, value in values.items()}
     return Errors(cast("Any", law), values_by_name(context.robot, values, law))
 
 

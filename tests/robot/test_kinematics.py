@@ -185,7 +185,8 @@ def with_coefficients(robot, rng):
             basis = Basis(function, int(rng.integers(3 if function == "given" else robot.n_joints)))
             axis, shared = Axis(int(rng.integers(6))), k == 1 and i % 4 == 3
             if not shared:
-                parameters.append(Parameter(f"c{i}.{k}", "x" if axis < 3 else "roll", 1, rng.uniform(0.1, 0.5)))
+                kind = "x" if axis < 3 else "roll"
+                parameters.append(Parameter(f"c{i}{k}.{kind}", kind, 1, rng.uniform(0.1, 0.5)))
             elements.append(Element(axis, parameter=len(parameters) - 1, sign=-1 if i % 5 == 0 else 1, basis=basis))
     return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
 
