@@ -1,9 +1,6 @@
 """Arms of several conventions, nominal and a little off, and what others compute of them."""
 
-import warnings
-
 import numpy as np
-import pytest
 
 from fg_calib import Robot
 from fg_calib.io import read_urdf
@@ -101,30 +98,6 @@ def matrix(rotation, position):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, position
     return T
-
-
-def pinocchio():
-    """Pinocchio, or the test is skipped without it; what it warns of when it is loaded is its own."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return pytest.importorskip("pinocchio", reason="needs pinocchio: pip install pin")
-
-
-def pin_poses(text, base, tip, names, readings):
-    """base_T_tip by pinocchio for joints of these names, shape (n, 4, 4)."""
-    pin = pinocchio()
-    model = pin.buildModelFromXML(text)
-    data = model.createData()
-    joints = [model.joints[model.getJointId(name)] for name in names]
-    base, tip = model.getFrameId(base), model.getFrameId(tip)
-    found = []
-    for row in readings:
-        q = pin.neutral(model)
-        for joint, value in zip(joints, row, strict=True):
-            q[joint.idx_q : joint.idx_q + joint.nq] = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
-        pin.framesForwardKinematics(model, data, q)
-        found.append((data.oMf[base].inverse() * data.oMf[tip]).homogeneous)
-    return np.array(found)
 
 
 def yourdfpy_poses(path, base, tip, names, readings, origins=None):

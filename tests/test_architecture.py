@@ -44,7 +44,12 @@ FOLDERS = (
 
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if p.name != "__init__.py" and "examples" not in p.parts)
 NAMES = [p.relative_to(PACKAGE).with_suffix("").as_posix() for p in MODULES]
-EVERY_MODULE = pytest.mark.parametrize(("name", "path"), list(zip(NAMES, MODULES, strict=True)), ids=NAMES)
+
+
+def found_in_modules(check):
+    """What a check finds in each module, by name, where it finds any."""
+    found = {name: check(name, path) for name, path in zip(NAMES, MODULES, strict=True)}
+    return {name: what for name, what in found.items() if what}
 
 
 @cache
@@ -100,16 +105,11 @@ def test_every_module_stands_in_a_folder():
     assert {name.partition("/")[0] for name in NAMES} == set(FOLDERS)
 
 
-@EVERY_MODULE
-def test_a_folder_imports_from_lower_ones_only(name, path):
-    upward = {other for other in imported(parse(path)) if floor(other) > floor(name)}
-    assert upward == set()
+def test_a_folder_imports_from_lower_ones_only():
+    def upward(name, path):
+        return {other for other in imported(parse(path)) if floor(other) > floor(name)}
 
-
-@EVERY_MODULE
-def test_estimation_reads_no_files(name, path):
-    if name.partition("/")[0] in ("graph", "statistics", "diagnostics", "observability", "baseline"):
-        assert not any(other.startswith("io/") for other in imported(parse(path)))
+    assert found_in_modules(upward) == {}
 
 
 def test_no_modules_import_each_other_in_a_circle():
@@ -135,50 +135,57 @@ def test_the_baseline_shares_nothing_with_the_graph_but_residuals():
     assert of_folders == {"inputs", "robot", "measurements", "parallel"}
 
 
-@EVERY_MODULE
-def test_a_function_is_seen_whole_on_a_screen(name, path):
-    functions = [node for node in ast.walk(parse(path)) if isinstance(node, ast.FunctionDef)]
-    assert {f.name for f in functions if f.end_lineno - f.lineno + 1 > 60} == set()
+@cache
+def libraries(path):
+    """First words of all that a module imports."""
+    of_import = {a.name for node in nodes(path) if isinstance(node, ast.Import) for a in node.names}
+    of_from = {node.module or "" for node in nodes(path) if isinstance(node, ast.ImportFrom)}
+    return {name.partition(".")[0] for name in of_import | of_from}
 
 
-@EVERY_MODULE
-def test_only_the_command_line_prints(name, path):
-    calls = [node for node in nodes(path) if isinstance(node, ast.Call)]
-    printing = [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"]
-    assert name.startswith("cli/") or printing == []
+@cache
+def calls(path):
+    """Every call of a module: `[("np.array", 1)]`, the function and how many arguments stand without a name."""
+    return [(ast.unparse(node.func), len(node.args)) for node in nodes(path) if isinstance(node, ast.Call)]
 
 
-@EVERY_MODULE
-def test_no_input_can_run_code_or_reach_a_network(name, path):
+def test_a_function_is_seen_whole_on_a_screen():
+    def long(_, path):
+        functions = [node for node in nodes(path) if isinstance(node, ast.FunctionDef)]
+        return {f.name for f in functions if f.end_lineno - f.lineno + 1 > 60}
+
+    assert found_in_modules(long) == {}
+
+
+def test_only_the_command_line_prints():
+    printing = found_in_modules(lambda _, path: any(function == "print" for function, _ in calls(path)))
+    assert {name for name in printing if not name.startswith("cli/")} == set()
+
+
+def test_no_input_can_run_code_or_reach_a_network():
     """What `docs/security.md` says: no pickles, and YAML goes through one safe loader."""
-    calls = {ast.unparse(node.func) for node in nodes(path) if isinstance(node, ast.Call)}
-    assert calls & {"eval", "exec", "compile", "__import__", "os.system", "yaml.unsafe_load", "yaml.full_load"} == set()
-    assert "yaml.load" not in calls or name == "io/yaml"
-    used = {alias.name.partition(".")[0] for node in nodes(path) if isinstance(node, ast.Import)
-            for alias in node.names}  # fmt: skip
-    used |= {(node.module or "").partition(".")[0] for node in nodes(path) if isinstance(node, ast.ImportFrom)}
+    dangerous = {"eval", "exec", "compile", "__import__", "os.system", "yaml.unsafe_load", "yaml.full_load"}
+    assert found_in_modules(lambda _, path: dangerous & {function for function, _ in calls(path)}) == {}
+    assert set(found_in_modules(lambda _, path: any(f == "yaml.load" for f, _ in calls(path)))) == {"io/yaml"}
     forbidden = {"pickle", "marshal", "shelve", "subprocess", "urllib", "http", "requests", "ctypes", "multiprocessing"}
-    allowed = {"parallel": {"multiprocessing"}}
-    assert used & forbidden == allowed.get(name, set())
+    assert found_in_modules(lambda _, path: forbidden & libraries(path)) == {"parallel": {"multiprocessing"}}
 
 
-@EVERY_MODULE
-def test_no_module_uses_global_random_state(name, path):
+def test_no_module_uses_global_random_state():
     """`np.random.default_rng` with a seed, and the type `Generator`, are all of numpy.random there is."""
-    tree = parse(path)
-    used = {
-        node.attr
-        for node in nodes(path)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Attribute) and node.value.attr == "random"
-    }
-    assert used <= {"default_rng", "Generator"}
-    assert not any(isinstance(n, ast.Import) and any(a.name == "random" for a in n.names) for n in nodes(path))
-    for node in nodes(path):
-        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("default_rng"):
-            assert node.args, "a generator without a seed"
-    at_import = [n for statement in tree.body if not isinstance(statement, ast.FunctionDef | ast.ClassDef)
-                 for n in ast.walk(statement) if isinstance(n, ast.Call)]  # fmt: skip
-    assert not any("random" in ast.unparse(call.func) for call in at_import)
+    numpys = re.compile(r"random\.(?!default_rng|Generator)\w+$")
+    attributes = lambda path: [ast.unparse(n) for n in nodes(path) if isinstance(n, ast.Attribute)]  # noqa: E731
+    assert found_in_modules(lambda _, path: [a for a in attributes(path) if numpys.search(a)]) == {}
+    assert found_in_modules(lambda _, path: "random" in libraries(path)) == {}
+    seedless = found_in_modules(lambda _, path: any(f.endswith("default_rng") and not n for f, n in calls(path)))
+    assert seedless == {}
+
+    def drawn_at_import(_, path):
+        outside = [s for s in parse(path).body if not isinstance(s, ast.FunctionDef | ast.ClassDef)]
+        called = [ast.unparse(n.func) for s in outside for n in ast.walk(s) if isinstance(n, ast.Call)]
+        return [function for function in called if "random" in function]
+
+    assert found_in_modules(drawn_at_import) == {}
 
 
 @pytest.mark.parametrize("name", fg_calib.__all__)
@@ -219,13 +226,8 @@ def test_all_that_is_imported_is_installed_with_the_package():
     }  # as imported; pydantic and jinja2 bring the latter
     used = {"lazy_loader": {"the folders' fronts"}}
     for name, path in zip(NAMES, MODULES, strict=True):
-        for node in nodes(path):
-            if isinstance(node, ast.Import):
-                modules = [alias.name for alias in node.names]
-            else:
-                modules = [node.module] if isinstance(node, ast.ImportFrom) else []
-            for module in modules:
-                used.setdefault(module.partition(".")[0], set()).add(name)
+        for library in libraries(path):
+            used.setdefault(library, set()).add(name)
     extras = {"camera": ("opencv-python-headless", "cv2", "importers/board"),
               "ros": ("rosbags", "rosbags", "importers/bag"),
               "distributed": ("distributed", "distributed", "parallel")}  # fmt: skip

@@ -10,8 +10,6 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from fg_calib import InputError, Measurements, Robot, calibrate, read_job, read_robot
 from fg_calib.io import read_measurements, read_result
@@ -234,23 +232,3 @@ def test_results(tmp_path, document, given, message):
         given(damaged)
         given = json.dumps(damaged)
     refuses(tmp_path, "result.json", given, read_result, message)
-
-
-WRONG = st.none() | st.booleans() | st.integers(-2, 2) | st.floats() | st.text(max_size=3) | st.just([]) | st.just({})
-
-
-@settings(max_examples=150, derandomize=True, database=None, deadline=None, suppress_health_check=list(HealthCheck))
-@given(data=st.data())
-def test_any_value_of_a_result_is_read_or_refused_in_one_line(tmp_path, document, data):
-    damaged = part = copy.deepcopy(document)
-    key = data.draw(st.sampled_from(sorted(damaged)))
-    while isinstance(part[key], dict | list) and part[key] and data.draw(st.booleans()):
-        part = part[key]
-        key = data.draw(st.sampled_from(sorted(part) if isinstance(part, dict) else range(len(part))))
-    part[key] = data.draw(WRONG)
-    (tmp_path / "result.json").write_text(json.dumps(damaged))
-    try:
-        read_result(tmp_path)
-    except InputError as error:
-        message = str(error)
-        assert message.isprintable()
