@@ -31,5 +31,5 @@ def check(
     found = calibration.check(table, limit=limit, limit_angle=limit_angle, pairs=pairs, like=like)
     joints = [joint.unit for joint in calibration.robot.joints]
     show_result(as_json, lambda: check_document(found), lambda: build_check_report(found, joints))
-    if not found.passed:
+    if found.verdict != "pass":
         raise typer.Exit(3)

@@ -108,11 +108,6 @@ class Design(FrozenArrays):
         """Number of poses."""
         return len(self.readings)
 
-    @property
-    def n_candidates(self) -> int:
-        """Number of candidate poses."""
-        return len(self.pool.readings)
-
     def __repr__(self) -> str:
         p = self.expected.position
         error = "unknown" if p is None else f"{p * 1e3:.3g} mm"

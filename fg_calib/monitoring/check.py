@@ -94,7 +94,7 @@ class Check:
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.
         detectable: Of each joint's zero the slip that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
             None where they show none at all.
-        advice: What to measure to distinguish what these rows do not; None where there is nothing to.
+        advice: What to measure to distinguish the two likeliest changes; None where there is nothing to.
     """
 
     verdict: Verdict
@@ -112,11 +112,6 @@ class Check:
     deploy: bool
     detectable: dict[str, float | None]
     advice: hypotheses.Advice | None = None
-
-    @property
-    def passed(self) -> bool:
-        """Whether the calibration is still good."""
-        return self.verdict == "pass"
 
 
 def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
@@ -179,7 +174,6 @@ def _judge(
         verdict, reasons = "not_evaluated", [f"a limit of {unjudged[0]}, and fewer than {LEAST} rows to judge it by"]
     explained = bool(likely) and likely[0].explains
     alone = len(likely) == 1 and likely[0].hypothesis.kind != "row"
-    wrong = hypotheses.WRONG / max(len(found), 1)
     made = Check(
         verdict=verdict,
         reasons=tuple(reasons),
@@ -195,7 +189,7 @@ def _judge(
         gross_rows=tuple(gross),
         deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
         detectable=_detectable(calibrated, found),
-        advice=hypotheses.advise_configurations(at, likely, wrong),
+        advice=hypotheses.advise_configurations(at, likely),
     )
     return made if explained or verdict != "fail" else _unless_misread(made, at)
 

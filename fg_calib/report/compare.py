@@ -255,8 +255,6 @@ KINDS = {
 
 SHOWN_CHANGES = "Joint offset changes that these rows show in 9 of 10 cases"
 
-NO_ADVICE = "no configurations are advised: none like these rows distinguishes these changes; another instrument may"
-
 
 def named(parameters: Sequence[str]) -> str:
     """A change by its name: for several parameters together `theta2 + theta3`."""
@@ -318,8 +316,7 @@ def _conclusions(found: Check) -> Iterator[str]:
         yield f"{likely[0].parameters[0]} is equivalent to {', '.join(likely[0].same)} for every position of the tool"
     if len(likely) > 1:
         yield f"not distinguishable by these rows: {', '.join(named(e.parameters) for e in likely)}"
-        yield "do not deploy any of these changes yet"
-        yield from [NO_ADVICE] * (found.advice is None)
+        yield "do not deploy any of these changes yet: measure more configurations"
     elif likely and found.verdict == "fail" and found.deploy:
         yield f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check again"
     elif likely and found.verdict == "fail":
@@ -330,11 +327,10 @@ def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
     advice = found.advice
     if advice is None:
         return []
-    rows = [(*q, apart, sigma) for q, apart, sigma in zip(advice.readings, advice.apart, advice.sigma, strict=True)]
+    rows = [(*q, apart) for q, apart in zip(advice.readings, advice.apart, strict=True)]
     joints = [f"q{i} [{tables.unit_shown(unit)}]|{unit}:.2f" for i, unit in enumerate(joint_units, start=1)]
-    said = "measured like the rest, in the same table, these distinguish the changes"
-    if not advice.enough:
-        said = "not even these distinguish all of them: measure more, spread over the whole workspace"
-    a, b = map(named, advice.between)
-    least = f"{said} ({advice.needed:.1f} sigma are needed; least apart are {a} and {b})"
-    return [table_of((*joints, "apart [mm]|m:.3f", "together [sigma]|.1f"), rows), least]
+    between = " and ".join(map(named, advice.between))
+    said = (
+        f"Here {between} differ most, by so much in the tool's position; measure them like the rest, in the same table."
+    )
+    return [table_of((*joints, "apart [mm]|m:.3f"), rows), said]
