@@ -250,11 +250,9 @@ def random_problem(
         seed: Of the random configurations.
     """
     n = n_configurations or max(300, 10 * len(robot.parameters))
-    somewhere = Measurements.from_arrays(
-        random_readings(robot, n, np.random.default_rng(seed)),
-        sigma_position=robot.scale_of("m"),
-        sigma_orientation=robot.scale_of("rad"),
-    )
+    sigmas = {"sigma_position": np.full((n, 3), robot.scale_of("m"))}
+    sigmas |= {"sigma_orientation": np.full((n, 3), robot.scale_of("rad"))}
+    somewhere = Measurements.at(random_readings(robot, n, np.random.default_rng(seed)), **sigmas)
     return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 

@@ -12,7 +12,7 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import BeforeValidator, PlainSerializer
 from pydantic_core import CoreSchema, core_schema
 
-from fg_calib.inputs.arguments import MOST_SIZE, ORDINARY
+from fg_calib.inputs.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
 from fg_calib.inputs.errors import InputError, shown
 
 
@@ -194,6 +194,41 @@ def as_rotations(name: str, given: object, n: int) -> Floats:
         U, _, Vt = np.linalg.svd(R[rounded])
         R[rounded] = U @ Vt  # the nearest rotation
     return R
+
+
+def as_indices(name: str, given: Any, n: int, most: int | None) -> Integers:
+    """Whole numbers from 0, a row each of n, up to `most` where there is such."""
+    values = as_array(name, given, "iu", f"whole numbers, a row for each of {n}").copy()
+    if values.shape[:1] != (n,):
+        raise InputError(name, f"shape {values.shape}", f"a row for each of {n}")
+    good = (values >= 0) & ((values <= most) if most is not None else True)
+    require(good, name, values, "0 and above" if most is None else f"0 to {most}")
+    return values
+
+
+def as_sigmas(name: str, given: Any, shape: tuple[int, ...]) -> Floats:
+    """Sigmas that broadcast to (n,) or (n, k), from such, or one a row."""
+    sigma = as_figures(name, given, "finite numbers")
+    check_sizes(name, sigma)
+    require(sigma > 0.0, name, sigma, "a number above 0")
+    require(sigma >= LEAST_SIZE, name, sigma, ORDINARY)
+    if len(shape) == 2 and sigma.shape == shape[:1] != (1,):
+        if (n := shape[0]) == shape[1]:
+            raise InputError(name, f"shape ({n},) of {n} rows", f"({n}, 1) for one a row, (1, {n}) for one an axis")
+        sigma = sigma[:, None]
+    try:
+        np.broadcast_to(sigma, shape)
+    except ValueError:
+        raise InputError(name, f"shape {np.shape(given)}", f"one that broadcasts to {shape}, or one a row") from None
+    return sigma
+
+
+def as_mask(name: str, given: object, n: int) -> Booleans:
+    """A mask of n rows."""
+    mask = as_array(name, given, "b", f"True or False for each of {n} rows").astype(np.bool_)
+    if mask.shape != (n,):
+        raise InputError(name, f"shape {mask.shape}", f"({n},), one a row")
+    return mask
 
 
 def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any]:

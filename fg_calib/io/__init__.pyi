@@ -1,3 +1,4 @@
+from .arrays import read_arrays
 from .atomic import (
     exists,
     fill_folder,
@@ -134,6 +135,7 @@ __all__ = [
     "noting_reads",
     "pairing_of",
     "quantity",
+    "read_arrays",
     "read_bytes",
     "read_calibrated_robot",
     "read_camera",

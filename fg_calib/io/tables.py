@@ -45,6 +45,7 @@ from fg_calib.inputs import (
 from fg_calib.io.atomic import decoded, read_bytes, require_own, write_text
 from fg_calib.io.yaml import Units, number_hint, shown
 from fg_calib.measurements import (
+    ANGLE_SLACK,
     GENERIC_COLUMNS,
     INSTRUMENTS,
     Groups,
@@ -52,12 +53,9 @@ from fg_calib.measurements import (
     Measurements,
     Noise,
     Pairs,
-    checked_joint_sigma,
-    covariances,
     limit_hint,
     no_pairs,
     outside_limits,
-    pairs_from_arrays,
 )
 from fg_calib.measurements import Column as ColumnSet
 from fg_calib.parallel import require_polars
@@ -136,7 +134,7 @@ class Table:
     Attributes:
         name: File name, or what a frame is called, for messages.
         columns: Names of all its columns, as they are known.
-        frame: The columns, without blank rows. Those of a CSV are texts.
+        frame: The columns, a frame of polars without blank rows. Those of a CSV are texts.
         separator: The character between the cells of a CSV; empty of others.
         lines: The line of each row of a CSV; empty of others.
         renamed: By column, its conversion, where the table has its own name for it.
@@ -144,7 +142,7 @@ class Table:
 
     name: str
     columns: tuple[str, ...]
-    frame: pl.DataFrame
+    frame: Any
     separator: str = ""
     lines: Integers | Sequence[int] = ()
     renamed: Mapping[str, Column] = field(default_factory=dict)
@@ -187,7 +185,7 @@ class Table:
     @property
     def n_rows(self) -> int:
         """Number of rows."""
-        return self.frame.height
+        return int(self.frame.height)
 
     def present(self, *columns: str) -> tuple[str, ...]:
         """Those of `columns` that the table has."""
@@ -250,7 +248,7 @@ class Table:
         """
         import polars as pl
 
-        cells = self.frame[column]
+        cells: pl.Series = self.frame[column]
         if cells.dtype.is_nested() or cells.dtype == pl.Object:
             raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "text")
         if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
@@ -261,11 +259,11 @@ class Table:
             self.require(texts.is_not_null().to_numpy(), column, expected)
         return texts
 
-    def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
-        """The column as texts, without a word such as NA that stands for nothing; null where a cell may be empty."""
+    def names(self, column: str, expected: str, *, optional: bool = False) -> list[Any]:
+        """The column as texts, without a word such as NA that stands for nothing; None where a cell may be empty."""
         names = self.texts(column, "" if optional else expected)
         self.require(~names.str.to_lowercase().is_in(NOTHING).fill_null(False).to_numpy(), column, expected)
-        return names
+        return names.to_list()
 
     def test_rows(self) -> Booleans:
         """True where `split` says test, shape (n_rows,)."""
@@ -467,6 +465,9 @@ _SIGMAS: Mapping[str, tuple[str, tuple[str, ...], int]] = {
 }
 """By field of `Measurements`: the key of `noise`, columns of which one may hold it, and its axes."""
 
+ROUNDED = 1e-9
+"""Share of a covariance that may be rounding."""
+
 
 @checked
 def read_measurements(
@@ -497,27 +498,46 @@ def read_measurements(
     units, noise = units or Units(), noise or Noise()
     _check_noise(noise)
     table = read_table(path, robot, columns or {})
-    instruments = tuple(INSTRUMENTS.values()) if model is None else (INSTRUMENTS[model],)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
-    labels = {
-        name: _labels(table, name, optional=any(name in one.optional_labels for one in instruments))
-        for name in dict.fromkeys(name for one in instruments for name in one.labels)
-        if name in table.columns
-    }
+    between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
+    return measurements_of(table, readings, between, units, noise, model)
+
+
+def measurements_of(
+    table: Table, readings: Floats, pairs: Table | None, units: Units, noise: Noise, model: Model | None = None
+) -> Measurements:
+    """Measurements of the columns of a table.
+
+    Args:
+        table: The table.
+        readings: Joint readings of its rows, shape (n_rows, n_joints), [rad] (prismatic: [m]).
+        pairs: Table of pairs; None if none were measured directly.
+        units: Of both tables.
+        noise: Sigmas where they specify none.
+        model: The model whose columns are read; those of all models if None.
+
+    Raises:
+        InputError: A column is missing, or a cell cannot be used.
+    """
+    instruments = tuple(INSTRUMENTS.values()) if model is None else (INSTRUMENTS[model],)
+    optional = {name for one in instruments for name in one.optional_labels}
+    columns = dict.fromkeys(name for one in instruments for name in one.labels if name in table.columns)
+    labels = {name: _labels(table, name, optional=name in optional) for name in columns}
     measured = _measured(table, [c.names[0] for i in instruments for c in i.columns], units, noise)
     repeated = bool(set(labels) - {"station"}) or "image" in measured
-    ids, test, groups = read_ids(table, repeated=repeated), table.test_rows(), _groups(table)
-    names, between, of_groups = ids.to_numpy().astype(np.str_), None, no_pairs(table.name)
+    ids, test, between = read_ids(table, repeated=repeated and pairs is None), table.test_rows(), None
+    groups, of_groups = Labels((), np.full(table.n_rows, -1)), no_pairs(table.name)
+    if "group" in table.columns:
+        groups = _labels(table, "group", optional=True)
     if pairs is not None:
-        table.require(ids.is_first_distinct().to_numpy(), "id", "different ids where pairs name them")
-        between, of_groups = _read_pairs(pairs, (names, test, groups), units, noise)
+        between, of_groups = _read_pairs(pairs, (ids, test, groups), units, noise)
     if not groups.names:
         measured["sigma_point"] = None
     return Measurements(
         readings=readings,
-        ids=names,
+        ids=ids,
         test=test,
-        sigma_joint=checked_joint_sigma(noise.joint, robot.n_joints),
+        sigma_joint=_joint_sigma(noise.joint, readings.shape[1]),
         pairs=between,
         source=table.name,
         groups=Groups(groups.names, groups.index, of_groups) if groups.names else None,
@@ -525,6 +545,13 @@ def read_measurements(
         labels=labels,
         **measured,
     )
+
+
+def _joint_sigma(given: float | tuple[float, ...], n_joints: int) -> Floats:
+    """Sigma of the readings of each joint, shape (n_joints,), from one for all or one a joint."""
+    if isinstance(given, tuple) and len(given) not in {1, n_joints}:
+        raise InputError("noise: joint", f"{len(given)} sigmas", f"one value, or {n_joints}")
+    return np.broadcast_to(np.array(given, dtype=np.float64), n_joints).copy()
 
 
 def _check_noise(noise: Noise) -> None:
@@ -586,18 +613,17 @@ def read_readings(table: Table, columns: Sequence[str], robot: Robot, units: Uni
     return readings
 
 
-def read_ids(table: Table, *, repeated: bool) -> pl.Series:
+def read_ids(table: Table, *, repeated: bool) -> NDArray[np.str_]:
     """The configurations' names, different ones unless `repeated`: their ids, or else their 0-based row numbers."""
-    import polars as pl
-
     if "id" not in table.columns:
-        return pl.int_range(table.n_rows, eager=True).cast(pl.String)
-    ids = table.names("id", "an id")
-    commented = ids.str.starts_with("#").to_numpy()
+        return np.arange(table.n_rows).astype(np.str_)
+    names, first = table.names("id", "an id"), dict[str, int]()
+    commented = np.array([name.startswith("#") for name in names])
     table.require(~commented | commented.all(), "id", "ids with # all or none", "# does not comment a row out")
     if not repeated:
-        table.require(ids.is_first_distinct().to_numpy(), "id", "different ids")
-    return ids
+        different = np.array([first.setdefault(name, row) == row for row, name in enumerate(names)])
+        table.require(different, "id", "different ids")
+    return np.array(names, dtype=np.str_)
 
 
 def read_joint_table(
@@ -615,7 +641,7 @@ def read_joint_table(
     """
     table = read_table(path, robot)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units or Units())
-    return tuple(read_ids(table, repeated=True).to_list()), readings
+    return tuple(read_ids(table, repeated=True).tolist()), readings
 
 
 @dataclass(frozen=True)
@@ -658,7 +684,7 @@ def read_targets(path: Path | str | Any, robot: Robot, units: Units | None = Non
         found = "neither x y z nor joint columns" if rotation is None else "orientations without x y z"
         raise InputError(table.name, found, "x y z, or joint values alone", f"it has {', '.join(table.columns)}")
     readings = read_readings(table, find_joint_columns(table, robot), robot, units) if named else None
-    return Targets(tuple(read_ids(table, repeated=False).to_list()), position, rotation, readings)
+    return Targets(tuple(read_ids(table, repeated=False).tolist()), position, rotation, readings)
 
 
 # --- columns of configurations ----------------------------------------------------------------------------------------
@@ -744,8 +770,10 @@ def _covariances(table: Table, values: Floats, units: Units) -> Floats:
     C, size = np.zeros((table.n_rows, 6, 6)), np.repeat([units.factor("rad"), units.factor("m")], 3)
     i, j = np.triu_indices(6)
     C[:, i, j] = C[:, j, i] = values
-    good, C = covariances(C * np.outer(size, size))
-    table.require(good, "cov_11", "a covariance: eigenvalues above 0")
+    C *= np.outer(size, size)
+    size = np.sqrt(np.maximum(np.einsum("nii->ni", C), LEAST_SIZE**2))
+    scaled = C / (size[:, :, None] * size[:, None, :])
+    table.require(np.linalg.eigvalsh(scaled)[:, 0] > ROUNDED, "cov_11", "a covariance: eigenvalues above 0")
     return C
 
 
@@ -753,57 +781,77 @@ def _labels(table: Table, column: str, *, optional: bool) -> Labels:
     """Names in the order met, and which of them each row has, -1 for none."""
     what = "point" if column == "group" else column
     expected = f"the name of a{'n' * (what[0] in 'aeiou')} {what}"
-    cells: list[str | None] = table.names(
-        column, expected + ", or an empty cell" * optional, optional=optional
-    ).to_list()
+    cells = table.names(column, expected + ", or an empty cell" * optional, optional=optional)
     names = tuple(dict.fromkeys(cell for cell in cells if cell is not None))
     place = {name: i for i, name in enumerate(names)}
     return Labels(names, np.array([-1 if cell is None else place[cell] for cell in cells], dtype=np.int64))
-
-
-def _groups(table: Table) -> Labels:
-    """The contact point of each row."""
-    if "group" not in table.columns:
-        return Labels((), np.full(table.n_rows, -1, dtype=np.int64))
-    return _labels(table, "group", optional=True)
 
 
 # --- pairs ------------------------------------------------------------------------------------------------------------
 
 
 def _read_pairs(
-    path: Path | str | Any, of: tuple[NDArray[np.str_], Booleans, Labels], units: Units, noise: Noise
+    table: Table, of: tuple[NDArray[np.str_], Booleans, Labels], units: Units, noise: Noise
 ) -> tuple[Pairs, Pairs]:
     """The pairs of configurations and those of contact points that a table lists.
 
+    Those of a test row, or of a contact point of test rows alone, are test pairs.
+
     Args:
-        path: The table.
+        table: The table of pairs.
         of: Names of the configurations, which are test rows, and the contact points.
         units: Of the table.
         noise: Sigmas where the table specifies none.
 
     Raises:
-        InputError: The file is missing, is no table, lacks a column or holds a cell that cannot be used.
+        InputError: It lacks a column or holds a cell that cannot be used.
     """
-    known = names_of(OF_PAIRS.values())
-    table = Table.read(path, "frame of pairs", known)
-    given: dict[str, Any] = {key: table.names(key, "a configuration").to_list() for key in table.present("a", "b")}
-    given["test"] = table.test_rows()
-    sigmas = {}
-    for key in ("distance", "angle"):
+    lacking = [key for key in ("a", "b") if key not in table.columns]
+    if lacking or not table.present("distance", "angle"):
+        found = f"no {lacking[0]}" if lacking else "neither distance nor angle"
+        raise InputError(table.name, found, "a and b, the two configurations of a pair, and distance or angle")
+    (ids, rows, groups), fields = of, dict[str, Any]()
+    a, b, of_groups = _ends(table, ids, groups.names)
+    in_rad = f"0 to pi, in rad; angles of the table are in {units.angle}"
+    for key, most, expected in (("distance", np.inf, "a number not below 0"), ("angle", np.pi, in_rad)):
         factor, default = units.factor(OF_PAIRS[key].si), noise.get(key) or np.nan
+        values, sigma = np.full((2, table.n_rows), [[np.nan], [default]])
         if key in table.columns:
-            given[key] = table.numbers([key], optional=True)[:, 0] * factor
-        sigma = np.full(table.n_rows, default)
+            values = table.numbers([key], optional=True)[:, 0] * factor
         if f"sigma_{key}" in table.columns:
             sigma = table.positive([f"sigma_{key}"], default, factor)[:, 0]
-        sigmas[f"sigma_{key}"] = once(sigma)
-    try:
-        pairs, of_groups = pairs_from_arrays(given, *of)
-    except InputError as error:
-        if place := re.fullmatch(r"pairs: (\w+): row (\d+)", error.place):
-            hint = error.hint or f"angles of the table are in {units.angle}" * ("in rad" in error.expected)
-            table.require(np.arange(table.n_rows) != int(place[2]), place[1], error.expected, hint)
-        raise InputError(table.name, error.found, error.expected, error.hint) from None
-    pairs = replace(pairs, **sigmas, test=once(pairs.test), source=table.name)
+        table.require(~((values < 0.0) | (values > most + ANGLE_SLACK)), key, expected)
+        fields |= {key: np.minimum(values, most), f"sigma_{key}": once(sigma)}
+    table.require(~of_groups | np.isnan(fields["angle"]), "angle", "none: two points have a distance, but no angle")
+    table.require(~of_groups | (fields["distance"] > 0.0), "distance", "a number above 0 between two groups")
+    test = table.test_rows()
+    for flags, chosen in ((rows, ~of_groups), (groups.only_of(rows), of_groups)):
+        test[chosen] |= flags[a[chosen]] | flags[b[chosen]]
+    pairs = Pairs(a, b, test=once(test), source=table.name, **fields)
     return (pairs, no_pairs(table.name)) if not of_groups.any() else (pairs.select(~of_groups), pairs.select(of_groups))
+
+
+def _ends(table: Table, ids: NDArray[np.str_], groups: Sequence[str]) -> tuple[Integers, Integers, Booleans]:
+    """Rows of configurations or indices of groups that `a` and `b` name, and whether they are groups.
+
+    Whole numbers in arrays are row numbers where no id and no group is a number.
+    """
+    n, names = len(ids), ids.tolist()
+    by_row = bool(np.array_equal(ids, np.arange(n).astype(np.str_)))  # no ids were given
+    place = {name: i for i, name in enumerate([*names, *groups])}
+    both = set(groups).intersection(names)
+    place |= dict.fromkeys(both, -1)
+    expected = "an id or a group" if groups else "an id (the row number where no ids were given)"
+    numbers = not any(word.isdigit() for word in (groups if by_row else place))
+    found = []
+    for key in ("a", "b"):
+        if numbers and getattr(table.frame[key].dtype, "kind", "") in ("i", "u"):
+            end = np.where(table.frame[key] < n, table.frame[key], -1).astype(np.int64)
+        else:
+            end = np.array([place.get(name, -1) for name in table.names(key, "a configuration")], dtype=np.int64)
+        table.require(end >= 0, key, expected, "names of both stand for neither" * bool(both))
+        found.append(end)
+    a, b = found
+    table.require((a < n) == (b < n), "b", "two configurations or two groups")
+    table.require(a != b, "b", "another than a")
+    return np.where(a < n, a, a - n), np.where(b < n, b, b - n), a >= n

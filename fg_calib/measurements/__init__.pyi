@@ -8,13 +8,10 @@ from .dataset import (
     Noise,
     Pairs,
     check_readings,
-    checked_joint_sigma,
-    covariances,
     form_pairs,
     limit_hint,
     no_pairs,
     outside_limits,
-    pairs_from_arrays,
 )
 from .kind import Coincidence, Frames, Kind, Length, Rows, check_rows, directions, is_ours, stack
 from .kinds import GENERIC_COLUMNS, INSTRUMENTS, LANDMARKS
@@ -69,8 +66,6 @@ __all__ = [
     "check_copies",
     "check_readings",
     "check_rows",
-    "checked_joint_sigma",
-    "covariances",
     "directions",
     "find_copies",
     "form_pairs",
@@ -81,7 +76,6 @@ __all__ = [
     "no_pairs",
     "outside_limits",
     "pack",
-    "pairs_from_arrays",
     "predict_measurements",
     "squares_along",
     "stack",

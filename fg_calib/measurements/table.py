@@ -23,20 +23,15 @@ from fg_calib.inputs import (
     Pairing,
     as_figures,
     as_floats,
+    as_indices,
+    as_mask,
+    as_sigmas,
     check_fields,
     check_number,
     listed,
     shown,
 )
-from fg_calib.measurements.dataset import (
-    Labels,
-    Measurements,
-    Pairs,
-    checked_indices,
-    checked_mask,
-    checked_sigma,
-    only_of,
-)
+from fg_calib.measurements.dataset import Labels, Measurements, Pairs
 from fg_calib.measurements.kind import Kind, check_kind
 from fg_calib.measurements.landmarks import Landmark, LandmarkKind, Landmarks
 
@@ -171,12 +166,12 @@ class CustomMeasurements(Brief):
         if names and (len(set(names)) != len(starts) or not all(isinstance(name, str) and name for name in names)):
             raise InputError("own: names", f"found {shown(self.names)}", f"{len(starts)} different words")
         found = {"data": data, "unknowns": starts, "names": names}
-        found["sigma"] = checked_sigma("own: sigma", self.sigma, (len(data), kind.residual_dim))
+        found["sigma"] = as_sigmas("own: sigma", self.sigma, (len(data), kind.residual_dim))
         if self.test is not None:
-            found["test"] = checked_mask("own: test", self.test, len(data))
+            found["test"] = as_mask("own: test", self.test, len(data))
         for name, most in (("ends", None), ("which", len(starts) - 1)):
             if getattr(self, name) is not None:
-                found[name] = checked_indices(f"own: {name}", getattr(self, name), len(data), most)
+                found[name] = as_indices(f"own: {name}", getattr(self, name), len(data), most)
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
@@ -303,8 +298,7 @@ class Table(Brief):
         if m.pairs is not None:
             changes["pairs"] = split(m.pairs, configurations)
         if (groups := m.groups) is not None:
-            only = only_of(configurations, groups.index, len(groups.names))
-            changes["groups"] = replace(groups, pairs=split(groups.pairs, only))
+            changes["groups"] = replace(groups, pairs=split(groups.pairs, groups.only_of(configurations)))
         return replace(self, measurements=replace(m, **changes), own=own)
 
     @property

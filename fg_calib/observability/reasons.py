@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -165,7 +164,7 @@ def at_random_configurations(problem: Problem, parameters: Floats) -> Problem | 
     robot = problem.robot.with_values(parameters[problem.variables.robot_span])
     places, before = places_of(problem, parameters), () if problem.knowledge is None else problem.knowledge.views
     q = np.zeros((1, problem.robot.n_joints))
-    anything = Measurements.from_arrays(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
+    anything = Measurements.at(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
     earlier = [
         Table(anything, m, frame=frame) for m, frame in before if INSTRUMENTS[m].is_pose or INSTRUMENTS[m].uses_pairs
     ]
@@ -209,11 +208,18 @@ def at_configurations(robot: Robot, table: Table, q: Floats, places: _Places, so
     poses, (column, names) = forward(build_chain(robot), robot.trig(q)), _named(table)
     real = [name for name in names if name is not None]
     index = np.array([real.index(name) if name is not None else -1 for name in names])[np.arange(len(q)) % len(names)]
-    length, called = np.full(len(q), robot.scale_of("m")), table.measurements.source
-    scales: dict[str, Any] = {"sigma_position": robot.scale_of("m"), "sigma_orientation": robot.scale_of("rad")}
-    m = Measurements.from_arrays(q, position=poses.position, rotation=poses.rotation, source=called, **scales)
-    sigmas = dict.fromkeys(INSTRUMENTS[model].generic_columns, length)
-    m = replace(m, labels={column: Labels(tuple(real), index)} if real else {}, sigma_length=length, sigmas=sigmas)
+    length, angle = (np.full(len(q), robot.scale_of(unit)) for unit in ("m", "rad"))
+    m = Measurements.at(
+        q,
+        position=poses.position,
+        rotation=poses.rotation,
+        sigma_position=np.tile(length[:, None], 3),
+        sigma_orientation=np.tile(angle[:, None], 3),
+        sigma_length=length,
+        sigmas=dict.fromkeys(INSTRUMENTS[model].generic_columns, length),
+        labels={column: Labels(tuple(real), index)} if real else {},
+        source=table.measurements.source,
+    )
     m = INSTRUMENTS[model].predict(m, poses, lambda kind, names: np.array([places[kind.letter, one] for one in names]))
     frame = "unknown" if model != table.model and INSTRUMENTS[model].is_pose else table.frame
     known = {name: k for name, k in table.known.items() if name in real}

@@ -123,7 +123,7 @@ GROUPS = "q1,q2,id,group\n0,0,a,g\n1,0,b,g\n1,1,c,h\n0,1,d,\n"
 GROUP_PAIRS = [
     ("a,b,distance\ng,a,1\n", "pairs.csv:2: b: found 'a', expected two configurations or two groups"),
     ("a,b,distance\ng,h,0\n", "pairs.csv:2: distance: found '0', expected a number above 0 between two groups"),
-    ("a,b,angle\ng,h,1\n", "pairs.csv:2: angle: found '1', expected nan: two points have a distance, but no angle"),
+    ("a,b,angle\ng,h,1\n", "pairs.csv:2: angle: found '1', expected none: two points have a distance, but no angle"),
     ("a,b,distance\ng,k,1\n", "pairs.csv:2: b: found 'k', expected an id or a group"),
 ]
 
