@@ -26,16 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import scipy
-from pydantic import (
-    AfterValidator,
-    AliasPath,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-    WrapSerializer,
-)
+from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
 
 from fg_calib import __version__, statistics
 from fg_calib.assessment import Assessment
@@ -189,11 +180,11 @@ class Carried(Section):
 
 def _dated(date: str) -> str:
     if date:
-        datetime.fromisoformat(date)
+        datetime.fromisoformat(str(date))
     return date
 
 
-Date = Annotated[str, AfterValidator(_dated)]
+Date = Annotated[str, BeforeValidator(_dated)]
 """A date as ISO 8601 has it; empty if it is unknown."""
 
 
