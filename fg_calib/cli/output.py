@@ -1,4 +1,4 @@
-"""Options of several commands, and how they show a report, a document or progress, and end."""
+"""What commands share: options, output of reports, JSON and progress, exit codes."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ def option(name: str, metavar: str | None, about: str, **limits: Any) -> Any:
 
     Args:
         name: Such as `--out`.
-        metavar: What it takes, for the help; None for a switch or a choice.
+        metavar: The placeholder of its value in the help; None for a switch or a choice.
         about: The line of help.
-        limits: Of numbers: `min`; of text: `parser`.
+        limits: `min` of a number, `parser` of text.
     """
     return typer.Option(name, metavar=metavar, readable=False, help=about, **limits)
 
 
 def length_option(name: str, about: str) -> Any:
-    """An option that takes a length with its unit, which a command gets in [m]."""
+    """An option whose value is a length with its unit; the command gets it in [m]."""
     return _quantity_option(name, "LENGTH", "m", about)
 
 
 def angle_option(name: str, about: str) -> Any:
-    """An option that takes an angle with its unit, which a command gets in [rad]."""
+    """An option whose value is an angle with its unit; the command gets it in [rad]."""
     return _quantity_option(name, "ANGLE", "rad", about)
 
 
@@ -61,14 +61,14 @@ TipLink = Annotated[str | None, option("--tip-link", "LINK", "Where the chain of
 ResultFolder = Annotated[Path, argument("RESULT", "What `calibrate --out` wrote.")]
 Length = Annotated[LengthUnit, option("--length", None, "Unit of lengths in the tables.")]
 Angle = Annotated[AngleUnit, option("--angle", None, "Unit of angles in the tables, joint values included.")]
-Seed = Annotated[int, option("--seed", None, "Of all that is drawn.", min=0)]
+Seed = Annotated[int, option("--seed", None, "Seed of all random draws.", min=0)]
 
 _stop_progress: list[Any] = []
 
 
 @contextmanager
 def progress() -> Iterator[None]:
-    """Show on stderr what is being done, if that is a terminal, until something is printed."""
+    """Show progress on stderr, if that is a terminal, until something is printed."""
     if not sys.stderr.isatty():
         yield
         return
@@ -88,7 +88,7 @@ def _hide_progress() -> None:
 
 
 def say(text: str) -> None:
-    """Print a line on stderr; names from files do not steer the terminal."""
+    """Print a line on stderr, without control characters that names in files may hold."""
     _hide_progress()
     print(printable(text), file=sys.stderr)
 
@@ -105,7 +105,7 @@ def show_json(document: dict[str, Any]) -> None:
 
 
 def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: Callable[[], RenderableType]) -> None:
-    """Print a result as JSON, or as a report as wide as the terminal or `COLUMNS`; a pipe has no width of its own.
+    """Print a result as JSON, or as a report as wide as the terminal or `COLUMNS` (`WIDTH` in a pipe).
 
     Args:
         as_json: Whether as JSON.
@@ -126,12 +126,12 @@ def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: C
 
 
 def names_in(text: str) -> list[str]:
-    """Names between commas."""
+    """The names in a list with commas."""
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
 def end(findings: Sequence[str], what: str = "not to be trusted", not_accepted: Sequence[str] = ()) -> None:
-    """Say on stderr why a result is not to be trusted, or not accepted, and end with 3 if there is a reason."""
+    """Print on stderr why a result is not to be trusted or not accepted; exit with 3 if there is a reason."""
     for finding in findings:
         say(f"{what}: {finding}")
     for reason in not_accepted:
@@ -141,7 +141,7 @@ def end(findings: Sequence[str], what: str = "not to be trusted", not_accepted: 
 
 
 def say_next(names: Sequence[str], folder: Path) -> None:
-    """Say on stderr which files of a job were written to a folder, and how to calibrate it."""
+    """Print on stderr which files were written, and the command that calibrates them."""
     say(f"wrote {', '.join(names)} to {folder}")
     job, result = (shlex.quote(str(folder / name)) for name in ("calibration.yaml", "result"))
     say(f"now: fg-calib calibrate {job} --out {result}")

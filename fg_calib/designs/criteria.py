@@ -14,10 +14,10 @@ are the eigenvalues of S:
 | `O4` | `-s_L^2 / s_1` | noise amplification (Nahvi and Hollerbach 1996) |
 | `O5` | `sum 1 / s_i` | (Sun and Hollerbach 2008) |
 
-Each is a function of the covariance V of the functions P that it is about: `V = P C P^T`. For `I`, `P^T P = W`; for all
-others P is the core and V is `S^-1`. A candidate's rows A change V by `-B^T (1 + A C A^T)^-1 B` with `B = A C P^T`
-(Woodbury). Those candidates are tried whose derivative promises most, `|B U D^(1/2)|^2`, where U are the eigenvectors
-of V and D the derivatives of the criterion in their variances; of O2 and O4 in the largest alone.
+Each is a function of `V = P C P^T`, the covariance of linear functions P of the parameters. For `I`, `P^T P = W`; for
+all others P is the core and V is `S^-1`. A candidate's rows A change V by `-B^T (1 + A C A^T)^-1 B` with `B = A C P^T`
+(Woodbury). This is computed for the candidates of the largest gain to first order, `|B U D^(1/2)|^2`, where U are the
+eigenvectors of V and D the derivatives of the criterion in their variances; of O2 and O4 in the largest alone.
 
 References:
     Fedorov (1972), Theory of Optimal Experiments. Academic Press.
@@ -45,7 +45,7 @@ from fg_calib.inputs import Floats
 Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 
 N_TRIED = 128
-"""Candidates that are tried at a step: those that promise most."""
+"""Candidates whose criterion is computed at a step: those of the largest gain to first order."""
 
 _TINY = 1e-300
 
@@ -95,7 +95,7 @@ class Measure:
         self._formula, self._weights = FORMULAS[criterion]
 
     def value(self, information: Floats) -> float:
-        """The criterion with some information, shape (n, n)."""
+        """The criterion for a matrix of information, shape (n, n)."""
         half = scipy.linalg.solve_triangular(np.linalg.cholesky(information), self._P.T, lower=True)
         return float(self._formula(half.T @ half))
 
@@ -103,7 +103,7 @@ class Measure:
         """The candidate that makes the criterion smallest, and its value with that.
 
         Args:
-            information: What is there, shape (n, n).
+            information: Information of what was chosen before, shape (n, n).
             allowed: Candidates that may be taken, shape (n_candidates,); at least one.
         """
         rows, (n, _, m) = self.system.rows, self.system.rows.shape
@@ -113,8 +113,8 @@ class Measure:
         V = self._P @ K
         w, U = np.linalg.eigh(V)
         X = K @ U * self._weights(np.maximum(w, _TINY))
-        promise = np.sum(np.reshape(rows.reshape(-1, m) @ X, (n, -1)) ** 2, axis=1)
-        tried = np.argsort(np.where(allowed, -promise, np.inf), kind="stable")[: min(N_TRIED, int(allowed.sum()))]
+        gain = np.sum(np.reshape(rows.reshape(-1, m) @ X, (n, -1)) ** 2, axis=1)
+        tried = np.argsort(np.where(allowed, -gain, np.inf), kind="stable")[: min(N_TRIED, int(allowed.sum()))]
         A = rows[tried]
         B, G = A @ K, np.eye(A.shape[1]) + A @ C @ np.swapaxes(A, 1, 2)
         values = self._formula(V - np.swapaxes(B, 1, 2) @ np.linalg.solve(G, B))

@@ -45,7 +45,7 @@ N_POSES = 30
 """Default number of poses of a design."""
 
 MIN_FITTED = 4
-"""Configurations of a task that a rigid fit does not bring onto each other, wherever they are."""
+"""Fewest configurations of a task after a rigid fit, which makes the errors of fewer too small."""
 
 N_CANDIDATES = 2000
 """Default number of candidates that are drawn."""
@@ -60,13 +60,13 @@ class Design(FrozenArrays):
 
     Attributes:
         pool: The candidates.
-        tables: What is to be measured, in order; none of an instrument none of whose own poses was chosen.
+        tables: What is to be measured, in order. An instrument of which no pose was chosen has none.
         criterion: By which criterion.
         task: What the calibration is for.
         readings: The configurations in the order in which to visit them, reference poses first, shape (n, n_joints),
             [rad] (prismatic: [m]).
         ids: Their names: those of chosen rows of a job, else s1, s2, ... after such names of the job, shape (n,).
-        group: The instrument that alone measures at each; "" where all others do.
+        group: The one instrument that measures at each; "" for all that share their configurations.
         expected: Expected errors of the tool over the task, with these and what was given.
         after_fit: Expected errors after the best rigid fit, where `expected` is in the base frame; else None.
         before: Expected errors with what was given alone; None without it.
@@ -138,13 +138,13 @@ def design(
         n: Number of poses; as many as reach the target if None.
         target: Expected RMS position error over the task that is to be reached, [m].
         criterion: What is minimised: `I` the mean square error over the task, or D, A, E, O1 to O5.
-        n_candidates: Number of configurations that are drawn to choose from; of a table all are taken.
+        n_candidates: Number of candidates to draw; of a table all are candidates.
         candidates: Where to measure instead: configurations, or with a job `"rows"`, to choose among its train rows.
         given: With a scenario: readings of poses that were measured already, or will be anyway, shape (n, n_joints).
         task: Configurations at which the tool is to be right, shape (n, n_joints); random ones within the joint limits
             if None.
-        fitted: Whether errors count after the best rigid fit, or in the base frame; the former if None where nothing
-            that is measured says where the base is.
+        fitted: Whether errors count after the best rigid fit, or in the base frame; if None after the fit where the
+            measurements do not determine the base.
         lever: Distance from the tool with which orientation errors count, [m].
         seed: Seed of all draws.
 
@@ -163,7 +163,7 @@ def design(
     blind_to_base = ObservedQuantities.of(pool.problem).blind_to_base
     wanted = Task(readings, blind_to_base if fitted is None else fitted, lever)
     if wanted.fitted and len(readings) < MIN_FITTED:
-        found = f"{len(readings)} configuration{'s' * (len(readings) > 1)}, of which a rigid fit leaves next to nothing"
+        found = f"{len(readings)} configuration{'s' * (len(readings) > 1)}, whose errors a rigid fit takes up"
         raise InputError("task", found, f"{MIN_FITTED} or more, or errors in the base frame")
     return design_from_pool(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
 
@@ -230,7 +230,7 @@ def design_from_pool(
     target: float | None = None,
     criterion: Criterion = "I",
 ) -> Design:
-    """Choose from a pool for a task, with random sets to compare with; for the others see `design`."""
+    """Choose from a pool for a task, and compare with random sets; arguments as of `design`."""
     measurable = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(measurable):
         raise InputError("candidates", "none at which anything is measured", "some")
@@ -283,10 +283,10 @@ def _position_error(posterior: Posterior, task: Task) -> float:
 
 
 def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Callable[[Integers], float] | None:
-    """The error with some candidates where pairs are formed otherwise than in a star; else None.
+    """Expected error of a set of candidates whose pairs are no star; None for a star.
 
-    Candidates are chosen there as poses in an unknown frame, which hold at least as much (see `MEASURED`), and compared
-    with random ones by this error: a chain of pairs may hold far less, and of other poses more.
+    The search takes candidates for poses in an unknown frame, whose information bounds that of pairs (see `MEASURED`).
+    A chain may have far less, so its design is compared with random ones by this error.
     """
     if not any(pairing.strategy != "star" for _, pairing in pool.formed.values()):
         return None

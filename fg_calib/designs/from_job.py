@@ -1,7 +1,7 @@
-"""The pool of a job: earlier measurements count, and more are chosen, anywhere or among the job's own rows.
+"""Candidates of a job: its measurements count already, and more are chosen, anywhere or among the job's own rows.
 
-A job becomes a scenario: each table is an instrument with candidates of its own, in the frame in which it measured, and
-everything is where the solution puts it. So candidates for more rows are found as those of a scenario.
+A solved job becomes a scenario: each table is an instrument in the frame in which it measured, and landmarks stand
+where they were estimated. Candidates for more rows are then drawn as those of any scenario.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from fg_calib.simulation import (
 )
 
 MIN_CONE_RAD = np.deg2rad(60.0)
-"""Angle between a board's normal and the direction to the camera that new views may have at least."""
+"""New views may be at least as oblique as this angle between a board's normal and the direction to the camera."""
 
 
 def solve_for_design(job: Job) -> Problem:
@@ -61,7 +61,7 @@ def solve_for_design(job: Job) -> Problem:
 def pool_of_rows(problem: Problem, source: str) -> Pool:
     """The pool of a solved problem's train rows.
 
-    Pairs must share one reference pose: what other pairs share is not one pose's.
+    Pairs must share one reference pose: the information of any other pair belongs to two poses.
 
     Raises:
         InputError: Pairs without one reference pose.
@@ -177,9 +177,9 @@ def _noise_of(problem: Problem, number: int) -> Noise:
 
 
 def _seen(boards: Mapping[str, Floats], tool: Floats) -> dict[str, Any]:
-    """Boards on the camera's side of which the tool was, or behind, and views of the first of them.
+    """The boards, whether they were seen from behind, and views of the first of them.
 
-    Its views are from as far and as near as it was seen from, and a little more oblique.
+    Views are from the measured range of distances, at the measured angles and a little more oblique ones.
     """
     placed = {name: Placement(Rotation.from_rotvec(at[:3]).as_matrix(), at[3:]) for name, at in boards.items()}
     behind = [name for name, b in placed.items() if np.median((tool - b.position) @ b.rotation[:, 2]) < 0.0]

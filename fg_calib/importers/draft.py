@@ -1,6 +1,6 @@
-"""A job for files that are there: `fg-calib init` recognises tables by their headers and fills a template.
+"""A job for existing files: `fg-calib init` recognises tables by their headers and fills a template.
 
-Lines marked DECIDE are what only the user knows.
+Lines marked DECIDE hold what only the user knows.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _MODELS: dict[str, Model] = {
 """Models by a column that no other has, in order of precedence."""
 
 _UNITS = {"length": (LENGTHS, "m", "mm", 30.0), "angle": (ANGLES, "rad", "deg", 13.0)}
-"""Units of each kind, the one that is guessed, and the one that is guessed where a value is larger than that."""
+"""Units of each kind, the guessed one, and the one that is guessed if a value exceeds the number."""
 
 _GUESSES = {"orientation": ("angle", 2e-4), "angle": ("angle", 2e-4), "pixel": ("", 0.2)}
 """Noise to start from by kind, [rad] or [px]; 1e-4 m of others."""
@@ -88,12 +88,12 @@ class _Recognised:
 
     Attributes:
         path: Its file.
-        model: Model of its measurements; None of joint readings alone, and of pairs.
-        present: Known columns that it has, except those of joints; and those of its pairs.
-        columns: Header of each column that the table calls otherwise, by the known name.
+        model: Model of its measurements; None for joint readings alone and for pairs.
+        present: Known columns that it or its table of pairs has, except those of joints.
+        columns: Headers of columns that have another name in the table, by the known name.
         units: Its units of `length` and `angle`, if it has such columns.
         unused: Columns without a meaning.
-        pairs: The file of the pairs that are of its configurations, if there is one.
+        pairs: The file of pairs of its configurations, if there is one.
     """
 
     path: Path
@@ -108,7 +108,7 @@ class _Recognised:
     def noise(self) -> list[str]:
         """Kinds of noise that its model needs and no column specifies."""
         kinds = INSTRUMENTS[str(self.model)].noise
-        if self.model in PAIR_MODELS:  # nothing is formed from contact points but what was measured between them
+        if self.model in PAIR_MODELS:  # contact points have only the pairs that were measured
             kinds = tuple(kind for kind in kinds if self.pairs is not None and kind in self.present)
             kinds = (*(("point",) if "group" in self.present else ()), *kinds)
         columns = {"position": "x", "orientation": "rx", "pixel": "u"}
@@ -184,7 +184,7 @@ def _find_joints(bare: Sequence[str], robot: Robot) -> dict[str, int]:
 
 
 def _guess_unit(table: Table, kind: str, columns: Mapping[str, int]) -> str:
-    """The unit of columns whose headers state none, by their largest value."""
+    """The unit of columns without one in their headers, by their largest value."""
     given = [table.columns[k] for name, k in columns.items() if not name.startswith("sigma_")]
     _, usual, other, limit = _UNITS[kind]
     large = given and np.nanmax(np.abs(table.numbers(given, optional=True)), initial=0.0) > limit
@@ -211,7 +211,7 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
         out: Where the job will be; the paths in it are relative to its folder.
 
     Raises:
-        InputError: There is no robot or no table among them, several of what there may be one, or one cannot be used.
+        InputError: Robot or table are missing, there are several robots or cameras, or a file cannot be used.
     """
     found = _sort(files)
     robot = read_robot(found["robot"][0])
@@ -265,7 +265,7 @@ def _sort(files: Sequence[Path]) -> dict[str, list[Path]]:
 
 
 def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
-    """Tables of configurations, that first which the pairs are of: at which nothing else was measured, if any.
+    """Tables of configurations, first that of the pairs: one without other measurements, if there is any.
 
     Raises:
         InputError: There are several tables of pairs, or one alone.

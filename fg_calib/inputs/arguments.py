@@ -217,13 +217,13 @@ def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str 
 
 
 NEAR = 0.87
-"""Likeness of names (see `difflib`) that is a slip of the pen: tool.w is as like tool.x as it is like tool.z."""
+"""Likeness of names (see `difflib`) from which one is suggested: tool.w is as like tool.x as it is like tool.z."""
 
 
 def did_you_mean(value: object, options: Iterable[object], likeness: float = 0.6) -> str:
-    """`did you mean shared?` where an option reads nearly like what was given, whatever its case; else nothing.
+    """`did you mean shared?` if an option is nearly what was given, in any case of letters; else nothing.
 
-    The first letter must be the same: whoever writes grad does not mean rad.
+    The first letter must be the same: grad does not mean rad.
     """
     if not isinstance(value, str) or not value:
         return ""
@@ -234,10 +234,10 @@ def did_you_mean(value: object, options: Iterable[object], likeness: float = 0.6
 
 
 def listed(key: str, names: Iterable[Any], expected: str = "a list of names") -> tuple[Any, ...]:
-    """Names as a tuple: what can be gone through only once would be empty the second time.
+    """Names as a tuple: an iterator would be empty the second time.
 
     Raises:
-        InputError: They are nothing to go through.
+        InputError: They cannot be iterated over.
     """
     if isinstance(names, str):
         return (names,)
