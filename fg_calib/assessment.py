@@ -18,7 +18,7 @@ from fg_calib.monitoring import at_nominal
 from fg_calib.observability import Identifiability, Observability, identifiability_of
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
-from fg_calib.robot import Robot, without_rigid_motion
+from fg_calib.robot import Robot
 from fg_calib.statistics.residual_table import residual_table
 
 
@@ -70,15 +70,6 @@ class Assessment(FrozenArrays):
     acceptance: statistics.Acceptance | None = None
     cross_validation: statistics.CrossValidation | None = None
 
-    def with_folds(self, folds: statistics.CrossValidation, solution: Solution) -> Assessment:
-        """The assessment with cross-validation, which judges limits on kinds without test rows.
-
-        Args:
-            folds: Result of the cross-validation.
-            solution: What was assessed.
-        """
-        return replace(self.with_held_out(folds.by_table, solution), cross_validation=folds)
-
     def with_held_out(self, others: Sequence[statistics.HeldOut], solution: Solution) -> Assessment:
         """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
 
@@ -104,15 +95,13 @@ class Assessment(FrozenArrays):
 
     @checked
     @single_threaded
-    def predict(self, function: Callable[[Robot], ArrayLike], *, fitted: bool = False) -> Prediction:
+    def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
 
         It may be determined although the parameters it depends on are not; where it is not, its sigma is nan.
 
         Args:
             function: From a robot to a number or an array; smooth, for it is differentiated by central differences.
-            fitted: Whether sigmas are those of points after the rotation and shift that bring them nearest to the true
-                ones, which the base has no part in; the function's values are points, shape (n, 3).
 
         Note:
             Parameters that were left out to fix the gauge (`keep`) count with their prior sigma: what depends on one
@@ -121,15 +110,8 @@ class Assessment(FrozenArrays):
         Raises:
             InputError: The function raised something, or returned no figures.
         """
-        value, whole = _figures(function, self.robot), self.whole
-        G = whole.derivative(lambda robot: _figures(function, robot))
-        if fitted:
-            if len(value) % 3:
-                raise InputError("function", f"{len(value)} figures", "points, shape (n, 3), where errors are fitted")
-            points = value.reshape(-1, 3)
-            G = without_rigid_motion(points, G.reshape(*points.shape, -1))[0].reshape(G.shape)
-        covariance = whole.covariance(G)
-        return Prediction(value, np.sqrt(np.diag(covariance)), covariance)
+        covariance = self.whole.covariance(self.whole.derivative(lambda robot: _figures(function, robot)))
+        return Prediction(_figures(function, self.robot), np.sqrt(np.diag(covariance)), covariance)
 
     @property
     def observability(self) -> Observability:

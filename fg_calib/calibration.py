@@ -126,7 +126,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
         assessment = assess(solution)
         if options.folds is not None:
             folds = cross_validate(given, solve_job, options.folds, executor=executor)
-            assessment = assessment.with_folds(folds, solution)
+            assessment = replace(assessment.with_held_out(folds.by_table, solution), cross_validation=folds)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         if not options.estimate_noise and options.estimate_tolerance is None:
             raise

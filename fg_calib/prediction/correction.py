@@ -19,7 +19,6 @@ from numpy.typing import ArrayLike
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations
 from fg_calib.measurements import check_readings
-from fg_calib.parallel import tell
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
 from fg_calib.robot import N_STARTS, REACHED, Inverse, Robot, build_chain, forward, rotation_vector, solve_inverse
 from fg_calib.statistics import TangentCovariance
@@ -35,9 +34,6 @@ _N_HALVINGS = 8
 
 _N_NEAR = 20
 """Starts near where the arm is to stay."""
-
-_AT_ONCE = 5000
-"""Targets at once: so many fit caches and memory, and progress is reported between them."""
 
 _RCOND = 1e-6
 """Singular values of the point's derivative below this share of the largest do not move it."""
@@ -193,22 +189,11 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats,
     Returns:
         Within the joint limits; the miss of a point that is itself out of reach is not 0.
     """
-    n = len(position)
-    parts = []
-    for first in range(0, max(n, 1), _AT_ONCE):
-        tell("reaching targets", first, n)
-        rows = slice(first, first + _AT_ONCE)
-        found = _reach(robot, position[rows], None if rotation is None else rotation[rows], near[rows], anywhere)
-        parts.append((found.readings, found.miss_position, found.miss_rotation))
-    return Inverse(*map(np.concatenate, zip(*parts, strict=True)))
 
-
-def _reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, anywhere: bool) -> Inverse:
     def solve(rows: Integers, near: Floats | None, n_starts: int) -> Inverse:
         turned = None if rotation is None else rotation[rows]
         return solve_inverse(robot, position[rows], turned, near=near, n_starts=n_starts)
 
-    q = near.copy()
     found = solve(np.arange(len(near)), near, 1 if anywhere else _N_NEAR)
     q, reached = found.readings.copy(), found.reached.copy()
     rows = np.flatnonzero(~reached)

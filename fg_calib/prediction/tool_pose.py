@@ -189,10 +189,6 @@ class ToolErrors(FrozenArrays):
     fitted: Floats
     joint_noise: Floats | None
 
-    def of(self, fitted: bool) -> Floats:
-        """Errors after the best rigid fit, or in the base frame, shape (n, 2)."""
-        return self.fitted if fitted else self.base
-
 
 @dataclass(frozen=True)
 class ToolPoseUncertainty(FrozenArrays):

@@ -2,7 +2,7 @@
 
 Over the workspace, configurations are drawn evenly within the joint limits; the expected error at each is that of
 `tool_pose`. Where it is largest, it has a covariance v Cov v^T of its own, whose axes give its direction. *Responsible*
-for it are the parameters whose errors it follows: if parameter i were known exactly, the expected square would fall by
+for it are the parameters whose errors it follows: if parameter i were known exactly, its expected square would fall by
 the share sum_k cov(e_k, p_i)^2 / (var(p_i) sum_k var(e_k)), summed over the coordinates of the error. Shares of
 correlated parameters overlap, so they need not add to 1.
 """
@@ -10,7 +10,7 @@ correlated parameters overlap, so they need not add to 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from fg_calib.inputs import Booleans, Floats, FrozenArrays
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
 from fg_calib.robot import Robot, pose, random_readings
+from fg_calib.statistics import TangentCovariance
 
 QUANTILES: Mapping[str, float] = {"median": 0.5, "p95": 0.95, "largest": 1.0}
 """Statistics by which errors are summarised."""
@@ -36,32 +37,24 @@ FAR = 0.15
 """Distance from the nearest measured position, in the radius of the workspace, beyond which nothing was measured."""
 
 _N_SAMPLED = 1000
-"""Configurations that give the radius of the workspace where these are given, and the responsible parameters."""
-
-
-def _bounded(robot: Robot, readings: Floats) -> Robot:
-    """The robot with its readings as the limits of joints that slide without any."""
-    ends = zip(robot.joints, readings.min(axis=0).tolist(), readings.max(axis=0).tolist(), strict=True)
-    free = [joint.prismatic and not np.isfinite(joint.upper - joint.lower) for joint in robot.joints]
-    joints = [replace(j, lower=a, upper=b) if no else j for (j, a, b), no in zip(ends, free, strict=True)]
-    return replace(robot, joints=tuple(joints))
+"""Configurations that give the radius of the workspace where configurations are given."""
 
 
 @dataclass(frozen=True)
 class Responsible:
-    """A parameter that errors follow.
+    """A parameter that an error follows.
 
     Attributes:
         name: Its name.
         unit: `m` or `rad`.
         share: Of the expected square of the position error, by how much it would fall were this one known, 0 to 1.
-        change: Its error that goes with one sigma along the longest axis of the error; None over many configurations.
+        change: Its error that goes with one sigma along the longest axis of the error.
     """
 
     name: str
     unit: str
     share: float
-    change: float | None
+    change: float
 
 
 @dataclass(frozen=True)
@@ -115,14 +108,7 @@ class PredictedErrors(FrozenArrays):
         if self.unknown == 1.0:
             return None
         row = int(np.nanargmax(self.expected[:, 0]))
-        return _worst(self, self.model.at(self.errors.readings[row : row + 1]), row)
-
-    @cached_property
-    def responsible(self) -> tuple[Responsible, ...]:
-        """The parameters that errors follow over all configurations where they are known, most first."""
-        known = self.errors.readings[np.isfinite(self.expected[:, 0])]
-        sampled = known[np.unique(np.linspace(0, len(known) - 1, min(_N_SAMPLED, len(known))).astype(np.int64))]
-        return _responsible(self.model, sampled, self.fitted)
+        return _worst(self, row)
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -134,7 +120,7 @@ class PredictedErrors(FrozenArrays):
     @property
     def expected(self) -> Floats:
         """Position [m] and orientation [rad] errors in the frame that counts, shape (n, 2); nan where unknown."""
-        return self.errors.of(self.fitted)
+        return self.errors.fitted if self.fitted else self.errors.base
 
     @property
     def with_joint_noise(self) -> Floats | None:
@@ -181,8 +167,7 @@ def predict_errors(
 ) -> PredictedErrors:
     """Expected errors at configurations, or all over the workspace, and where they are largest.
 
-    In the workspace a revolute joint without limits rotates by +-180 degrees. A prismatic one without them moves
-    between its lowest and its highest reading.
+    In the workspace a revolute joint without limits rotates by +-180 degrees, a prismatic one slides by +-1 m.
 
     Args:
         robot: The calibrated robot, with its limits.
@@ -193,7 +178,7 @@ def predict_errors(
         limit: Largest allowed position error, [m].
     """
     n, rng = N_DRAWN if readings is None else _N_SAMPLED, np.random.default_rng(0)
-    drawn = random_readings(_bounded(robot, measured), n, rng)
+    drawn = random_readings(robot, n, rng)
     errors = model.at(drawn if readings is None else readings)
     points = errors.position if readings is None else pose(robot, drawn).position
     radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
@@ -202,41 +187,33 @@ def predict_errors(
     return PredictedErrors(model, errors, fitted, readings is not None, far, measured_points, limit)
 
 
-def _worst(found: PredictedErrors, errors: ToolErrors, row: int) -> WorstConfiguration:
+def _worst(found: PredictedErrors, row: int) -> WorstConfiguration:
     """The error ellipsoid and the responsible parameters at one configuration."""
-    model, fitted = found.model, found.fitted
-    v = model.motions(errors.readings, fitted=fitted)[0, 3:]
+    model, errors = found.model, found.model.at(found.errors.readings[row : row + 1])
+    v = model.motions(errors.readings, fitted=found.fitted)[0, 3:]
     size, axes = np.linalg.eigh(v @ model.covariance.tangent @ v.T)
     sigma, axes = np.sqrt(np.maximum(size[::-1], 0.0)), axes.T[::-1]
     axes = axes * np.where(axes[np.arange(3), np.argmax(np.abs(axes), axis=1)] < 0.0, -1.0, 1.0)[:, None]
-    along = _responsible(model, errors.readings, fitted, along=axes[0] @ v)
-    return WorstConfiguration(errors, row if found.given else None, axes, sigma, bool(found.far[row]), along)
+    responsible = _responsible(model.covariance, v, axes[0] @ v)
+    return WorstConfiguration(errors, row if found.given else None, axes, sigma, bool(found.far[row]), responsible)
 
 
-def _responsible(
-    model: ToolPoseUncertainty, readings: Floats, fitted: bool, along: Floats | None = None
-) -> tuple[Responsible, ...]:
-    """The parameters that position errors follow.
+def _responsible(posterior: TangentCovariance, v: Floats, along: Floats) -> tuple[Responsible, ...]:
+    """The parameters that a position error follows.
 
     Args:
-        model: What is expected of the tool.
-        readings: Where the errors are known, shape (n, n_joints).
-        fitted: Whether errors count after the best rigid fit.
-        along: The error along one direction, in the columns, shape (n_columns,): changes are those that go with it.
+        posterior: The covariance.
+        v: The error in the columns, shape (3, n_columns).
+        along: The same along one direction, shape (n_columns,): changes are those that go with it.
     """
-    if not len(readings):
-        return ()
-    posterior, variables = model.covariance, model.covariance.variables
-    v = model.motions(readings, fitted=fitted)[:, 3:].reshape(3 * len(readings), variables.n_columns)
+    variables = posterior.variables
     named = variables.named_derivative(posterior.parameters)[: variables.n_robot_columns]
     with np.errstate(invalid="ignore", divide="ignore"):  # nan: yaw and roll at a pitch of a quarter turn
         covariance = named @ posterior.tangent  # of parameters with the columns
         variance = posterior.variance(named)  # nan: not determined, and so of no part in what is
-        total = float(np.einsum("ij,ji->", v @ posterior.tangent, v.T))
-        shares = np.square(covariance @ v.T).sum(axis=1) / (variance * total)
-        change = None if along is None else covariance @ along / np.sqrt(along @ posterior.tangent @ along)
+        shares = np.square(covariance @ v.T).sum(axis=1) / (variance * np.trace(v @ posterior.tangent @ v.T))
+        changes = covariance @ along / np.sqrt(along @ posterior.tangent @ along)
     order = np.argsort(-np.nan_to_num(shares, nan=-1.0), kind="stable")[:_NAMED].tolist()
     units = {p.name: p.unit for p in variables.robot.parameters}
-    changes = [None] * len(shares) if change is None else change.tolist()
-    chosen = [(variables.names[i], float(shares[i]), changes[i]) for i in order if shares[i] >= _LEAST_SHARE]
-    return tuple(Responsible(name, units[name], share, moved) for name, share, moved in chosen)
+    chosen = [(variables.names[i], i) for i in order if shares[i] >= _LEAST_SHARE]
+    return tuple(Responsible(name, units[name], float(shares[i]), float(changes[i])) for name, i in chosen)

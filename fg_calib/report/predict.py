@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats
 from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
-from fg_calib.prediction import Correction, PredictedErrors, Responsible, ToolErrors, summed_up
+from fg_calib.prediction import Correction, PredictedErrors, ToolErrors, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import write_charts
 from fg_calib.report.figures import error_slices
@@ -54,7 +54,9 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
     of_worst: dict[str, Any] | None = None
     if worst is not None:
         of_worst = _configuration(worst.errors, 0, "" if worst.row is None else names[worst.row], worst.far)
-        of_worst |= {"axes": worst.axes, "sigma": worst.sigma, "responsible": _shares(worst.responsible, result)}
+        classes = {p.name: p.identifiability for p in result.parameters}
+        shares = [vars(p) | {"identifiability": classes[p.name]} for p in worst.responsible]
+        of_worst |= {"axes": worst.axes, "sigma": worst.sigma, "responsible": shares}
     return tables.document_of(
         "predict",
         found,
@@ -70,7 +72,6 @@ def prediction_document(found: PredictedErrors, result: Result, ids: Sequence[st
         },
         far=np.mean(found.far),
         worst=of_worst,
-        responsible=_shares(found.responsible, result),
         configurations=[_configuration(errors, k, names[k], found.far[k]) for k in range(len(names) * found.given)],
     )
 
@@ -88,11 +89,6 @@ def _configuration(errors: ToolErrors, k: int, name: str, far: bool) -> dict[str
     known = {key: of for key, of in _frames(errors).items() if of is not None}
     kinds = {"joint_noise": None} | {key: dict(zip(POSE_KINDS, of[k], strict=True)) for key, of in known.items()}
     return {"id": name, "readings": errors.readings[k], "position": errors.position[k], **kinds, "near": not far}
-
-
-def _shares(found: Sequence[Responsible], result: Result) -> list[dict[str, Any]]:
-    classes = {p.name: p.identifiability for p in result.parameters}
-    return [vars(p) | {"identifiability": classes[p.name]} for p in found]
 
 
 FILES = {"predict.json": b'{\n "schema": "fg-calib/predict/', "predict.csv": b"id,", "predict.svg": b"<svg"}
@@ -155,9 +151,7 @@ def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot
         *(*result.findings, *result.reservations),
         *section("Expected error, by the covariance of the calibration", size_table(found), *percentages(found)),
         *section(f"Where it is largest{in_part}", *_worst_in_words(found, robot, names)),
-        *section(
-            "Parameters that it comes from (fall of the mean square if known exactly)", _responsible(found, result)
-        ),
+        *section("Parameters that it comes from there", _responsible(found, result)),
         *section("Configurations", *listed),
         *section("Notes", *_prediction_notes(found, robot)),
     )
@@ -166,7 +160,7 @@ def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot
 def size_table(found: PredictedErrors) -> Table:
     """RMS and quantiles, in both frames, with joint noise and without."""
     order = ("fitted", "base") if found.fitted else ("base", "fitted")
-    errors: dict[str, Floats | None] = {FRAMES[name]: found.errors.of(name == "fitted") for name in order}
+    errors: dict[str, Floats | None] = {FRAMES[name]: getattr(found.errors, name) for name in order}
     errors[f"{FRAMES[order[0]]}, with joint noise"] = found.with_joint_noise
     rows: list[tuple[Any, ...]] = []
     for frame, of in errors.items():
@@ -207,18 +201,14 @@ def _worst_in_words(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
     yield f"joints: {', '.join(joints)}"
     axis, (first, *across) = ", ".join(f"{v:+.2f}" for v in worst.axes[0]), [figure(v, "m") for v in worst.sigma]
     yield f"1 sigma is {first} mm along ({axis}), {' and '.join(across)} mm across"
-    if worst.responsible:
-        changes = (f"{p.name} {in_words(p.change, p.unit, '+.3g')}" for p in worst.responsible)
-        yield f"with 1 sigma along it go {', '.join(changes)}"
 
 
 def _responsible(found: PredictedErrors, result: Result) -> Table:
-    """The shares of parameters over all configurations and at the worst."""
+    """The parameters responsible for the largest error: the error's fall if known, and what goes with 1 sigma of it."""
     classes = {p.name: p.identifiability for p in result.parameters}
     worst = () if found.worst is None else found.worst.responsible
-    every, there = ({p.name: p.share for p in of} for of in (found.responsible, worst))
-    rows = [(name, every.get(name), there.get(name), classes[name]) for name in every | there]
-    return table_of(("", "of all|.0%", "where largest|.0%", "class"), rows)
+    rows = [(p.name, p.share, in_words(p.change, p.unit, "+.3g"), classes[p.name]) for p in worst]
+    return table_of(("", "mean square falls if known by|.0%", "with 1 sigma along it|>", "class"), rows)
 
 
 def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Table:
@@ -234,7 +224,7 @@ def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
     yield "Errors are RMS, from the specified noise and prior sigmas. Unmodelled effects are not included."
     if not found.given:
         unlimited = [j.name for j in robot.joints if not np.isfinite(j.upper - j.lower)]
-        instead = f" ({', '.join(unlimited)} without any: +-180 deg, or what was read)" if unlimited else ""
+        instead = f" ({', '.join(unlimited)} without any: +-180 deg, or +-1 m)" if unlimited else ""
         yield f"{len(found.errors.readings)} configurations were drawn within the joint limits{instead}."
     if found.fitted:
         yield "Nothing was measured in the base frame: errors count after the best rigid fit to all measurements."

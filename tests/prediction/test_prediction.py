@@ -96,7 +96,7 @@ def test_where_nothing_was_measured_is_far(calibrated, monkeypatch):
     assert found.far.any()
 
 
-def test_a_slide_without_limits_is_drawn_between_its_readings():
+def test_a_slide_without_limits_is_drawn_within_a_metre():
     builder, none = RobotBuilder("slide", "dh"), {"a": 0.5, "alpha": 0.0, "d": 0.0, "theta": 0.0}
     builder.add_convention_joint(Joint("swing", lower=-2.0, upper=2.0), none)
     builder.add_convention_joint(Joint("slide", prismatic=True), none)
@@ -104,7 +104,7 @@ def test_a_slide_without_limits_is_drawn_between_its_readings():
     q = np.column_stack([np.linspace(-0.5, 1.9, 25), np.linspace(0.1, 0.9, 25)])
     result = calibrate(robot, measure(robot, 25, np.random.default_rng(0), readings=q), model="pose", gauge="none")
     slides = predict(result).errors.position[:, 2]
-    assert (slides.min() >= 0.1 - 1e-3, slides.max() <= 0.9 + 1e-3) == (True, True)  # nominal, but for its estimate
+    assert [slides.min(), slides.max()] == pytest.approx([-1.0, 1.0], abs=1e-2)  # of 12 000, and nominal but for noise
 
 
 def test_what_a_parameter_is_responsible_for_goes_when_it_is_known(calibrated):
@@ -145,7 +145,7 @@ def test_what_nothing_determines_is_unknown_and_named(monkeypatch):
     robot = small_arm()
     result = calibrate(robot, measure(robot, 40, rng), model="orientation", gauge="none")
     found = predict(result, limit=1.0)
-    assert (found.unknown, found.within, found.worst, found.responsible) == (1.0, 0.0, None, ())
+    assert (found.unknown, found.within, found.worst) == (1.0, 0.0, None)
     assert "a2" in found.undetermined
     assert np.isnan(found.expected[:, 0]).all()
     assert np.isfinite(found.expected[:, 1]).all()
@@ -188,7 +188,7 @@ def test_arms_that_were_calibrated_are_as_far_off_as_expected(frame):
         estimate = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
         model = ToolPoseUncertainty.of(spread_of(solution), m.readings)
         worst = predict_errors(estimate, model, m.readings, q, fitted=frame == "unknown").worst
-        errors = model.at(q).of(frame == "unknown")[:, 0]
+        errors = getattr(model.at(q), "fitted" if frame == "unknown" else "base")[:, 0]
         off = pose(estimate, q).position - pose(true, q).position
         if frame == "unknown":
             a, b = pose(estimate, m.readings).position, pose(true, m.readings).position
