@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.verdict import Severity, Statement, listed, texts
-from fg_calib.graph import Problem, linear_system, problem_of, solve, tables_of, unsolved
+from fg_calib.graph import Problem, problem_of, solve, tables_of, unsolved
 from fg_calib.inputs import Brief, CalibrationError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
@@ -182,7 +182,7 @@ def inspect_job(job: Job) -> Inspection:
     misread = any(check.explanations for check in setups)  # then all rows disagree
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
-    n_directions = spread.rank + linear_system(problem, problem.start).left.rank
+    n_directions = spread.rank + problem.system.left.rank
     found = Inspection(
         robot=job.robot.name,
         tables=tuple(_survey(problem, number, table) for number, table in enumerate(tables)),

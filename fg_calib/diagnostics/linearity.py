@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.graph import Problem, Solution, linear_system, noises_at, subsampled
+from fg_calib.graph import Problem, Solution, noises_at, subsampled
 from fg_calib.inputs import Floats, SolverError
 from fg_calib.robot import forward
 from fg_calib.statistics import Spread
@@ -55,13 +55,14 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     root = spread.root[:, :rank]
     scaled = root / scales[:, None]
     in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
-    here, shifts = linear_system(problem, solution.parameters), list[Floats]()
+    here = solution.system if problem is solution.problem else problem.linearize(solution.parameters)
+    shifts: list[Floats] = []
     try:
         while len(shifts) < N_DRAWS:
             core = root @ rng.choice([-1.0, 1.0], rank)
             step = np.concatenate([core, here.left.follow @ core])
             there = [problem.variables.moved(solution.parameters, d) for d in (step, -step)]
-            plus, minus = (linear_system(problem, x).step for x in there)
+            plus, minus = (problem.linearize(x).step for x in there)
             shifts.append((0.5 * (plus + minus) - here.step)[:n])
             squares = np.mean((np.array(shifts) @ in_sigma.T) ** 2)
             if len(shifts) == 1 and squares < NEGLIGIBLE:

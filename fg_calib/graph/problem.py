@@ -29,6 +29,9 @@ from fg_calib.robot import Chain, Parameter, Robot, forward
 N_REMEMBERED = 4
 """Parameter vectors whose square root a problem remembers: the start, nominal and the estimate are asked for often."""
 
+NO_ROWS = whitened_rows((), sharing=False, joints=False, weights=None)
+"""The rows of a problem before they are whitened."""
+
 
 @dataclass(frozen=True)
 class Problem(FrozenArrays):
@@ -123,13 +126,29 @@ class Problem(FrozenArrays):
         head = f"Problem of {self.robot.name!r}: {models}{frame}, {self.n_configurations} configurations"
         return f"{head}\n  {self.n_residuals} residuals and {self.n_priors} priors on {unknowns}"
 
-    def linearize(self, parameters: Floats | None = None) -> NormalSystem:
-        """The normal system of measurements, priors and added factors at a parameter vector, at `start` if None.
+    @cached_property
+    def system(self) -> NormalSystem:
+        """The normal system at `start`."""
+        return self.linearize(self.start)
+
+    def linearize(self, parameters: Floats, *, with_loss: bool = False) -> NormalSystem:
+        """The normal system at a parameter vector: all train rows, priors and added factors.
+
+        Args:
+            parameters: The parameter vector.
+            with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
 
         Raises:
             SolverError: A residual or derivative is not finite.
         """
-        return linear_system(self, self.start if parameters is None else parameters)
+        v = self.variables
+        r, J = prior_rows(v, parameters)
+        rows, priors = square_root(self, parameters, with_loss=with_loss), np.column_stack([J, r])
+        with np.errstate(over="ignore"):
+            if not np.isfinite(np.vdot(rows, rows) + np.vdot(priors, priors)):
+                raise SolverError("a residual is not finite: the measurements or the robot hold absurd numbers")
+        gather = lambda: self.rows.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
+        return NormalSystem(rows, v.n_columns, v.prior_scales, priors, self.rows.states, gather)
 
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
@@ -160,7 +179,8 @@ class Problem(FrozenArrays):
     def estimated(self) -> list[Parameter]:
         """The robot's estimated parameters, in the order of the columns."""
         names = self.variables.names[: self.variables.n_robot_columns]
-        return [self.robot.parameters[self.robot.index(name)] for name in names]
+        by_name = {p.name: p for p in self.robot.parameters}
+        return [by_name[name] for name in names]
 
     @property
     def pair_series(self) -> tuple[MeasurementBlock, ...]:
@@ -198,8 +218,9 @@ class Problem(FrozenArrays):
     @property
     def n_priors(self) -> int:
         """Scalar priors."""
-        of_unknowns = unknown_prior_rows(self.variables, self.start)[0]
-        return len(prior_rows(self.variables, self.start)[0]) + len(of_unknowns)
+        v = self.variables
+        of_unknowns = sum(len(one.prior[0]) for one in v.nuisance if one.prior is not None)
+        return of_unknowns + sum(len(stated) for stated, _ in v.stated.values())
 
     @property
     def n_added(self) -> int:
@@ -246,12 +267,9 @@ class Problem(FrozenArrays):
 
     @cached_property
     def _square_roots(self) -> Callable[[bytes], Floats]:
+        """Rows [A r] with the Gram matrix of the train rows, error states eliminated, at a parameter vector's bytes."""
         rows, variables = self.rows, self.variables
         return lru_cache(N_REMEMBERED)(lambda x: rows.square_root(variables.at(np.frombuffer(x))))
-
-    def square_root(self, parameters: Floats) -> Floats:
-        """Rows [A r] with the Gram matrix of the train rows, error states eliminated, all columns."""
-        return self._square_roots(parameters.tobytes())
 
 
 def with_factors(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
@@ -420,27 +438,6 @@ def joint_errors(problem: Problem, parameters: Floats) -> Floats:
     return found
 
 
-def linear_system(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> NormalSystem:
-    """The normal system of a problem at a parameter vector: all train rows, priors and added factors.
-
-    Args:
-        problem: The problem.
-        parameters: The parameter vector.
-        with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
-
-    Raises:
-        SolverError: A residual or derivative is not finite.
-    """
-    v = problem.variables
-    r, J = prior_rows(v, parameters)
-    rows, priors = square_root(problem, parameters, with_loss=with_loss), np.column_stack([J, r])
-    with np.errstate(over="ignore"):
-        if not np.isfinite(np.vdot(rows, rows) + np.vdot(priors, priors)):
-            raise SolverError("a residual is not finite: the measurements or the robot hold absurd numbers")
-    gather = lambda: problem.rows.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
-    return NormalSystem(rows, v.n_columns, v.prior_scales, priors, problem.rows.states, gather)
-
-
 def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
     """Rows [A r] with the Gram matrix of train rows, landmarks' priors and added factors, error states eliminated.
 
@@ -459,7 +456,7 @@ def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False
     if problem.added:
         others.append(linearize_factors(problem.added, v, v.values(parameters)))
     variance = loss_variance(problem) if with_loss else 1.0
-    measured = problem.square_root(parameters) / np.sqrt(variance)
+    measured = problem._square_roots(parameters.tobytes()) / np.sqrt(variance)
     return np.vstack([*(np.column_stack([J, r]) for r, J in others), measured])
 
 
@@ -483,13 +480,13 @@ def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
 
 def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
     """Signal-to-noise ratios of data and priors at some parameters, and their unit-free directions as columns."""
-    system = linear_system(problem, parameters)
+    system = problem.linearize(parameters)
     return system.singular_values, (system.directions / problem.variables.prior_scales).T
 
 
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     """`whitened_triangle` by named parameters, the measurement frames projected out: shape (m, n_robot_columns)."""
-    return named_rows(problem.variables, parameters, linear_system(problem, parameters).left.A)
+    return named_rows(problem.variables, parameters, problem.linearize(parameters).left.A)
 
 
 def felt(problem: Problem, parameters: Floats, wanted: Integers) -> Floats:
@@ -535,7 +532,7 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
     if not problem.missing_correlation:
         return None
     n, wide = problem.variables.n_columns, problem.rows.private(problem.variables.at(parameters))
-    J = wide[:, :n] + wide[:, n:-1] @ linear_system(problem, parameters).left.follow
+    J = wide[:, :n] + wide[:, n:-1] @ problem.linearize(parameters).left.follow
     return correlation_of(problem.noises, problem.rows, J)
 
 
@@ -578,5 +575,4 @@ def problem_at(
     robot: Robot, data: Dataset, options: Options, variables: Variables, start: Floats, **more: Any
 ) -> Problem:
     """A problem with its rows whitened at a start."""
-    bare = whitened_rows((), sharing=False, joints=False, weights=None)
-    return with_factors(Problem(robot, data, options, variables, start, NoiseState(), bare, **more), start)
+    return with_factors(Problem(robot, data, options, variables, start, NoiseState(), NO_ROWS, **more), start)

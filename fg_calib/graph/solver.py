@@ -178,6 +178,11 @@ class Solution(FrozenArrays):
         return replace(self.problem, start=self.parameters).initial
 
     @cached_property
+    def system(self) -> NormalSystem:
+        """The normal system at the estimate."""
+        return self.problem.linearize(self.parameters)
+
+    @cached_property
     def objective(self) -> float:
         """What it is an optimum of: the cost; with a robust loss by what that has each measurement cost."""
         weights, loss = self.problem.state.weights, self.problem.options.loss
@@ -443,7 +448,7 @@ def _solution(run: _Fit, before: Floats, started: Problem, clock: float) -> Solu
     parameters = problem.variables.parameters(problem.variables.values(run.here.parameters))  # angles in usual range
     weighted, cost = problem.state.weights is not None, weighted_cost
     if weighted:
-        cost = relinearized_at(problem, parameters, replace(problem.state, weights=None)).linearize().cost
+        cost = relinearized_at(problem, parameters, replace(problem.state, weights=None)).system.cost
     return Solution(
         problem=problem,
         parameters=parameters,
@@ -451,7 +456,7 @@ def _solution(run: _Fit, before: Floats, started: Problem, clock: float) -> Solu
         converged=run.converged,
         message=run.message,
         history=run.history,
-        initial_cost=started.linearize().cost,
+        initial_cost=started.system.cost,
         cost=cost,
         weighted_cost=weighted_cost,
         seconds=time.perf_counter() - clock,

@@ -287,7 +287,8 @@ class _Motion:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self._parameters = problem.estimated
         self._seen = seen
-        columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
+        numbers = {p.name: i for i, p in enumerate(robot.parameters)}
+        columns = {numbers[p.name]: k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, robot.trig(random_readings(robot, 60, np.random.default_rng(0))))
         self._R, self._p = poses.rotation, poses.position

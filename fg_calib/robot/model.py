@@ -417,7 +417,6 @@ class Robot:
         """
         return SCALES.get(unit, SCALES["1"]).ordinary * (self.reach if unit == "m" else 1.0)
 
-    @checked
     def index(self, name: str) -> int:
         """Index of the parameter called `name`.
 
@@ -458,8 +457,8 @@ class Robot:
             found = f"{len(figures)} values" if figures.ndim == 1 else f"shape {figures.shape}"
             raise InputError(self.name, found, f"{n}, one a parameter")
         check_sizes(self.name, figures)
-        changed = (replace(p, nominal=float(v)) for p, v in zip(self.parameters, figures, strict=True))
-        return replace(self, parameters=tuple(changed))
+        pairs = zip(self.parameters, figures.tolist(), strict=True)
+        return replace(self, parameters=tuple(p if p.nominal == v else replace(p, nominal=v) for p, v in pairs))
 
 
 class RobotBuilder:

@@ -132,10 +132,11 @@ def spread_of(solution: graph.Solution) -> Spread:
     `robust.Effect`.
     """
     problem, variables = solution.problem, solution.problem.variables
-    system = graph.linear_system(problem, solution.parameters, with_loss=True)
+    weighted = problem.state.weights is not None
+    system = problem.linearize(solution.parameters, with_loss=True) if weighted else solution.system
     nominal = system
     if solution.before is not solution.parameters:
-        nominal = graph.linear_system(problem, solution.before, with_loss=True)
+        nominal = problem.linearize(solution.before, with_loss=True)
     rank, half, scales = system.rank, system.root, variables.prior_scales
     loose, loose_at_nominal = system.directions[rank:], nominal.directions[nominal.rank :]
     held = held_frames(loose, loose_at_nominal, scales, variables.n_robot_columns)
@@ -240,7 +241,7 @@ def _errors(problem: graph.Problem, parameters: Floats) -> tuple[Floats, Floats]
     by_name = dict(zip(whole.names, derivative.T, strict=True))
     left_out = [by_name[p.name] for p in problem.whole.estimated if p.name not in own.names]
     N = np.array(left_out).reshape(-1, whole.n_columns).T
-    J = graph.linear_system(replace(problem, variables=whole), parameters).left.A
+    J = replace(problem, variables=whole).linearize(parameters).left.A
     U, s, Vt = np.linalg.svd((J @ M) * own.scales, full_matrices=False)
     rank = graph.determined(s)
     G = own.scales[:, None] * ((Vt[:rank].T / s[:rank]) @ (U[:, :rank].T @ (J @ N)))

@@ -229,7 +229,7 @@ def _landmarks(solution: graph.Solution, whole: Spread) -> tuple[LandmarkEstimat
     if not unknowns.names:
         return ()
     at = problem.variables.at(solution.parameters)
-    left = graph.linear_system(replace(problem, variables=whole.variables), solution.parameters).left
+    left = replace(problem, variables=whole.variables).linearize(solution.parameters).left
     counts, first = _n_rows(problem), np.cumsum([0, *unknowns.sizes])
     names, found = unknowns.keys, []
     for i, (_, name) in enumerate(names):
@@ -270,7 +270,7 @@ def _joint_errors(solution: graph.Solution) -> JointErrors | None:
     sigma = problem.sigma_joint[joints]
     rows, slots = problem.rows.configurations, problem.rows.slots
     share, of_joints = np.zeros((len(rows), problem.robot.n_joints)), slots < problem.robot.n_joints
-    variance = graph.linear_system(problem, solution.parameters).z_variance.reshape(len(rows), -1)
+    variance = problem.linearize(solution.parameters).z_variance.reshape(len(rows), -1)
     share[:, slots[of_joints]] = 1.0 - variance[:, of_joints]  # of its prior variance, by which an error varies
     share = share[:, joints]
     error = graph.joint_errors(problem, solution.parameters)[np.ix_(rows, joints)]

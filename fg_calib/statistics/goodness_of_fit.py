@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
-from fg_calib.graph import NoiseState, Solution, effect, linear_system, mahalanobis_distances, noises_at
+from fg_calib.graph import NoiseState, Solution, effect, mahalanobis_distances, noises_at
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import squares_along
 from fg_calib.robot import SPAN
@@ -367,7 +367,7 @@ class RowStatistics:
         known = len(fitted) <= (MAX_KEPT if self._shared else MAX_INDEPENDENT)
         known &= not (self.robust or problem.missing_correlation)
         keep = (table.used & known) | (table.test & (len(test) <= MAX_KEPT))
-        self._model = RowModel(problem, solution.parameters, noises)
+        self._model = RowModel(solution, noises)
         self._kept, self._errors = np.flatnonzero(keep), self._read(keep)
         w = self.weight
         variance = np.where(table.used, 1.0 - 2.0 * w, 1.0)  # in place, as of a million rows each array counts
@@ -580,7 +580,7 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
     problem = solution.problem
     chi2, n_rows, of_loss = _weighted_chi2(solution)
     dof = n_rows + problem.n_priors + problem.n_added + (0 if problem.known is None else problem.known.n) - spread.rank
-    dof -= linear_system(problem, solution.parameters).left.rank
+    dof -= solution.system.left.rank
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
     known = dof > 0 and problem.state.weights is None and solution.estimated_noise is None
     p_value = float(special.chdtrc(dof, chi2)) if known and not problem.missing_correlation else None

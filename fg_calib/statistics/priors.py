@@ -250,7 +250,7 @@ def _corrections(
     u, P = graph.prior_rows(specified, at)
     U, s, Vt = np.linalg.svd(P * by)
     back, rest = by[:, None] * (Vt[: len(s)].T / s) @ U.T, by[:, None] * Vt[len(s) :].T
-    J = graph.linear_system(problem, at).left.A
+    J = problem.linearize(at).left.A
     left = graph.eliminate(np.hstack([J @ back, J @ rest]), np.zeros(len(J)), len(u))
     follow = back + rest @ left.follow
     G = left.A.T @ left.A
@@ -347,7 +347,7 @@ def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, .
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
         # The places' errors follow those of the core, and what is theirs alone comes on top.
-        left, unknowns = graph.linear_system(problem, solution.parameters, with_loss=True).left, problem.data.landmarks
+        left, unknowns = problem.linearize(solution.parameters, with_loss=True).left, problem.data.landmarks
         of_core, of_places = P_places[:, : variables.n_columns], P_places[:, variables.n_columns :]
         P = np.vstack([P, of_core + of_places @ left.follow])
         own = np.vstack([np.zeros((len(z), left.rank)), of_places @ left.inverse])

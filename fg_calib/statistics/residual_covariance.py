@@ -15,7 +15,7 @@ import scipy.sparse
 from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
-from fg_calib.graph import PRIVATE_SHARE, Problem, RowNoise, felt, linear_system, reach
+from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, felt, reach
 from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
@@ -122,14 +122,14 @@ class RowModel:
     each coordinate off, W J and W L, their private noise one more column of L each.
 
     Args:
-        problem: The problem.
-        parameters: The estimate.
+        solution: The solution.
         noises: The rows and their noise at the estimate.
     """
 
-    def __init__(self, problem: Problem, parameters: Floats, noises: Sequence[RowNoise]) -> None:
+    def __init__(self, solution: Solution, noises: Sequence[RowNoise]) -> None:
+        problem, parameters, left = solution.problem, solution.parameters, solution.system.left
         v, unknowns = problem.variables, problem.data.landmarks
-        self._at, self._noises, left = v.at(parameters), noises, linear_system(problem, parameters).left
+        self._at, self._noises = v.at(parameters), noises
         self._follow = np.vstack([np.eye(v.n_columns), left.follow])
         self._alone = np.vstack([np.zeros((v.n_columns, left.rank)), left.inverse])
         self._common = np.flatnonzero((reach(noises) > 0) & (reach(noises, test=True) > 0))

@@ -101,7 +101,7 @@ def noise_components(solution: graph.Solution) -> NoiseComponents:
     """How much noise of each origin the residuals of a solution show."""
     problem = solution.problem
     names = _origins(problem)
-    system, roots = graph.linear_system(problem, solution.parameters), [_root(problem, name) for name in names]
+    system, roots = problem.linearize(solution.parameters), [_root(problem, name) for name in names]
     u = system.weighted_residual / np.sqrt(_robust_weights(problem))
     squares = np.array([np.sum((E.T @ u) ** 2) for E in roots])
     expected = np.array([system.trace(E) for E in roots])

@@ -10,7 +10,6 @@ from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import linear_system
 from fg_calib.graph.solver import solve
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.monitoring.prior_information import knowledge_of
@@ -117,8 +116,8 @@ def test_rows_say_the_same_by_the_columns_of_parameters_that_were_left_out(loss)
     )
     problem, x = solution.problem, solution.parameters
     wide = problem.whole.variables
-    of_all = linear_system(replace(problem, variables=wide), x, with_loss=True).left.A
-    mine = linear_system(problem, x, with_loss=True).left.A
+    of_all = replace(problem, variables=wide).linearize(x, with_loss=True).left.A
+    mine = problem.linearize(x, with_loss=True).left.A
     seen = of_all @ wide.columns_of(problem.variables, x)
     np.testing.assert_allclose(seen.T @ seen, mine.T @ mine, rtol=1e-9, atol=1e-9 * np.abs(mine).max() ** 2)
     assert knowledge_of(solution).n >= problem.variables.n_columns

@@ -65,7 +65,7 @@ def test_touches_of_a_point_are_all_pairs_of_its_touches():
         sigma_point=np.append(m.sigma_point, SIGMA),
         groups=Groups((*m.groups.names, "once"), np.append(m.groups.index, 4), no_pairs("pairs.csv")),
     )
-    J = [build_problem(true, x, model="distance").linearize().left.A for x in (m, all_pairs(m), more)]
+    J = [build_problem(true, x, model="distance").system.left.A for x in (m, all_pairs(m), more)]
     wanted = J[0].T @ J[0]
     assert J[1].T @ J[1] == pytest.approx(wanted, abs=1e-8 * wanted.max())
     assert J[2].T @ J[2] == pytest.approx(wanted, abs=1e-7 * wanted.max())

@@ -11,7 +11,7 @@ from fg_calib import InputError, Measurements, Pairing, Table, assess, solve
 from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.noise_models import whitening_of
-from fg_calib.graph.problem import linear_system, relinearized_at, subsampled
+from fg_calib.graph.problem import relinearized_at, subsampled
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
@@ -103,8 +103,8 @@ def test_small_covariances_are_whitened_by_the_rows_in_use(d):
 def test_rows_whitened_at_the_optimum_leave_nothing_to_go(problem, n_sigma):
     """Wherever the start is: convergence is judged by rows whitened at the estimate itself."""
     expected = solve(problem)
-    system = linear_system(problem, expected.parameters)
+    system = problem.linearize(expected.parameters)
     off = n_sigma * system.root @ np.ones(system.rank) / np.sqrt(system.rank)
     found = solve(problem, start=problem.variables.moved(expected.parameters, off))
     assert found.converged
-    assert linear_system(relinearized_at(found.problem, found.parameters), found.parameters).decrement < 3e-7
+    assert relinearized_at(found.problem, found.parameters).system.decrement < 3e-7

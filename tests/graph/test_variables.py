@@ -226,4 +226,4 @@ def test_frame_and_tool_start_near_the_truth_from_far_away():
     true = robot.with_values(values)
     frame = (Rotation.from_rotvec(np.pi * np.array([0.6, 0.8, 0.0])), np.array([30.0, -4.0, 9.0]))
     problem = build_problem(robot, measure(true, 30, rng, frame=frame), model="pose", frame="unknown")
-    assert 2.0 * problem.linearize().cost / problem.n_residuals < 4.0  # only noise is left
+    assert 2.0 * problem.system.cost / problem.n_residuals < 4.0  # only noise is left

@@ -11,7 +11,6 @@ from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import FIRST_TOLERANCE, build_problem
-from fg_calib.graph.problem import linear_system
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
 from fg_calib.inputs import InputError, Options
@@ -255,5 +254,5 @@ def test_what_has_no_prior_follows_the_corrections():
     problem, _ = drawn_problem(frame="unknown")
     solution, n = solve(problem), len(prior_rows(problem.variables, problem.start)[0])
     corrections, follow = _corrections(solution, problem.variables, np.ones(n), np.zeros(n, dtype=np.int64))
-    rows = linear_system(solution.problem, solution.parameters).left.A @ follow
+    rows = solution.problem.linearize(solution.parameters).left.A @ follow
     np.testing.assert_allclose(rows.T @ rows, corrections.information, rtol=1e-6, atol=1e-6 * np.max(rows**2))
