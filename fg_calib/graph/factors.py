@@ -260,7 +260,8 @@ def with_added(
     found, on_errors = set(chain.from_iterable(f.keys() for f in factors if f is not None)), set(errors.keys())
     if found & on_errors:
         added = f"an added factor on the error variable {_symbol(min(found & on_errors))}"
-        raise ProblemError("problem.graph", added, "factors on other variables")
+        way_out = "gtsam.LevenbergMarquardtOptimizer(problem.graph, problem.initial) takes it"
+        raise ProblemError("problem.graph", added, "factors on other variables", way_out)
     ours = variables.with_added((), initial)
     known, given = found.union(ours.keys), set(initial.keys()) - on_errors
     for key in sorted(known ^ given):
