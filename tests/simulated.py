@@ -111,7 +111,7 @@ def write_job(folder, robot: Robot, m: Measurements, /, **job):
     write_csv(folder / "poses.csv", columns | {"split": np.where(m.test, "test", "train")})
     if robot.urdf is None:
         write_robot(folder / "robot.yaml", robot)
-    stated = {"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma_point}
+    stated = {"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma("point")}
     noise = {kind: float(np.max(sigma)) for kind, sigma in stated.items() if sigma is not None}
     noise |= {"joint": float(m.sigma_joint[0])} if m.sigma_joint[0] else {}
     given = {"robot": "robot.yaml", "measurements": "poses.csv", "noise": noise} | job

@@ -79,6 +79,6 @@ def touch(true, points, n_each, rng, sigma=SIGMA, distances=(), test=()):
         sigma_orientation=None,
         sigma_joint=np.zeros(true.n_joints),
         groups=Groups(tuple(f"g{g}" for g in range(len(points))), index, pairs),
-        sigma_point=np.full(n, sigma or SIGMA),
+        sigmas={"point": np.full(n, sigma or SIGMA)},
         source="poses.csv",
     )

@@ -110,7 +110,7 @@ def _instrument_of(problem: Problem, number: int, name: str, configurations: Con
     m, model = table.measurements, table.model
     given: dict[str, Any] = {"name": name, "model": model, "noise": _noise_of(problem, number)}
     given["configurations"] = configurations or RandomReadings(1)
-    contact = m.length is None or not np.nan_to_num(m.length).any()
+    contact = not np.nan_to_num(m.columns.get("distance", np.zeros(1))).any()
 
     def points(letter: str, column: str) -> dict[str, Spot]:
         names, prior = _names(m, column), {one: point.tolerance or 0.0 for one, point in table.known.items()}

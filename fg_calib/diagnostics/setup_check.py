@@ -317,9 +317,10 @@ def _measured_in_units(setup: Setup) -> _Found:
         if setup.sees_lengths:
             of_groups = groups and replace(groups, pairs=replace(groups.pairs, distance=groups.pairs.distance * f))
             of_pairs = pairs and replace(pairs, distance=pairs.distance * f)
-            position, length = (None if v is None else v * f for v in (m.position, m.length))
+            position, columns = None if m.position is None else m.position * f, dict(m.columns)
+            columns |= {name: v * f for name, v in columns.items() if name == "distance"}
             what = "distances" if pairs is not None or m.position is None else "x, y, z"
-            without = setup.measuring(position=position, length=length, pairs=of_pairs, groups=of_groups)
+            without = setup.measuring(position=position, columns=columns, pairs=of_pairs, groups=of_groups)
             yield f"{what} are in {unit}", without
         if image is not None:
             yield f"corner_x, corner_y are in {unit}", setup.measuring(image=image * [1.0, 1.0, f, f])

@@ -194,7 +194,7 @@ def _guess_unit(table: Table, kind: str, columns: Mapping[str, int]) -> str:
 def _find_model(present: set[str]) -> Model | None:
     """The model whose columns a table of configurations has."""
     models = [model for column, model in _MODELS.items() if column in present]
-    models += [model for model, i in INSTRUMENTS.items() if set(i.generic_columns) & present]
+    models += [model for model, i in INSTRUMENTS.items() if set(i.generic_columns) & present and not i.labels]
     position, orientation = {"x", "y", "z"} <= present, bool({"qw", "roll", "rx"} & present)
     models += [model for model, of in POSE_MODELS.items() if of == (orientation, position)]
     return next(iter(models), None)

@@ -456,14 +456,8 @@ _NOT_JOINTS = names_of(
 )
 """Names of columns that a joint's readings cannot have, whatever the model."""
 
-_SIGMAS: Mapping[str, tuple[str, tuple[str, ...], int]] = {
-    "sigma_position": ("position", ("sigma_position", "sigma_x"), 3),
-    "sigma_orientation": ("orientation", ("sigma_orientation", "sigma_rx"), 3),
-    "sigma_length": ("distance", ("sigma_distance",), 1),
-    "sigma_point": ("point", ("sigma_point",), 1),
-    "sigma_pixel": ("pixel", ("sigma_pixel", "sigma_u"), 2),
-}
-"""By field of `Measurements`: the key of `noise`, columns of which one may hold it, and its axes."""
+_BY_AXIS = {"position": "sigma_x", "orientation": "sigma_rx", "pixel": "sigma_u"}
+"""By kind of noise, the first of the columns that may hold its sigma on each axis."""
 
 ROUNDED = 1e-9
 """Share of a covariance that may be rounding."""
@@ -532,7 +526,7 @@ def measurements_of(
     if pairs is not None:
         between, of_groups = _read_pairs(pairs, (ids, test, groups), units, noise)
     if not groups.names:
-        measured["sigma_point"] = None
+        measured["sigmas"].pop("point", None)
     return Measurements(
         readings=readings,
         ids=ids,
@@ -713,27 +707,27 @@ def _measured(table: Table, known: Iterable[str], units: Units, noise: Noise) ->
             return table.positive(names[given], default, factors[given])
         return None if default is None else np.full((table.n_rows, 1), default)
 
-    found: dict[str, Any] = dict.fromkeys(("position", "rotation", "sigma_position", "sigma_orientation"))
+    found: dict[str, Any] = dict.fromkeys(("position", "rotation"))
     if "x" in names:
         found["position"] = values("x")
     if given := _one_of(table, _ROTATIONS, names):
         found |= _rotation(table, given, values(given))
-    for name, (kind, columns, n_axes) in _SIGMAS.items():
-        if (one := sigma(kind, columns)) is not None:
-            found[name] = one[:, 0] if n_axes == 1 else np.broadcast_to(one, (table.n_rows, n_axes)).copy()
-    if "distance" in names:
-        found["length"] = values("distance", optional=True)[:, 0]
-        table.require(~(found["length"] < 0.0) | ("plane" in names), "distance", "a number not below 0")
     if "u" in names or "corner_x" in names:
         table.has(*OF_CONFIGURATIONS["u"].names, *OF_CONFIGURATIONS["corner_x"].names)
         found["image"] = np.hstack([values("u"), values("corner_x")])
     if "cov_11" in names:
         found["covariance"] = _covariances(table, values("cov_11"), units)
-    generic = [name for name in GENERIC_COLUMNS if name in known]
-    found["columns"] = {name: values(name, optional=True)[:, 0] for name in generic if name in names}
-    sigmas = {name: sigma(name, [f"sigma_{name}"]) for name in generic}
-    found["sigmas"] = {name: one[:, 0] for name, one in sigmas.items() if one is not None}
-    return found
+    found["columns"] = {name: values(name, optional=True)[:, 0] for name in GENERIC_COLUMNS if name in names}
+    if "distance" in names:
+        table.require(~(found["columns"]["distance"] < 0.0) | ("plane" in names), "distance", "a number not below 0")
+    sigmas: dict[str, Floats | None] = dict.fromkeys(("position", "orientation"))
+    for kind in (*_BY_AXIS, "point", *(name for name in GENERIC_COLUMNS if name in known)):
+        each = _BY_AXIS.get(kind, "")
+        if (one := sigma(kind, (f"sigma_{kind}", each))) is not None:
+            shape = table.n_rows, len(OF_CONFIGURATIONS[each].names) if each else 1
+            sigmas[kind] = np.broadcast_to(one, shape).copy() if each else one[:, 0]
+    found |= {f"sigma_{kind}": sigmas.pop(kind) for kind in ("position", "orientation")}
+    return found | {"sigmas": sigmas}
 
 
 def _one_of(table: Table, columns: Iterable[str], present: Container[str]) -> str | None:

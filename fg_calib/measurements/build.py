@@ -360,7 +360,6 @@ def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measureme
         sigma_orientation=specified("orientation", 3),
         source="predictions",
         labels=labels,
-        sigma_length=specified("distance"),
         sigmas={name: specified(name) for name in instrument.generic_columns},
     )
     if not n:

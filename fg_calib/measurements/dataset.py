@@ -173,21 +173,18 @@ class Measurements(FrozenArrays):
         pairs: Directly measured pairs; None if pairs are to be formed from the poses.
         source: File name, for messages.
         groups: Which configurations touched the same point; None if none did.
-        sigma_point: Of a touch, per axis, shape (n_configurations,), [m]; nan where it is not specified.
         named: Whether the names were given, so that another table may have the same configurations.
         roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
         labels: What the rows are of, by `target`, `station`, `anchor`, `plane` or `board`, where that was said.
-        length: Distance to the row's anchor, or from its plane, shape (n_configurations,), [m]; None where not
-            measured.
-        sigma_length: Shape (n_configurations,), [m]; None where it is not specified.
         image: Where a point of the row's board was seen, u and v, [px], and where it is on the board, x and y, [m],
             shape (n_configurations, 4); None where nothing was.
-        sigma_pixel: Along u and v, shape (n_configurations, 2), [px]; None where it is not specified.
         covariance: Of a board's measured pose, about and along the camera's axes, shape (n_configurations, 6, 6), [rad]
             and [m]; None where sigmas say it.
         part: Which rows of a table these are, shape (n_configurations,); None where they are all.
-        columns: What instruments with columns of their own measured, by column, shape (n_configurations,) each.
-        sigmas: 1 sigma of these, by the same names.
+        columns: What else was measured, by column, shape (n_configurations,) each, nan where it was not: `distance` to
+            the row's anchor, or from its plane, [m].
+        sigmas: 1 sigma of these, by the same names, and of `point`, a touch, per axis, [m], nan where it is not
+            specified; and of `pixel`, along u and v, shape (n_configurations, 2), [px].
     """
 
     readings: Floats
@@ -201,14 +198,10 @@ class Measurements(FrozenArrays):
     pairs: Pairs | None = None
     source: str = "measurements"
     groups: Groups | None = None
-    sigma_point: Floats | None = None
     roll_pitch_yaw: Floats | None = None
     named: bool = False
     labels: Mapping[str, Labels] = field(default_factory=dict)
-    length: Floats | None = None
-    sigma_length: Floats | None = None
     image: Floats | None = None
-    sigma_pixel: Floats | None = None
     covariance: Floats | None = None
     part: Integers | None = None
     columns: Mapping[str, Floats] = field(default_factory=dict)
@@ -253,8 +246,7 @@ class Measurements(FrozenArrays):
 
     def sigma(self, noise: str) -> Floats | None:
         """1 sigma by kind of noise; None where it is not specified."""
-        name = "sigma_length" if noise == "distance" else f"sigma_{noise}"
-        found: Floats | None = self.sigmas.get(noise, getattr(self, name, None))
+        found: Floats | None = self.sigmas.get(noise, getattr(self, f"sigma_{noise}", None))
         return found
 
     def with_values(self, values: Mapping[str, Floats]) -> Measurements:

@@ -176,7 +176,7 @@ def counted_before(table: Table, known: Collection[str]) -> bool:
 
 def _of_rows(m: Measurements) -> Words:
     """Hashes of what was measured at, and between, configurations."""
-    given = [v for v in (m.position, m.rotation, m.length, m.image, *m.columns.values()) if v is not None]
+    given = [v for v in (m.position, m.rotation, m.image, *m.columns.values()) if v is not None]
     values = [v.reshape(len(m.readings), -1) for v in given]
     labels = [*(m.labels.get(kind.name) for kind in LANDMARKS.values()), m.groups]
     named = [one for one in labels if one is not None]

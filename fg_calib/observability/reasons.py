@@ -215,7 +215,6 @@ def at_configurations(robot: Robot, table: Table, q: Floats, places: _Places, so
         rotation=poses.rotation,
         sigma_position=np.tile(length[:, None], 3),
         sigma_orientation=np.tile(angle[:, None], 3),
-        sigma_length=length,
         sigmas=dict.fromkeys(INSTRUMENTS[model].generic_columns, length),
         labels={column: Labels(tuple(real), index)} if real else {},
         source=table.measurements.source,

@@ -230,7 +230,7 @@ def _files_before(folder: Path) -> dict[str, str]:
 def _is_touched(table: Table) -> bool:
     """Whether something is touched, so that it is the joint readings that are measured."""
     m = table.measurements
-    contact = table.model in ("anchor", "plane") and not np.any(0.0 if m.length is None else m.length)
+    contact = table.model in ("anchor", "plane") and not np.any(m.columns.get("distance", 0.0))
     return m.groups is not None or contact
 
 

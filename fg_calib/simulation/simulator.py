@@ -357,7 +357,8 @@ class Measuring:
             length = np.linalg.norm(self.at().position - places, axis=1)
             length = np.abs(length + (i.offset or 0.0) + self.noise("distance", n))
         labels = {"anchor": Labels(tuple(anchors), which)}
-        m = self.rows(labels=labels, length=length, sigma_length=self.sigma("distance", len(which)))
+        sigmas = {"distance": self.sigma("distance", len(which))}
+        m = self.rows(labels=labels, columns={"distance": length}, sigmas=sigmas)
         table = Table(m, "anchor", known=self.known(anchors), offset=i.offset is not None)
         return table, {"anchors": anchors, "offsets": {} if i.offset is None else {self.name: i.offset}}
 
@@ -371,8 +372,8 @@ class Measuring:
         above = np.einsum("ni,ni->n", normal, at) - distance + self.noise("distance", self.n)
         if i.contact:
             which = which[self.touch(at - above[:, None] * normal, n_starts=3)]
-        labels, sigma = {"plane": Labels(tuple(planes), which)}, self.sigma("distance", len(which))
-        m = self.rows(labels=labels, length=None if i.contact else above, sigma_length=sigma)
+        labels, sigmas = {"plane": Labels(tuple(planes), which)}, {"distance": self.sigma("distance", len(which))}
+        m = self.rows(labels=labels, columns={} if i.contact else {"distance": above}, sigmas=sigmas)
         return Table(m, "plane"), {"planes": planes}
 
     def _draw_planes(self, n: int) -> Mapping[str, Plane]:
@@ -394,7 +395,7 @@ class Measuring:
             unmeasured, fitted = np.full(len(a), np.nan), np.zeros(len(a), dtype=np.bool_)
             sigma, source = self.sigma("distance", len(a)), f"{self.name}_pairs.csv"
             pairs = Pairs(a, b, np.abs(d), unmeasured, sigma, unmeasured, fitted, source)
-        m = self.rows(groups=Groups(tuple(sockets), which, pairs), sigma_point=self.sigma("point", len(which)))
+        m = self.rows(groups=Groups(tuple(sockets), which, pairs), sigmas={"point": self.sigma("point", len(which))})
         return Table(m, "distance"), {"sockets": sockets}
 
     def boards(self) -> tuple[Table, Truth]:
@@ -426,7 +427,7 @@ class Measuring:
             k,
             labels={} if i.fixed else {"board": Labels(tuple(boards), which)},
             image=np.hstack([image[k, which, corner] + self.noise("pixel", len(k), 2), i.corners[corner]]),
-            sigma_pixel=self.sigma("pixel", len(k), 2),
+            sigmas={"pixel": self.sigma("pixel", len(k), 2)},
         )
         frame: FrameKnowledge = "unknown" if i.fixed else "known"
         table = Table(m, "pixels", frame=frame, camera=i.camera, fixed_camera=i.fixed)

@@ -25,7 +25,7 @@ Columns = Mapping[str, Any]
 _FIRST_WORDS = "# fg-calib simulate "
 """How the job of a simulation begins."""
 
-MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "distance", "angle", *"uv", *GENERIC_COLUMNS)
+MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "angle", *"uv", *GENERIC_COLUMNS)
 """Columns of measured values."""
 
 
@@ -105,8 +105,6 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
     if m.rotation is not None:
         quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
         columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
-    if m.length is not None:
-        columns["distance"] = m.length / length
     columns |= {name: values / units.factor(GENERIC_COLUMNS[name].si) for name, values in m.columns.items()}
     if m.image is not None:
         columns |= dict(zip("uv", m.image.T[:2], strict=True))

@@ -131,7 +131,7 @@ def lengths(rng, offset, n=60):
     """An arm, and lengths to anchors with an offset that the job does not mention."""
     robot, _, table = measured_by("anchors", rng, n=n, sigma_joint=3e-5)
     m = table.measurements
-    return robot, replace(table, measurements=replace(m, length=m.length + offset))
+    return robot, replace(table, measurements=m.with_values({"distance": m.value("distance") + offset}))
 
 
 def test_a_forgotten_offset_is_reported_with_its_size():

@@ -48,9 +48,9 @@ def all_pairs(m):
         parts.append(rows[np.array(np.triu_indices(len(rows), 1))])
     a, b = np.hstack(parts)
     nan = np.full(len(a), np.nan)
-    sigma = np.sqrt(np.bincount(index)[index[a]]) * m.sigma_point[a]
+    sigma = np.sqrt(np.bincount(index)[index[a]]) * m.sigma("point")[a]
     pairs = Pairs(a, b, np.zeros(len(a)), nan, sigma, nan, np.zeros(len(a), dtype=bool))
-    return replace(m, groups=None, sigma_point=None, pairs=pairs)
+    return replace(m, groups=None, pairs=pairs)
 
 
 def test_touches_of_a_point_are_all_pairs_of_its_touches():
@@ -62,7 +62,7 @@ def test_touches_of_a_point_are_all_pairs_of_its_touches():
         readings=np.vstack([m.readings, once.readings]),
         ids=np.append(m.ids, "last"),
         test=np.append(m.test, False),
-        sigma_point=np.append(m.sigma_point, SIGMA),
+        sigmas={"point": np.append(m.sigma("point"), SIGMA)},
         groups=Groups((*m.groups.names, "once"), np.append(m.groups.index, 4), no_pairs("pairs.csv")),
     )
     J = [build_problem(true, x, model="distance").system.left.A for x in (m, all_pairs(m), more)]
@@ -125,7 +125,7 @@ def test_groups_of_a_table_and_distances_between_them_are_read(tmp_path):
     noise = Noise(distance=1e-3, point=2e-4)
     m = read_measurements(tmp_path / "poses.csv", small_arm(), noise=noise, pairs=tmp_path / "pairs.csv")
     assert (m.groups.names, m.groups.index.tolist()) == (("left", "right"), [0, 0, 1, -1])
-    assert m.sigma_point.tolist() == [2e-4] * 4
+    assert m.sigma("point").tolist() == [2e-4] * 4
     between = m.groups.pairs
     assert (between.a.tolist(), between.b.tolist(), between.distance.tolist()) == ([0], [1], [0.05])
     assert between.test.tolist() == [True]  # as all of its touches are
@@ -159,7 +159,7 @@ def test_contacts_that_a_model_cannot_use_or_without_sigmas_are_refused():
         said = f"poses.csv: group with model {model}, expected model distance or distance-rotation"
         assert refused(robot, m, model=model) == said
     said = "poses.csv: no sigma for touched points, expected noise.point or a column sigma_point"
-    assert refused(robot, replace(m, sigma_point=None), model="distance") == said
+    assert refused(robot, replace(m, sigmas={}), model="distance") == said
     said = "pairs.csv: no sigma for distance, expected noise.distance or a column sigma_distance"
     assert refused(robot, replace(m, groups=replace(m.groups, pairs=pairs)), model="distance") == said
 
@@ -254,10 +254,10 @@ def test_what_one_table_says_of_an_anchor_holds_for_all_and_two_may_not_differ()
 
 def test_a_length_of_zero_is_contact_unless_the_instrument_adds_an_offset():
     robot, _, table = measured_by("anchors", np.random.default_rng(7))
-    length = table.measurements.length.copy()
+    length = table.measurements.value("distance").copy()
     length[[4, 7]] = 0.0
     for offset, kinds in ((True, {"AnchorDistance": 40}), (False, {"AnchorDistance": 38, "AnchorContact": 2})):
-        m = replace(table.measurements, length=length)
+        m = table.measurements.with_values({"distance": length})
         series = build_problem(robot, replace(table, measurements=m, offset=offset)).data.blocks
         assert {type(s.kind).__name__: s.n for s in series} == kinds
     assert [[s.of.names[i] for i in s.of.index[:3]] for s in series] == [["a0", "a1", "a2"], ["a1", "a1"]]
@@ -275,7 +275,9 @@ def test_what_an_instruments_model_lacks_is_named():
         assert refused(robot, Table(m, model)).startswith(f"measurements: {lacks}")
     names = np.array(m.labels["anchor"].names)[m.labels["anchor"].index]
     test = m.labels["anchor"].index == 1
-    data = Measurements.from_arrays(m.readings, anchor=names, distance=m.length, sigma_distance=1e-4, test=test)
+    data = Measurements.from_arrays(
+        m.readings, anchor=names, distance=m.value("distance"), sigma_distance=1e-4, test=test
+    )
     assert "anchor a1 has test rows alone, expected train rows too, or its place as" in refused(
         robot, Table(data, "anchor")
     )

@@ -75,7 +75,7 @@ def two_tables(rng, *, second="pairs", joint=3e-4):
     m = replace(m, named=True, source="first")
     if second == "touches":
         robot, other = touches(rng, joint=joint)
-        m = replace(other, groups=None, sigma_point=None, position=pose(robot, other.readings).position)
+        m = replace(other, groups=None, position=pose(robot, other.readings).position)
         m = replace(m, sigma_position=np.full((24, 3), 1e-3), source="first", named=True)
         return robot, [Table(m, "position"), Table(replace(other, source="second", named=True), "distance")]
     other = measure(true_robot(robot, rng), 16, rng, sigma=(1e-3, 5e-4), readings=m.readings)

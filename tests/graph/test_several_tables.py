@@ -106,7 +106,7 @@ def test_a_point_of_one_name_in_two_tables_is_one_point():
         place = np.searchsorted(names, np.array(m.groups.names)) if pairs.n_pairs else None
         pairs = replace(pairs, a=place[pairs.a], b=place[pairs.b]) if pairs.n_pairs else pairs
         return replace(
-            m, readings=m.readings[rows], ids=m.ids[rows], test=m.test[rows], sigma_point=m.sigma_point[rows],
+            m, readings=m.readings[rows], ids=m.ids[rows], test=m.test[rows], sigmas={"point": m.sigma("point")[rows]},
             groups=Groups(names, index, pairs), source=source,
         )  # fmt: skip
 

@@ -33,8 +33,7 @@ def write_files(folder, robot, table, job):
     columns |= {"id": m.ids} if m.named else {}
     for name, labels in m.labels.items():
         columns[name] = np.array(["", *labels.names])[labels.index + 1]
-    if m.length is not None:
-        columns["distance"] = 1e3 * m.length
+    columns |= {name: 1e3 * values for name, values in m.columns.items()}
     if m.image is not None:
         columns |= dict(zip(("u", "v", "corner_x", "corner_y"), (m.image * [1, 1, 1e3, 1e3]).T, strict=True))
     if m.position is not None:
@@ -118,7 +117,7 @@ def test_a_column_that_another_model_uses_means_nothing(tmp_path):
     (tmp_path / "poses.csv").write_text("q1,q2,q3,q4,x,y,z,anchor,distance,u\n0,0,0,0,1,2,3,,far,left\n")
     found = read_measurements(tmp_path / "poses.csv", robot, model="position")
     assert found.labels == {}
-    assert found.length is None
+    assert found.value("distance") is None
 
 
 HEAD = "q1,q2,q3,q4"

@@ -38,6 +38,8 @@ def table():
 def same(a, b):
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b, equal_nan=a.dtype.kind == "f")
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
     if isinstance(a, tuple) or not hasattr(a, "__dataclass_fields__"):
         return a == b
     return all(same(getattr(a, f), getattr(b, f)) for f in a.__dataclass_fields__ if f != "source")

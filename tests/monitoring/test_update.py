@@ -100,7 +100,7 @@ def lengths(true, anchors, rng, n, ids):
     d = d + 2e-8 * rng.normal(size=n)
     rows = Measurements.from_arrays(q, ids=[f"{ids}{i}" for i in range(n)])
     labels = {"anchor": Labels(tuple(anchors), of)}
-    return Table(replace(rows, labels=labels, length=d, sigma_length=np.full(n, 2e-8)), "anchor")
+    return Table(replace(rows, labels=labels, columns={"distance": d}, sigmas={"distance": np.full(n, 2e-8)}), "anchor")
 
 
 @pytest.mark.slow

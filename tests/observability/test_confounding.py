@@ -74,12 +74,12 @@ def test_touched_points_take_up_the_size_of_the_arm():
     rows = [[0.1, 1.5, 0.4, 0.1], [0.5, 0.2, 0.1, 0.0], [0.4, -1.4, 0.05, 0.3], [0.3, 0.9, 0.2, -0.2]]
     robot, rng = Robot.from_dh(rows, tolerance={"a": 1e-3}), np.random.default_rng(1)
     points = corners(robot, 4, rng)
-    m = replace(touch(robot, points, 20, rng, sigma=1e-12), sigma_point=np.full(80, 1e-4))
+    m = replace(touch(robot, points, 20, rng, sigma=1e-12), sigmas={"point": np.full(80, 1e-4)})
     _, found = looked_at(robot, Table(m, "distance"))
     reasons = by_reason(found)
     assert "confounded with the unknown contact points" in reasons
     assert NOT_EXCITED not in reasons
     assert NO_CAUSE not in reasons
     m = touch(robot, points, 20, rng, sigma=1e-12, distances=[(0, 1, 1e-5), (1, 2, 1e-5)])
-    problem, _ = looked_at(robot, Table(replace(m, sigma_point=np.full(80, 1e-4)), "distance"))
+    problem, _ = looked_at(robot, Table(replace(m, sigmas={"point": np.full(80, 1e-4)}), "distance"))
     assert max(seen(problem, relation) for relation in reasons["confounded with the unknown contact points"]) > 1.0

@@ -74,7 +74,9 @@ def test_lengths_go_to_anchors_in_turn(which):
     m, truth, T = exact(which)
     names, every = names_of(m.labels["anchor"]), m.labels["anchor"].names
     away = np.linalg.norm(T[:, :3, 3] - [truth["anchors"][name].xyz for name in names], axis=1)
-    assert m.length == pytest.approx(away + 0.12 * (which == "offset"), abs=1e-9 if which == "contact" else CLOSE)
+    assert m.value("distance") == pytest.approx(
+        away + 0.12 * (which == "offset"), abs=1e-9 if which == "contact" else CLOSE
+    )
     assert names == [every[k % len(every)] for k in range(len(T))]
     assert truth.get("offsets", {}) == ({"it": 0.12} if which == "offset" else {})
 
@@ -84,8 +86,8 @@ def test_distances_are_across_planes(which):
     m, truth, T = exact(which)
     planes = [truth["planes"][name] for name in names_of(m.labels["plane"])]
     away = np.array([p.normal @ t[:3, 3] - p.distance for p, t in zip(planes, T, strict=True)])
-    assert away == pytest.approx(0.0 if m.length is None else m.length, abs=1e-9 if which == "faces" else CLOSE)
-    assert (m.length is None) == (which == "faces")
+    assert away == pytest.approx(m.columns.get("distance", 0.0), abs=1e-9 if which == "faces" else CLOSE)
+    assert ("distance" not in m.columns) == (which == "faces")
     normals = np.array([p.normal for p in truth["planes"].values()])[:3]
     assert normals @ normals.T == pytest.approx(np.eye(3), abs=CLOSE)
 
@@ -142,8 +144,8 @@ def test_sockets_are_touched_in_turn_and_measured_against_each_other():
 NOISY = {
     "pose": [("position", 1e-4), ("rotation", 2e-4)],
     "targets": [("position", 1e-4)],
-    "anchors": [("length", 1e-4)],
-    "planes": [("length", 1e-4)],
+    "anchors": [("distance", 1e-4)],
+    "planes": [("distance", 1e-4)],
     "board": [("position", 1e-4), ("rotation", 2e-4)],
     "pixels": [("image", 0.1)],
 }
@@ -155,7 +157,7 @@ def test_noise_has_its_sigma(which):
     of = scenario(INSTRUMENTS[which], n=700)
     noisy, clean = (simulate(of, 3, exact=which).tables[0].measurements for which in (False, True))
     for name, sigma in NOISY[which]:
-        a, b = getattr(noisy, name), getattr(clean, name)
+        a, b = noisy.value(name), clean.value(name)
         if name == "rotation":  # the tracker's about the tool's axes, the camera's about its own
             b = np.swapaxes(b, 1, 2)
             off = Rotation.from_matrix(a @ b if which == "board" else b @ a).as_rotvec()
@@ -222,7 +224,7 @@ def test_the_same_configuration_has_the_same_joint_errors_in_all_tables():
     assert first.ids.tolist() == second.ids.tolist() == wire.ids.tolist()
     assert first.position == pytest.approx(second.position, abs=0.0)
     anchors = np.array([s.truth["anchors"][name].xyz for name in names_of(wire.labels["anchor"])])
-    assert wire.length == pytest.approx(np.linalg.norm(first.position - anchors, axis=1), abs=CLOSE)
+    assert wire.value("distance") == pytest.approx(np.linalg.norm(first.position - anchors, axis=1), abs=CLOSE)
     moved = np.stack([tool_pose(s.true_robot, q)[:3, 3] for q in s.true_readings])
     assert np.abs(s.true_readings - first.readings).max() > 1e-4
     assert first.position == pytest.approx(moved, abs=CLOSE)

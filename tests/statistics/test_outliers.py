@@ -40,7 +40,7 @@ def spoilt(name, by, rng):
         robot, _, table = measured_by(name, rng)
         m = table.measurements
         if name in ("anchors", "planes"):
-            m = replace(m, length=plus(m.length, 9, by * 1e-4))
+            m = m.with_values({"distance": plus(m.value("distance"), 9, by * 1e-4)})
         else:
             m = replace(m, position=plus(m.position, (9, 1), by * 3e-4))
         return build_problem(robot, [replace(table, measurements=m)]), str(m.ids[9])

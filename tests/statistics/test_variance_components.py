@@ -30,8 +30,9 @@ SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
 
 def stated(m, own, joint):
     """Measurements whose noise is stated so many times as large as it is."""
-    changes = {name: getattr(m, name) for name in ("sigma_position", "sigma_orientation", "sigma_point")}
+    changes = {name: getattr(m, name) for name in ("sigma_position", "sigma_orientation")}
     changes = {name: own * sigma for name, sigma in changes.items() if sigma is not None}
+    changes["sigmas"] = {name: own * sigma for name, sigma in m.sigmas.items()}
     if m.pairs is not None:
         changes["pairs"] = replace(m.pairs, sigma_distance=own * m.pairs.sigma_distance)
     if m.groups is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from fg_calib.initialization import anchors_from_lengths, offset_from_lengths
 from fg_calib.inputs import Floats
 from fg_calib.measurements import Coincidence, Landmark, LandmarkKind, Landmarks, Length, Table
-from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Kinds, Quantity
+from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Kinds
 
 ANCHOR = LandmarkKind(
     "A",
@@ -62,7 +62,6 @@ class AnchorGauge(Instrument):
     """Lengths to anchors; where one was measured as 0 the tool is at the anchor, unless the offset is unknown."""
 
     model, words = "anchor", "lengths to anchors"
-    quantities = (Quantity("length", "distance", "distance", "lengths to the anchors"),)
     columns = (Column(("anchor",), "", "Which anchor the distance is to"), *LENGTH_COLUMNS)
     labels = optional_labels = ("anchor",)
     noise, landmarks, options = ("distance",), (ANCHOR, OFFSET), ("offset",)
@@ -71,7 +70,7 @@ class AnchorGauge(Instrument):
     def kinds(self, table: Table) -> Kinds:
         """See `Instrument.kinds`."""
         m, there = table.measurements, self.names(table.measurements, ANCHOR).index >= 0
-        contact = (np.zeros(1) if m.length is None or table.offset else m.length == 0.0).astype(np.bool_)
+        contact = np.zeros_like(there) if table.offset else m.columns.get("distance", np.ones(1)) == 0.0
         return [(AnchorDistance(), there & ~contact), (AnchorContact(), there & contact)]
 
     def landmark(self, table: Table, kind: LandmarkKind, name: str) -> Landmark:

@@ -54,7 +54,7 @@ class Column(NamedTuple):
 
 
 LENGTH_COLUMNS = (
-    Column(("distance",), "length", "To the anchor (0: contact), or from the plane (0 without)"),
+    Column(("distance",), "length", "To the anchor (0: contact), or from the plane (0 without)", generic=True),
     Column(("sigma_distance",), "length", "1 sigma of that"),
 )
 

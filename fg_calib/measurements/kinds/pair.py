@@ -247,11 +247,11 @@ def contact_blocks(table: Table, number: int, landmarks: Landmarks) -> list[Meas
     found, rows, pairs = list[MeasurementBlock](), np.flatnonzero(groups.index >= 0), groups.pairs
     place = landmarks.add([Landmark(POINT, name, np.full(3, np.nan)) for name in groups.names], m.source)
     if len(rows):
-        if m.sigma_point is None or not np.isfinite(m.sigma_point[rows]).all():
+        if (sigma := m.sigma("point")) is None or not np.isfinite(sigma[rows]).all():
             raise ProblemError(m.source, "no sigma for touched points", "noise.point or a column sigma_point")
         touched = groups.index[rows]
         fields: dict[str, Any] = {"nuisances": place[touched], "of": Labels(groups.names, touched), "source": m.source}
-        arrays = rows, np.zeros((len(rows), 0)), m.sigma_point[rows, None]
+        arrays = rows, np.zeros((len(rows), 0)), sigma[rows, None]
         found.append(MeasurementBlock.of_rows(TouchedPoint(), number, *arrays, test=m.test[rows], **fields))
     if n := pairs.n_pairs:
         if not np.isfinite(pairs.sigma_distance).all():

@@ -9,7 +9,7 @@ import numpy as np
 from fg_calib.initialization import plane_from_distances
 from fg_calib.inputs import Floats
 from fg_calib.measurements import Estimate, Frames, Kind, LandmarkKind, Landmarks, Rows, Table, directions
-from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Quantity
+from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument
 
 
 def normal_and_distance(behind: Floats, through: Floats, covariance: Floats) -> Estimate:
@@ -75,7 +75,6 @@ class PlaneGauge(Instrument):
     """Distances from planes."""
 
     model, words, kind = "plane", "distances from planes", PlaneDistance()
-    quantities = (Quantity("length", "distance", "distance", "distances from the planes"),)
     columns = (Column(("plane",), "", "Which plane the tool point is on, or at a distance from"), *LENGTH_COLUMNS)
     labels = optional_labels = ("plane",)
     noise, landmarks = ("distance",), (BEHIND, PLANE)
@@ -84,7 +83,7 @@ class PlaneGauge(Instrument):
     def values(self, table: Table) -> Floats:
         """Distances from planes; 0, on the plane, where no column says them. See `Instrument.values`."""
         m = table.measurements
-        return np.zeros((m.n_configurations, 1)) if m.length is None else super().values(table)
+        return super().values(table) if "distance" in m.columns else np.zeros((m.n_configurations, 1))
 
     def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
         """See `Instrument.start_landmarks`."""
