@@ -183,9 +183,10 @@ def run_python(text, folder, fg_calib):
 RUN = {"yaml": read_yaml, "csv": read_csv, "bash": parse_commands, "sh": parse_commands, "console": run_console}
 RUN |= {
     "python": run_python,
+    "diff": lambda *_: None,  # see `measurements/test_extensions.py`
     "text": lambda text, *others: run_console(f"$ fg-calib calibrate demo/calibration.yaml\n{text}", *others),
 }
-FAST = ("bash", "sh", "csv", "yaml")
+FAST = ("bash", "sh", "csv", "yaml", "diff")
 EVERY_SNIPPET = [
     pytest.param(page, n, id=f"{page}-{n}", marks=() if language in FAST else pytest.mark.slow)
     for page in PAGES
