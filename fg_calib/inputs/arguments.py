@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache, wraps
+from importlib import import_module
 from inspect import signature
 from numbers import Integral, Real
 from pathlib import Path
@@ -53,6 +54,22 @@ _WORDS = {
     dict: "a mapping",
     Callable: "a function",
 }
+
+
+class Reader:
+    """A constructor that is a function of `fg_calib.io`, which the folder of its class does not import.
+
+    Args:
+        function: Its name.
+    """
+
+    def __init__(self, function: str) -> None:
+        self._function = function
+
+    def __get__(self, instance: object, owner: type) -> Callable[..., Any]:
+        """The function."""
+        found: Callable[..., Any] = getattr(import_module("fg_calib.io"), self._function)
+        return found
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from fg_calib.inputs import (
     InputError,
     Integers,
     Pairing,
+    Reader,
     brief,
     check_number,
 )
@@ -207,9 +208,7 @@ class Measurements(FrozenArrays):
     columns: Mapping[str, Floats] = field(default_factory=dict)
     sigmas: Mapping[str, Floats] = field(default_factory=dict)
 
-    from_arrays: ClassVar[Callable[..., Measurements]]
-    from_frame: ClassVar[Callable[..., Measurements]]
-    """`io.read_arrays` and `io.read_measurements`, attached by the package: this folder knows nothing of tables."""
+    from_arrays, from_frame = Reader("read_arrays"), Reader("read_measurements")
 
     @classmethod
     def at(cls, readings: Floats, **fields: Any) -> Measurements:

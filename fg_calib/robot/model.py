@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,6 +23,7 @@ from fg_calib.inputs import (
     NEAR,
     Floats,
     InputError,
+    Reader,
     as_figures,
     as_floats,
     check,
@@ -282,8 +283,7 @@ class Robot:
     elements: tuple[Element, ...]
     urdf: UrdfSource | None = field(default=None, repr=False)
 
-    from_urdf: ClassVar[Callable[..., Robot]]
-    """`io.read_urdf`, attached by the package: this folder knows nothing of files."""
+    from_urdf = Reader("read_urdf")
 
     @classmethod
     @checked
