@@ -1,10 +1,10 @@
 """Check of a job's set-up: mistakes that explain why residuals before calibration are far too large.
 
 Each mistake is undone on some rows of a table: units, signs, orders of columns, inverted poses, a frame or a tool that
-is not what the job says; then two of them together. A mistake explains the table if undoing it divides the excess (see
-`nominal_residuals`) by `REDUCTION` at least and leaves no more than `EXPLAINED`. Where several do, the simplest comes
-first: a unit before the meaning of columns, that before a single joint, and a frame or a tool, which bring unknowns of
-their own, last.
+is not what the job says. A mistake explains the table if undoing it divides the excess (see `nominal_residuals`) by
+`REDUCTION` at least and leaves no more than `EXPLAINED`. Where several do, the simplest comes first: a unit before the
+meaning of columns, that before a single joint, and a frame or a tool, which bring unknowns of their own, last. Two
+mistakes at once are not looked for.
 
 Base and tool are one for all tables, so a table that is wrong spoils the residuals of all others; each is therefore
 judged by the base and tool that it determines alone. Only where all tables are right alone can they disagree on base
@@ -34,10 +34,7 @@ EXPLAINED = 4.0
 """Largest excess that may be left once a mistake is undone."""
 
 REDUCTION = 5.0
-"""Undoing a mistake divides the excess by this at least; undoing two, the excess that either alone leaves."""
-
-N_COMBINED = 6
-"""The best single mistakes, each of which is combined with any other."""
+"""Undoing a mistake divides the excess by this at least."""
 
 NEGLIGIBLE_EXCESS = 1e-6
 """Excess below which there is nothing to explain: each unknown takes its own row up."""
@@ -47,23 +44,20 @@ OTHER_TOOL = "tool or base differ from those of the other tables (another target
 
 @dataclass(frozen=True)
 class Explanation:
-    """A mistake in the set-up that explains a table, or two together.
+    """A mistake in the set-up that explains a table.
 
     Attributes:
-        mistakes: Each as the end of a sentence "residuals fall if ...".
-        residuals: Residuals once they are undone, by kind.
+        mistake: The end of a sentence "residuals fall if ...".
+        residuals: Residuals once it is undone, by kind.
     """
 
-    mistakes: tuple[str, ...]
+    mistake: str
     residuals: tuple[TypicalResidual, ...]
 
     @property
     def excess(self) -> float:
         """The largest excess of all kinds; infinite without residuals."""
         return max((residual.excess for residual in self.residuals), default=np.inf)
-
-    def __str__(self) -> str:
-        return " and ".join(self.mistakes)
 
 
 @dataclass(frozen=True)
@@ -101,8 +95,8 @@ class SetupCheck(Brief):
             return f"{words}: no common mistake in a set-up explains it"
         first, *others = self.explanations
         after = next(r for r in first.residuals if r.kind == worst.kind)
-        also = "".join(f", or if {other}" for other in others[:2])
-        return f"{words} fall from {shown(worst)} to {shown(after)} in the median if {first}{also}"
+        also = "".join(f", or if {other.mistake}" for other in others[:2])
+        return f"{words} fall from {shown(worst)} to {shown(after)} in the median if {first.mistake}{also}"
 
 
 def shown(residual: TypicalResidual) -> str:
@@ -134,7 +128,7 @@ def check_setup(
 
     Note:
         Models with landmarks (anchors, planes, boards) and targets are looked at only where `doubtful`: these have to
-        be located first, a hundred times in all, and two mistakes at once are not looked for there.
+        be located first, a hundred times in all.
 
     Raises:
         InputError: An option is not one of those possible.
@@ -190,7 +184,7 @@ def check_tables(
     if not reporting(checks):
         for number, one in enumerate(together):
             if one.far:  # and the table alone is not
-                other = Explanation((OTHER_TOOL,), checks[number].residuals)
+                other = Explanation(OTHER_TOOL, checks[number].residuals)
                 checks[number] = replace(one, table=labels[number], explanations=(other,))
     return checks
 
@@ -211,49 +205,14 @@ def _check_alone(setup: Setup, doubtful: bool, found: SetupCheck) -> SetupCheck:
 
 
 def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
-    """Mistakes that explain residuals, the simplest first; two together where no single one does."""
+    """Mistakes that explain residuals, the simplest first: they leave little, and at most twice what the best does."""
     # Where residuals are no larger than predicted only what has unknowns of its own can make them much smaller.
-    least = HYPOTHESES.index((_frame,)) if given.excess < 1.0 else 0
-    single = [_trial(m) for m in setup_hypotheses(setup) if m.about >= least]
-    found = _accepted(single, given.excess / REDUCTION)
-    return found if found or not given.far or setup.has_landmarks else _accepted(_doubles(single, given.excess), np.inf)
-
-
-_Trial = tuple[tuple["Mistake", ...], Explanation]
-"""Mistakes that were undone, and the residuals that are left then."""
-
-
-def _trial(*mistakes: Mistake) -> _Trial:
-    """Mistakes with the residuals that are left once they are undone, the last of which has the others undone too."""
-    words = tuple(m.words for m in sorted(mistakes, key=lambda m: m.about))
-    return mistakes, Explanation(words, nominal_residuals(mistakes[-1].without))
-
-
-def _doubles(single: Sequence[_Trial], given: float) -> list[_Trial]:
-    """Two mistakes undone together, where that reduces the excess far below `given` and below either alone."""
-    alone, found = {one.words: trial.excess for (one,), trial in single}, dict[frozenset[str], _Trial]()
-
-    def left(trial: Explanation) -> float:  # of all kinds: undoing one of two may leave one kind as bad as before
-        return float(np.sum(np.log([r.excess for r in trial.residuals]))) if trial.residuals else np.inf
-
-    for (one,), _ in sorted(single, key=lambda pair: left(pair[1]))[:N_COMBINED]:
-        for two in setup_hypotheses(one.without):
-            words = frozenset((one.words, two.words))
-            if words not in found:
-                found[words] = _trial(one, two)
-    return [
-        pair
-        for words, pair in found.items()
-        if pair[1].excess <= min(given, *(alone.get(word, np.inf) for word in words)) / REDUCTION
-    ]
-
-
-def _accepted(trials: Sequence[_Trial], most: float) -> tuple[Explanation, ...]:
-    """Trials that leave a small enough excess, at most twice that of the best; the simplest first."""
-    good = [one for one in trials if one[1].excess <= min(most, EXPLAINED)]
-    best = max(min((trial.excess for _, trial in good), default=0.0), 0.5)
-    chosen = [one for one in good if one[1].excess <= 2.0 * best]
-    return tuple(trial for _, trial in sorted(chosen, key=lambda one: sum(mistake.about for mistake in one[0])))
+    least = HYPOTHESES.index(_frame) if given.excess < 1.0 else 0
+    undone = (one for hypothesis in HYPOTHESES[least:] for one in hypothesis(setup))
+    trials = [Explanation(mistake, nominal_residuals(without)) for mistake, without in undone]
+    found = [trial for trial in trials if trial.excess <= min(given.excess / REDUCTION, EXPLAINED)]
+    best = max(min((trial.excess for trial in found), default=0.0), 0.5)
+    return tuple(trial for trial in found if trial.excess <= 2.0 * best)
 
 
 # --- hypotheses, each undone ------------------------------------------------------------------------------------------
@@ -270,29 +229,8 @@ ANGLES = {np.pi / 180.0: "deg, not rad", 180.0 / np.pi: "rad, not deg"}
 """Units that are meant by values in another, by the factor that converts them."""
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """A mistake in a set-up, undone.
-
-    Attributes:
-        about: Place of its subject in `HYPOTHESES`: the simplest first.
-        words: The end of a sentence "residuals fall if ...".
-        without: The set-up with it undone.
-    """
-
-    about: int
-    words: str
-    without: Setup
-
-
 _Found = Iterator[tuple[str, Setup]]
-"""Words of a `Mistake`, and the set-up with it undone."""
-
-
-def setup_hypotheses(setup: Setup) -> Iterator[Mistake]:
-    """Every mistake that is known, undone in a set-up."""
-    for about, hypotheses in enumerate(HYPOTHESES):
-        yield from (Mistake(about, *found) for hypothesis in hypotheses for found in hypothesis(setup))
+"""Mistakes, each as the end of a sentence "residuals fall if ...", and the set-up with it undone."""
 
 
 def _robot_in_units(setup: Setup) -> _Found:
@@ -448,14 +386,11 @@ def _tool(setup: Setup) -> _Found:
         yield words, setup.with_tool(frozenset(setup.tool if lengths else (*setup.tool[3:], *fitted)))
 
 
-HYPOTHESES: tuple[tuple[Callable[[Setup], _Found], ...], ...] = (
-    (_robot_in_units, _measured_in_units, _readings_in_units),
-    (_inverted, _columns, _orientations, _conventions),
-    (_joint_columns,),
-    (_frame,),
-    (_tool,),
+HYPOTHESES: tuple[Callable[[Setup], _Found], ...] = (
+    *(_robot_in_units, _measured_in_units, _readings_in_units),
+    *(_inverted, _columns, _orientations, _conventions, _joint_columns, _frame, _tool),
 )
-"""Hypotheses on units, on the meaning of columns, on joints, on the frame and on the tool."""
+"""Hypotheses on units, on the meaning of columns, on joints, on the frame and on the tool: the simplest first."""
 
 
 def _rotated(setup: Setup, rotation: Rotation, roll_pitch_yaw: Floats | None = None) -> Setup:

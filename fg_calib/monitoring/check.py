@@ -197,7 +197,8 @@ def _judge(
 def _unless_misread(found: Check, at: Linear) -> Check:
     """A check that failed, but by a usual mistake in how the table is read, such as its units: then it says nothing."""
     solution = at.placed.solution
-    checks = check_tables(solution.problem, solution.parameters, doubtful=True, with_landmarks=True)
+    problem = replace(solution.problem, robot=at.placed.calibrated.arm)  # with what a set-up check may fit
+    checks = check_tables(problem, solution.parameters, doubtful=True, with_landmarks=True)
     named = tuple(str(one) for one in reporting(checks) if one.explanations)
     if not named:
         return found

@@ -155,7 +155,7 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
     { "schema": "fg-calib/inspection/1", "version", "robot", "ready", "findings", "cautions", "evaluated",
       "tables": [the fields of `TableSurvey`], "joints": [the fields of `JointRange`, with "share" and "still"],
       "residuals": [{"table", "kind", "unit", "size", "expected", "excess", "n"}],
-      "explanations": [{"table", "mistakes"}],
+      "explanations": [{"table", "mistake"}],
       "disagreements": [{"name", "ratio", "test"}],
       "n_residuals", "n_priors", "n_unknowns", "dof", "n_excluded": {reason: count},
       "observability": as observability.json,
@@ -170,7 +170,7 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
         **{key: getattr(found, key) for key in counts},
         joints=[vars(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
         residuals=[{"table": of.table, "excess": one.excess, **vars(one)} for of in setups for one in of.residuals],
-        explanations=[{"table": of.table, "mistakes": one.mistakes} for of in setups for one in of.explanations],
+        explanations=[{"table": of.table, "mistake": one.mistake} for of in setups for one in of.explanations],
         observability=observability_document(found.identifiability),
         inputs=job.inputs,
     )

@@ -1,4 +1,4 @@
-"""Tables spoilt by one usual mistake, or two, are named by it; healthy ones by none."""
+"""Tables with one usual mistake are named by it; healthy ones by none."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ from jobs import SIGMA, only, ur5e, write_job
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
-from sparing import as_case
 
 from fg_calib.assessment import assess, solve_job
 from fg_calib.diagnostics import setup_check as mistakes
@@ -77,7 +76,7 @@ CASES = [(*model, mistake) for model, mistakes in SHOWN.items() for mistake in m
 
 def named(check):
     """What the first explanation says."""
-    return str(check.explanations[0]) if check.explanations else ""
+    return check.explanations[0].mistake if check.explanations else ""
 
 
 @pytest.mark.sampled(4)
@@ -91,23 +90,6 @@ def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     check = check_setup(robot, SPOILT[mistake](m), model, frame)
     assert mistake in named(check)
     assert check.explanations[0].excess <= min(EXPLAINED, check.excess / REDUCTION)
-
-
-TWO = [
-    ("x, y, z are in mm, not m", "joint readings are in deg, not rad"),
-    ("x, y, z are in mm, not m", "joint 2 moves the other way"),
-    ("joint readings are in deg, not rad", "the poses are inverted"),
-    ("x, y, z are in mm, not m", "columns qx, qy, qz, qw hold w, x, y, z"),
-]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("two", [as_case((two,), is_slow=i in (0, 2)) for i, two in enumerate(TWO)], ids=" and ".join)
-def test_two_mistakes_at_once_are_named(tmp_path, two):
-    robot = ur5e(tmp_path)
-    m = measured(robot, placed=PLACED)
-    check = check_setup(robot, SPOILT[two[1]](SPOILT[two[0]](m)), "pose", "unknown")
-    assert all(mistake in named(check) for mistake in two)
 
 
 ANGLES = {
