@@ -172,7 +172,7 @@ class Variables(Brief):
         """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
         scales = self.scales.copy()
         for v in self.items:
-            stated, weight = self.stated[v.symbol]
+            stated, weight = self.stated[v.key]
             places = [_ALONG_TANGENT.index(k) if v.is_pose else k for k in stated]
             scales[v.columns][places] = 1.0 / weight
         return scales
@@ -183,14 +183,14 @@ class Variables(Brief):
         return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
 
     @cached_property
-    def stated(self) -> dict[str, tuple[list[int], Floats]]:
-        """Of each core variable, by its symbol: which of its parameters have a prior, and 1 / sigma of these."""
+    def stated(self) -> dict[int, tuple[list[int], Floats]]:
+        """Of each core variable, by its key: which of its parameters have a prior, and 1 / sigma of these."""
         found = {}
         for v in self.items:
             of_v = () if v.kind == "frame" or not self.priors else v.parameters
             tolerances = [self.robot.parameters[i].tolerance for i in of_v]
             weights = np.array([1.0 / t for t in tolerances if t is not None])
-            found[v.symbol] = [k for k, t in enumerate(tolerances) if t is not None], weights
+            found[v.key] = [k for k, t in enumerate(tolerances) if t is not None], weights
         return found
 
     def nominal(self) -> Floats:
@@ -448,10 +448,10 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         only: The variable whose priors are wanted; all if None.
     """
     items = variables.items if only is None else (only,)
-    n = sum(len(variables.stated[v.symbol][0]) for v in items)
+    n = sum(len(variables.stated[v.key][0]) for v in items)
     nominal, r, J, first = variables.nominal(), np.zeros(n), np.zeros((n, variables.n_columns)), 0
     for v in items:
-        stated, weight = variables.stated[v.symbol]
+        stated, weight = variables.stated[v.key]
         if not stated:
             continue
         of_v, rows, columns = v.places, slice(first, first + len(stated)), v.columns

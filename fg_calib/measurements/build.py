@@ -206,7 +206,7 @@ def find_copies(table: Table) -> tuple[int, str, int]:
     of_rows = [of.index for of in (*m.labels.values(), m.groups) if of is not None]
     columns = np.hstack([*(m.readings[k] for k in ends.T), *(index[ends] for index in of_rows)]) + 0.0  # no -0
     n_places = len(np.unique(columns, axis=0))
-    if not figures:
+    if not figures or n_places == len(ends):
         return 0, "", len(ends) - n_places
     values = [np.where(np.isnan(v), -1e300, v) for v in figures.values()]
     rows = np.hstack([columns, *values, np.any(m.test[ends], axis=1, keepdims=True)]) + 0.0
