@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -53,9 +53,8 @@ from fg_calib.measurements import (
     Measurements,
     Noise,
     Pairs,
-    limit_hint,
+    check_limits,
     no_pairs,
-    outside_limits,
 )
 from fg_calib.measurements import Column as ColumnSet
 from fg_calib.parallel import require_polars
@@ -490,7 +489,6 @@ def read_measurements(
             names its line and column.
     """
     units, noise = units or Units(), noise or Noise()
-    _check_noise(noise)
     table = read_table(path, robot, columns or {})
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
@@ -548,13 +546,6 @@ def _joint_sigma(given: float | tuple[float, ...], n_joints: int) -> Floats:
     return np.broadcast_to(np.array(given, dtype=np.float64), n_joints).copy()
 
 
-def _check_noise(noise: Noise) -> None:
-    """Raise for a sigma that is not above 0: nothing is measured exactly but joint readings."""
-    for f in fields(noise)[:-1]:
-        if f.name != "joint" and (sigma := getattr(noise, f.name)) is not None:
-            check_number(f"noise: {f.name}", sigma, above=True)
-
-
 def read_table(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column] | None = None) -> Table:
     """A table of configurations of a robot; for `columns` see `read_measurements`."""
     joints = {joint.name for joint in robot.joints}
@@ -596,14 +587,8 @@ def find_joint_columns(table: Table, robot: Robot) -> tuple[str, ...]:
 def read_readings(table: Table, columns: Sequence[str], robot: Robot, units: Units) -> Floats:
     """Joint readings within the joints' limits, shape (n_rows, n_joints), [rad] or [m]."""
     readings = table.numbers(columns) * [units.factor(joint.unit) for joint in robot.joints]
-    outside = outside_limits(readings, robot)  # (n_configurations, n_joints)
-    if outside.any():
-        row, j = divmod(int(np.argmax(outside)), robot.n_joints)
-        unit = robot.joints[j].unit
-        reading, low, high = (v / units.factor(unit) for v in (readings[row, j], *robot.limits[j]))
-        found = f"{columns[j]} = {reading:.6g} {units.name(unit)} is outside [{low:.6g}, {high:.6g}]"
-        hint = limit_hint(readings[:, j], robot, j, units.name(unit))
-        raise InputError(table.place(row), found, hint=hint)
+    shown_in = {unit: (units.name(unit), units.factor(unit)) for unit in ("rad", "m")}
+    check_limits(readings, robot, columns, table.place, shown_in)
     return readings
 
 
@@ -701,7 +686,8 @@ def _measured(table: Table, known: Iterable[str], units: Units, noise: Noise) ->
         return table.numbers(names[first], optional=optional) * factors[first]
 
     def sigma(kind: str, columns: Sequence[str]) -> Floats | None:
-        default = noise.get(kind)
+        if (default := noise.get(kind)) is not None:
+            check_number(f"noise: {kind}", default, above=True)
         if given := _one_of(table, columns, names):
             default = np.nan if default is None and kind == "point" else default  # some rows touch none
             return table.positive(names[given], default, factors[given])

@@ -204,17 +204,15 @@ def find_copies(table: Table) -> tuple[int, str, int]:
     """
     m, (ends, figures) = table.measurements, _rows_of(table)
     of_rows = [of.index for of in (*m.labels.values(), m.groups) if of is not None]
-    columns = np.hstack([*(m.readings[k] for k in ends.T), *(index[ends] for index in of_rows)]) + 0.0  # no -0
-    n_places = len(np.unique(columns, axis=0))
+    at = np.hstack([*(m.readings[k] for k in ends.T), *(index[ends] for index in of_rows)]) + 0.0  # no -0
+    n_places = len({row.tobytes() for row in at})
     if not figures or n_places == len(ends):
         return 0, "", len(ends) - n_places
-    values = [np.where(np.isnan(v), -1e300, v) for v in figures.values()]
-    rows = np.hstack([columns, *values, np.any(m.test[ends], axis=1, keepdims=True)]) + 0.0
-    first, of = np.unique(rows, axis=0, return_index=True, return_inverse=True)[1:]
-    before, two = first[of.ravel()], dict[str, None]()
-    copied = np.flatnonzero(before != np.arange(len(ends)))
-    for k in copied[:1]:
-        two = dict.fromkeys("-".join(m.ids[ends[row]].tolist()) for row in (before[k], k))
+    rows = np.hstack([at, *figures.values(), np.any(m.test[ends], axis=1, keepdims=True)]) + 0.0
+    first: dict[bytes, int] = {}
+    before = [first.setdefault(row.tobytes(), k) for k, row in enumerate(rows)]
+    copied = [k for k, earlier in enumerate(before) if earlier != k]
+    two = dict.fromkeys("-".join(m.ids[ends[row]].tolist()) for k in copied[:1] for row in (before[k], k))
     return len(copied), " and ".join(two), len(first) - n_places
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -267,17 +267,35 @@ def check_readings(readings: Floats, robot: Robot, name: str) -> None:
     """
     if readings.shape[1] != robot.n_joints:
         raise InputError(name, f"readings of {readings.shape[1]} joints", f"{robot.n_joints}, as {robot.name} has")
-    lower, upper = robot.limits.T
-    outside = outside_limits(readings, robot)
-    if outside.any():
-        row, j = divmod(int(np.argmax(outside)), robot.n_joints)
-        joint, reading = robot.joints[j], readings[row, j]
-        found = f"{joint.name} = {reading:.6g} {joint.unit} is outside [{lower[j]:.6g}, {upper[j]:.6g}]"
-        hint = limit_hint(readings[:, j], robot, j, joint.unit)
-        raise InputError(f"{name}: row {row}", found, hint=hint)
+    names, si = [joint.name for joint in robot.joints], {"rad": ("rad", 1.0), "m": ("m", 1.0)}
+    check_limits(readings, robot, names, lambda row: f"{name}: row {row}", si)
     for joint, limits, q in zip(robot.joints, robot.limits, readings.T, strict=True):
         if not joint.prismatic and np.isinf(limits).all() and np.mean(np.abs(q) > 4 * np.pi) > 0.5:
             _log.warning("%s: most readings of %s are more than two turns; are they in deg?", name, joint.name)
+
+
+def check_limits(
+    readings: Floats, robot: Robot, names: Sequence[str], place: Callable[[int], str], shown: Mapping[str, Any]
+) -> None:
+    """Check that readings are within their joints' limits.
+
+    Args:
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        robot: The robot.
+        names: What the joints are called.
+        place: What a row is called in messages.
+        shown: What rad and m are shown in: a unit and its size.
+
+    Raises:
+        InputError: One is outside.
+    """
+    outside = outside_limits(readings, robot)
+    if outside.any():
+        row, j = divmod(int(np.argmax(outside)), robot.n_joints)
+        unit, size = shown[robot.joints[j].unit]
+        reading, low, high = (v / size for v in (readings[row, j], *robot.limits[j]))
+        found = f"{names[j]} = {reading:.6g} {unit} is outside [{low:.6g}, {high:.6g}]"
+        raise InputError(place(row), found, hint=_limit_hint(readings[:, j], robot, j, unit))
 
 
 def outside_limits(readings: Floats, robot: Robot) -> Booleans:
@@ -287,7 +305,7 @@ def outside_limits(readings: Floats, robot: Robot) -> Booleans:
     return outside
 
 
-def limit_hint(readings: Floats, robot: Robot, joint: int, unit: str) -> str:
+def _limit_hint(readings: Floats, robot: Robot, joint: int, unit: str) -> str:
     """What to do about a joint that has a reading outside its limits.
 
     A smaller unit is suggested where a reading is far outside and all are within the limits in that unit.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fg_calib import Robot
-from fg_calib.measurements.dataset import limit_hint
+from fg_calib.measurements.dataset import _limit_hint
 
 WIDEN = "widen the joint's limits if the reading is right"
 ROBOT = Robot.from_dh(np.zeros((2, 4)), types=["prismatic", "revolute"], limits=[(0.1, 0.9), (-1.2, 2.5)])
@@ -21,4 +21,4 @@ ROBOT = Robot.from_dh(np.zeros((2, 4)), types=["prismatic", "revolute"], limits=
     ],
 )
 def test_another_unit_is_suggested_only_where_it_explains_all_rows(joint, unit, readings, said):
-    assert limit_hint(readings, ROBOT, joint, unit) == said
+    assert _limit_hint(readings, ROBOT, joint, unit) == said
