@@ -1,29 +1,29 @@
 """Why directions are lost: each is moved at random configurations, and what it does to the tool tells the cause.
 
-A cause is stated only if it is checked: that the tool does not move, that everything moves as one body, that the tool
+A cause is given only if it is checked: that the tool does not move, that everything moves as one body, that the tool
 only turns about its own point, that landmarks take the direction up (`find_confounding`), and so on. Where no check
 succeeds the reason is `NO_CAUSE`, never a guess.
 
 A landmark is confounded with a direction where the direction is lost with the columns of its kind projected out, and
 seen with the landmarks held where they are: both are computed from the whitened rows, leaving one kind out after the
-other. Random configurations may show what the user's do not: targets, anchors, planes and boards stay where they are,
-known or not as they are; the arm goes to random configurations, and measures what it predicts.
+other. Random configurations may show what the user's do not: the arm goes there, and each model measures what it
+predicts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
-from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, places_of, square_root, true_problem
-from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model, Options, Pairing
-from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Instrument, Labels, Measurements, Table
+from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, random_problem, square_root
+from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model
+from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Instrument
 from fg_calib.observability.indices import Observability
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import Robot, build_chain, forward, random_readings
+from fg_calib.robot import build_chain, forward, random_readings
 
 
 @dataclass(frozen=True)
@@ -145,85 +145,7 @@ def confounding_in_words(letters: Sequence[str]) -> str:
 
 
 N_RANDOM = 60
-"""Random configurations of each table."""
-
-
-def at_random_configurations(problem: Problem, parameters: Floats) -> Problem | None:
-    """The tables of a problem at random configurations, each of those that would say the same once.
-
-    Contacts cannot be planned at random configurations: a table of contacts alone counts as one of positions in an
-    unknown frame. Custom kinds are left out.
-
-    Args:
-        problem: The problem.
-        parameters: Its parameter vector: where the arm and everything else is.
-
-    Returns:
-        A problem of the same parameters, noise assumed as `Robot.scale_of` says; None where nothing is left.
-    """
-    robot = problem.robot.with_values(parameters[problem.variables.robot_span])
-    places, before = places_of(problem, parameters), () if problem.knowledge is None else problem.knowledge.views
-    q = np.zeros((1, problem.robot.n_joints))
-    anything = Measurements.at(q, position=np.zeros((1, 3)), rotation=np.eye(3)[None])
-    earlier = [
-        Table(anything, m, frame=frame) for m, frame in before if INSTRUMENTS[m].is_pose or INSTRUMENTS[m].uses_pairs
-    ]
-    different: dict[tuple[object, ...], Table] = {}
-    for table in (*problem.data.tables, *earlier):
-        if table.model is not None and (named := _named(table))[1]:
-            model = INSTRUMENTS[table.model].random_model(table)
-            different[model, table.frame, named[0], frozenset(named[1]), table.offset] = table
-    generator = np.random.default_rng(0)
-    tables = [
-        at_configurations(robot, table, random_readings(robot, N_RANDOM, generator), places, f"random {i}")
-        for i, table in enumerate(different.values())
-    ]
-    return true_problem(robot, tables, Options(gauge="none", pair_errors="independent"), places) if tables else None
-
-
-def _named(table: Table) -> tuple[str, list[str | None]]:
-    """The column that names landmarks, and those of the train rows; None of rows without a name."""
-    instrument = INSTRUMENTS[INSTRUMENTS[str(table.model)].random_model(table)]
-    column = next(iter(instrument.labels), "")
-    labels, train = table.measurements.labels.get(column), ~table.measurements.test
-    if labels is None:
-        return column, [column] if instrument.sees_landmarks and column not in instrument.optional_labels else [None]
-    return column, [labels.names[k] if k >= 0 else None for k in np.unique(labels.index[train]).tolist()]
-
-
-_Places = Mapping[tuple[str, str], Floats]
-
-
-def at_configurations(robot: Robot, table: Table, q: Floats, places: _Places, source: str) -> Table:
-    """A table of what the arm predicts at configurations, landmarks in turn.
-
-    Args:
-        robot: The arm.
-        table: What instrument it is; for pixels boards are seen, or the tool from the room.
-        q: The configurations, shape (n, n_joints).
-        places: Of the landmarks that the table names.
-        source: What the table is called.
-    """
-    model = INSTRUMENTS[str(table.model)].random_model(table)
-    poses, (column, names) = forward(build_chain(robot), robot.trig(q)), _named(table)
-    real = [name for name in names if name is not None]
-    index = np.array([real.index(name) if name is not None else -1 for name in names])[np.arange(len(q)) % len(names)]
-    length, angle = (np.full(len(q), robot.scale_of(unit)) for unit in ("m", "rad"))
-    m = Measurements.at(
-        q,
-        position=poses.position,
-        rotation=poses.rotation,
-        sigma_position=np.tile(length[:, None], 3),
-        sigma_orientation=np.tile(angle[:, None], 3),
-        sigmas=dict.fromkeys(INSTRUMENTS[model].generic_columns, length),
-        labels={column: Labels(tuple(real), index)} if real else {},
-        source=table.measurements.source,
-    )
-    m = INSTRUMENTS[model].predict(m, poses, lambda kind, names: np.array([places[kind.letter, one] for one in names]))
-    frame = "unknown" if model != table.model and INSTRUMENTS[model].is_pose else table.frame
-    known = {name: k for name, k in table.known.items() if name in real}
-    return Table(replace(m, source=source), model, Pairing("chain"), frame, known=known, offset=table.offset)
-
+"""Random configurations at which directions are moved."""
 
 NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"
@@ -253,28 +175,29 @@ def explain(problem: Problem, parameters: Floats, observability: Observability) 
     names, lost = observability.names, observability.lost
     if not lost:
         return ()
-    motion = _Motion(problem, parameters, ObservedQuantities.of(problem))
+    observed = ObservedQuantities.of(problem)
+    motion = _Motion(problem, parameters, observed)
     directions = np.array([[relation.get(name, 0.0) for name in names] for relation in lost]).T
     confounding = find_confounding(problem, parameters, directions)
-    touched = any(table.measurements.groups is not None for table in problem.data.tables)
 
     @cache
     def seen() -> Booleans:
         """Whether each direction is seen at random configurations; what custom kinds would show there is not known."""
-        anywhere = at_random_configurations(problem, parameters)
-        effect = np.zeros((1, len(directions))) if anywhere is None else named_triangle(anywhere, anywhere.start)
-        largest = float(np.linalg.norm(effect, axis=0).max())
-        shown: Booleans = np.linalg.norm(effect @ directions, axis=0) > 1e-6 * largest * np.abs(directions).max(axis=0)
+        shown, robot = np.zeros(len(lost), dtype=np.bool_), motion.robot
+        for model, frame in observed.views:
+            known = frame if INSTRUMENTS[model].is_pose else "known"
+            anywhere = random_problem(robot, model, known, n_configurations=N_RANDOM, seed=0)
+            effect = named_triangle(anywhere, anywhere.start)
+            least = 1e-6 * float(np.linalg.norm(effect, axis=0).max()) * np.abs(directions).max(axis=0)
+            shown |= np.linalg.norm(effect @ directions, axis=0) > least
         return shown
 
     def reason(k: int, direction: Floats) -> str:
         by = confounding[k]
-        cause = motion.reason(direction) if by == () else NO_CAUSE
-        if cause != NO_CAUSE:
-            return cause
-        if not (by and touched) and seen()[k]:  # nor is it known what touches of the same points would show
-            return NOT_EXCITED
-        return NO_CAUSE if not by else BASE if motion.of_base(direction) else confounding_in_words(by)
+        if by:
+            return BASE if motion.of_base(direction) else confounding_in_words(by)
+        cause = NO_CAUSE if by is None else motion.reason(direction)
+        return NOT_EXCITED if cause == NO_CAUSE and seen()[k] else cause
 
     return tuple(LostDirection(relation, reason(k, directions[:, k])) for k, relation in enumerate(lost))
 
@@ -284,12 +207,11 @@ class _Motion:
 
     def __init__(self, problem: Problem, parameters: Floats, seen: ObservedQuantities) -> None:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
-        self._parameters = problem.estimated
-        self._seen = seen
+        self.robot, self._parameters, self._seen = robot, problem.estimated, seen
         numbers = {p.name: i for i, p in enumerate(robot.parameters)}
         columns = {numbers[p.name]: k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
-        poses = forward(chain, robot.trig(random_readings(robot, 60, np.random.default_rng(0))))
+        poses = forward(chain, robot.trig(random_readings(robot, N_RANDOM, np.random.default_rng(0))))
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, : len(columns)]
         self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
