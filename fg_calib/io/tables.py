@@ -489,6 +489,9 @@ def read_measurements(
             names its line and column.
     """
     units, noise = units or Units(), noise or Noise()
+    for kind, sigma in vars(noise).items():
+        if kind not in ("joint", "more") and sigma is not None:  # nothing but joint readings is measured exactly
+            check_number(f"noise: {kind}", sigma, above=True)
     table = read_table(path, robot, columns or {})
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
@@ -686,8 +689,7 @@ def _measured(table: Table, known: Iterable[str], units: Units, noise: Noise) ->
         return table.numbers(names[first], optional=optional) * factors[first]
 
     def sigma(kind: str, columns: Sequence[str]) -> Floats | None:
-        if (default := noise.get(kind)) is not None:
-            check_number(f"noise: {kind}", default, above=True)
+        default = noise.get(kind)
         if given := _one_of(table, columns, names):
             default = np.nan if default is None and kind == "point" else default  # some rows touch none
             return table.positive(names[given], default, factors[given])
