@@ -156,11 +156,6 @@ class Inspection(Brief):
     findings: tuple[str, ...] = ()
     cautions: tuple[str, ...] = ()
 
-    @property
-    def ready(self) -> bool:
-        """Whether nothing is to be looked at first."""
-        return not self.findings
-
 
 @checked
 @single_threaded

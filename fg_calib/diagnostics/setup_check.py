@@ -6,7 +6,7 @@ is not what the job says. A mistake explains the table if undoing it divides the
 meaning of columns, that before a single joint, and a frame or a tool, which bring unknowns of their own, last. Two
 mistakes at once are not looked for.
 
-Base and tool are one for all tables, so a table that is wrong spoils the residuals of all others; each is therefore
+Base and tool are one for all tables, so a mistake in one table shows in the residuals of all others. Each is therefore
 judged by the base and tool that it determines alone. Only where all tables are right alone can they disagree on base
 and tool, which is reported of all that are far off together.
 """

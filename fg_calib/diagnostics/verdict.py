@@ -134,7 +134,7 @@ class Case:
     @property
     def gross(self) -> GrossErrors | None:
         """The gross errors that are all that is wrong; None if there are none, or more than these is."""
-        return self.fit.goodness.gross if self.fit.goodness.spoilt and self.change is None else None
+        return self.fit.goodness.gross if self.fit.goodness.gross_alone and self.change is None else None
 
     @property
     def too_large(self) -> bool:

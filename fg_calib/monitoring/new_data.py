@@ -1,10 +1,10 @@
 """New rows of an arm that was calibrated before, with what that calibration says of it.
 
 The rows are whitened by their noise and linearised at the calibrated arm, measurement frames and whatever else does not
-stay with the arm fitted to them. What the arm and its targets may be off is fitted, too, with the calibration's
-information as rows `R s` of its own, R^T R its inverse covariance; what nothing determined, frames, anchors, planes,
-boards, touched points and offsets have no such rows. So the smallest sum of squares is chi-square by the covariance
-`N + J Sigma J^T` after what is free has been fitted.
+stay with the arm fitted to them. Errors of the arm and its targets are fitted, too, with the calibration's information
+as rows `R s` of its own, R^T R its inverse covariance. Frames, anchors, planes, boards, contact points, offsets and
+what nothing determined have no such rows. So the smallest sum of squares is chi-square by the covariance
+`N + J Sigma J^T`.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def linearise_new_data(at: Placed) -> Linear:
     wide = v.n_columns + v.n_nuisance
     every = problem.rows.states.whiten(problem.rows.private(v.at(problem.start)))
     J, r = every[:, :wide], every[:, wide]
-    stated, J_stated = graph.unknown_prior_rows(v, problem.start)
+    r_priors, J_priors = graph.unknown_prior_rows(v, problem.start)
     places = [graph.coordinates_of(v, problem.data.landmarks, name) for name in at.pinned]
     pinned = np.array([place for place in places if place is not None], dtype=np.int64).ravel()
     pinned = pinned - v.nuisance_span.start + v.n_columns
@@ -221,12 +221,12 @@ def linearise_new_data(at: Placed) -> Linear:
     free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, wide), pinned)])
     directions = np.hstack([known, unit[:, free.astype(np.int64)]])
     of_known = np.hstack([information, np.zeros((len(information), len(free)))])
-    system = np.vstack([J @ directions, of_known, J_stated @ directions])
+    system = np.vstack([J @ directions, of_known, J_priors @ directions])
     fitted = basis_of(system)
-    n_given = len(information) + len(stated)
+    n_given = len(information) + len(r_priors)
     return Linear(
         placed=at,
-        r=np.concatenate([r, np.zeros(len(information)), stated]),
+        r=np.concatenate([r, np.zeros(len(information)), r_priors]),
         system=system,
         directions=directions,
         fitted=fitted,

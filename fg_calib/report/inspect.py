@@ -97,7 +97,7 @@ def build_inspection_report(found: Inspection, job: Job) -> Group:
     return tables.report(
         line(f"{found.robot}: {'; '.join(words)}"),
         *(line(f"LOOK AT THIS FIRST: {finding}", "bold red") for finding in found.findings),
-        *([line(ready, "bold green")] if found.ready else []),
+        *([line(ready, "bold green")] if not found.findings else []),
         *([line(evaluated)] if found.evaluated else []),
         *section("Tables", _tables(found), *excluded),
         *section("Joint readings", _joints(found)),
@@ -166,7 +166,8 @@ def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
     return tables.document_of(
         "inspection",
         found,
-        "robot ready findings cautions evaluated tables disagreements expected_error dof",
+        "robot findings cautions evaluated tables disagreements expected_error dof",
+        ready=not found.findings,
         **{key: getattr(found, key) for key in counts},
         joints=[vars(joint) | {"share": joint.share, "still": joint.still} for joint in found.joints],
         residuals=[{"table": of.table, "excess": one.excess, **vars(one)} for of in setups for one in of.residuals],

@@ -161,7 +161,7 @@ class SuspectConfiguration:
 
 @dataclass(frozen=True)
 class GrossErrors:
-    """The few measurements that spoil a fit.
+    """The few measurements that make residuals of a fit too large.
 
     Attributes:
         n: How many there are.
@@ -218,7 +218,7 @@ class Goodness(FrozenArrays):
         suspect: Rows that are too large, and outliers among the fitted ones.
         configurations: Suspect configurations among the fitted rows, the worst first.
         test: The predicted rows; None without any that can be judged.
-        gross: The few gross errors that spoil the fit; None if there are none, or it cannot be told.
+        gross: The few gross errors in the fit; None if there are none, or it cannot be told.
         searched: Whether these were searched for, as far as the fit asks for it: not among too many rows.
     """
 
@@ -240,7 +240,7 @@ class Goodness(FrozenArrays):
         return found
 
     @property
-    def spoilt(self) -> bool:
+    def gross_alone(self) -> bool:
         """Whether a few gross errors are all that is wrong with the fit."""
         return self.gross is not None and all(kind.verdict != "too small" for kind in self.kinds)
 

@@ -1,10 +1,10 @@
-"""Outliers: the few measurements that spoil a fit, found by their studentised residuals, and the fit without them.
+"""Outliers: the few gross errors in a fit, found by their studentised residuals, and the fit without them.
 
-One wrong row of a table with many unknowns makes most residuals too large, for the fit gives way to it. So measurements
-far from the others of their kind are left out, everything is fitted and judged anew, those left out by how they are
+One gross error in a table with many unknowns makes most residuals too large, for the fit follows it. So measurements
+far from the others of their kind are left out, and everything is fitted and judged anew, those left out by how they are
 predicted, until the same ones are far. Far is a studentised residual, over the typical size of its kind, beyond what
-any of a clean table has (Bonferroni). Far off as outliers are they may have led the fit where the problem is not
-linear, so the search begins again at the nominal arm where the fit without them is not as expected.
+any of a clean table has (Sidak). A fit that outliers led far from the truth is not linear there, so the search begins
+again at the nominal arm where the fit without them is not as expected.
 
 References:
     Hadi, Simonoff (1993), Procedures for the identification of multiple outliers in linear models. JASA 88(424).
@@ -24,19 +24,19 @@ from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, chi_squar
 from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table, suspect_level
 
 MAX_ROWS = 20_000
-"""Rows up to which outliers are looked for: of more, few of them spoil little."""
+"""Rows up to which outliers are looked for: among more, a few do little harm."""
 
 MAX_ROUNDS = 10
 """How often the fit is made again."""
 
 FINE = ("as specified", "too large", "unknown")
-"""Verdicts of kinds that nothing spoils."""
+"""Verdicts of kinds without gross errors."""
 
 _State = tuple[Solution, Spread, ResidualTable]
 
 
 def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTable, fit: Goodness) -> Goodness:
-    """The goodness of a fit, by kind with that of the fit without outliers where a few spoil it.
+    """The goodness of a fit, by kind with its cause where a few outliers make it bad.
 
     Args:
         solution: The solution.
@@ -50,7 +50,7 @@ def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTa
     if np.sum(table.used) > MAX_ROWS:
         return replace(fit, searched=False)
     found = _fit_without_outliers(solution, table, fit)
-    if found is None or not _is_fine(found[2]):  # the nominal arm is nearer to the truth than a fit that went astray
+    if found is None or not _is_fine(found[2]):  # the nominal arm may be nearer to the truth
         at_nominal = replace(solution, parameters=solution.before)
         state = at_nominal, spread_of(at_nominal), residual_table(at_nominal)
         other = _fit_without_outliers(solution, table, judge_fit(*state))
@@ -118,7 +118,7 @@ def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem
 
 
 def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, rest: Goodness) -> Goodness:
-    """The fit's kinds with those of the fit without the rows left out."""
+    """The fit with what the fit without the rows left out says of its kinds, and with the gross errors."""
     size = np.where(out, np.abs(rest.studentised), 0.0)
     wrong = {table.groups[code] for code in np.unique(table.group[size > rest.level])}
     fine = {(kind.table, kind.kind) for kind in rest.kinds if kind.verdict in ("as specified", "too large")}

@@ -49,7 +49,7 @@ def said(found):
 @pytest.mark.slow
 def test_the_bundled_example_is_ready_without_a_note(whole_example):
     found = inspect_job(read_job(whole_example / "calibration.yaml"))
-    assert found.ready
+    assert not found.findings
     assert said(found) == ()
     (table,) = found.tables
     assert (table.n_rows, table.n_test, table.n_pairs, table.n_test_pairs) == (552, 500, 51, 499)
@@ -121,7 +121,7 @@ def test_limits_that_cannot_be_evaluated_are_reported(arm, n_test):
         True
     ] * (n_test == 0)
     folds = Options(model="pose", frame="unknown", accept={"position": 1e-3}, folds=5)
-    assert inspect_job(Job(None, arm, m, folds)).ready
+    assert not inspect_job(Job(None, arm, m, folds)).findings
 
 
 @pytest.mark.sampled(2)
@@ -150,7 +150,7 @@ def test_a_wrong_row_of_every_instrument_is_named(name):
 def test_a_robust_loss_makes_wrong_rows_a_caution(arm):
     m = measured(arm)
     found = inspected(arm, replace(m, position=plus(m.position, [7], 0.1)), loss="gnc")
-    assert found.ready
+    assert not found.findings
     assert found.cautions[0].endswith(": 1 (7)")
 
 
@@ -190,7 +190,7 @@ def test_a_joint_that_hardly_moves_is_reported(arm):
     q[:, 3] = 0.3
     found = inspected(arm, measured(arm, readings=q))
     assert [joint.name for joint in found.joints if joint.still] == ["q4"]
-    assert found.ready
+    assert not found.findings
     assert found.cautions[0] == "q4 hardly moves: its zero is not distinguishable from the link before"
     assert any("not excited by these configurations" in caution for caution in found.cautions)
 

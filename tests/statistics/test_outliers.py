@@ -75,7 +75,7 @@ def test_noise_specified_too_small_is_named_next_to_outliers(n):
     found = assess(solve(problem_of(robot, m, "position")))
     assert [fit.verdict for fit in found.fit.goodness.kinds] == ["too small"]
     assert found.fit.goodness.gross.names
-    assert not found.fit.goodness.spoilt
+    assert not found.fit.goodness.gross_alone
 
 
 @pytest.mark.slow
@@ -86,5 +86,5 @@ def test_what_is_not_modelled_is_no_outlier(error, k):
     solution = solve(problem_of(robot, m, "pose"))
     found = assess(solution)
     assert not {fit.verdict for fit in found.fit.goodness.kinds} & {"outliers", "others"}
-    assert not found.fit.goodness.spoilt
+    assert not found.fit.goodness.gross_alone
     assert "loss: gnc" not in format_report(solution, found)
