@@ -303,17 +303,20 @@ def all_variables(robot: Robot) -> Variables:
     return build_variables(robot.with_estimated(names_of(robot.parameters)), [False], False)
 
 
-def motion(rows: Linear, found: HypothesisTest, readings: Floats | None = None) -> Floats:
-    """How a change moves the tool, shape (n, 2, 3), rotation first, [rad] and [m].
+def random_configurations(robot: Robot) -> Floats:
+    """Configurations at which changes are compared, shape (n, n_joints), [rad] (prismatic: [m])."""
+    return random_readings(robot, N_RANDOM, np.random.default_rng(0))
+
+
+def motion(rows: Linear, found: HypothesisTest) -> Floats:
+    """How a change moves the tool at random configurations, shape (n, 2, 3), rotation first, [rad] and [m].
 
     Args:
         rows: The rows at the calibrated arm.
         found: The change; no gross errors.
-        readings: The configurations, shape (n, n_joints); random ones if None.
     """
-    q = random_readings(rows.robot, N_RANDOM, np.random.default_rng(0)) if readings is None else readings
     v = all_variables(rows.robot)
-    J = forward(v.chains[0].at(v.nominal()), v.robot.trig(q)).jacobian
+    J = forward(v.chains[0].at(v.nominal()), v.robot.trig(random_configurations(rows.robot))).jacobian
     out: Floats = (J @ (found.hypothesis.directions @ found.change)).reshape(-1, 2, 3)
     return out
 
@@ -367,8 +370,7 @@ def advise_configurations(rows: Linear, likely: Sequence[HypothesisTest]) -> Adv
     if len(changes) < 2 or all(table.model not in POSE_MODELS for table in rows.placed.problem.data.tables):
         return None
     one, other = changes
-    q = random_readings(rows.robot, N_RANDOM, np.random.default_rng(0))
-    moved = motion(rows, one, q) - motion(rows, other, q)
+    q, moved = random_configurations(rows.robot), motion(rows, one) - motion(rows, other)
     in_scale = moved / np.array([[rows.robot.scale_of("rad")], [rows.robot.scale_of("m")]])
     best = np.argsort(-np.linalg.norm(in_scale, axis=(1, 2)), kind="stable")[:N_ADVISED]
     apart = np.linalg.norm(moved[best, 1], axis=1)

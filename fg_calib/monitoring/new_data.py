@@ -152,19 +152,15 @@ class Linear:
 
     Attributes:
         placed: The rows.
-        r: Residuals, zeros for what is known below them, shape (m + k,).
-        system: The rows by what is fitted, then what is known of that, shape (m + k, n).
-        directions: What is fitted, in the columns of `placed.problem`, shape (n_columns + n_nuisance, n).
-        fitted: Basis of `system`, shape (m + k, rank).
+        left: Residuals after the fit of the rows, then of what is known, shape (m + k,).
+        fitted: Basis of what is fitted, shape (m + k, rank).
         of_arm: Derivatives in the arm's columns, shape (m, n_robot_columns).
         dof: Degrees of freedom of chi-square.
         n_free: Directions that were fitted to the new rows alone.
     """
 
     placed: Placed
-    r: Floats
-    system: Floats
-    directions: Floats
+    left: Floats
     fitted: Floats
     of_arm: Floats
     dof: int
@@ -176,23 +172,13 @@ class Linear:
         return self.placed.problem.robot
 
     @property
-    def left(self) -> Floats:
-        """What the fit leaves of the residuals."""
-        out: Floats = self.r - self.fitted @ (self.fitted.T @ self.r)
-        return out
-
-    @property
     def chi2(self) -> float:
         """Chi-square, by noise and by what the arm may be off."""
         return float(np.sum(self.left**2))
 
-    def stacked(self, columns: Floats) -> Floats:
-        """Columns of the rows with zeros for what is known, shape (m + k, n)."""
-        return np.vstack([columns, np.zeros((len(self.r) - len(columns), columns.shape[1]))])
-
     def new(self, columns: Floats) -> Floats:
-        """What columns of the rows have that is not fitted, shape (m + k, n)."""
-        wide = self.stacked(columns)
+        """What columns of the rows, shape (m, n), have that is not fitted, shape (m + k, n)."""
+        wide = np.pad(columns, ((0, len(self.left) - len(columns)), (0, 0)))
         for _ in range(2):  # once more: rounding of the first time
             wide = wide - self.fitted @ (self.fitted.T @ wide)
         return wide
@@ -221,14 +207,12 @@ def linearise_new_data(at: Placed) -> Linear:
     free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, wide), pinned)])
     directions = np.hstack([known, unit[:, free.astype(np.int64)]])
     of_known = np.hstack([information, np.zeros((len(information), len(free)))])
-    system = np.vstack([J @ directions, of_known, J_priors @ directions])
-    fitted = basis_of(system)
+    fitted = basis_of(np.vstack([J @ directions, of_known, J_priors @ directions]))
+    r = np.concatenate([r, np.zeros(len(information)), r_priors])
     n_given = len(information) + len(r_priors)
     return Linear(
         placed=at,
-        r=np.concatenate([r, np.zeros(len(information)), r_priors]),
-        system=system,
-        directions=directions,
+        left=r - fitted @ (fitted.T @ r),
         fitted=fitted,
         of_arm=J[:, : v.n_robot_columns],
         dof=problem.n_independent + n_given - fitted.shape[1],
