@@ -89,7 +89,7 @@ def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
     """Many jobs for the terminal: a line of each, then how many are good; `seconds` is the duration of all together."""
     from rich.console import Group
 
-    from fg_calib.report import in_order, line, table_of, unit_shown
+    from fg_calib.report import in_order, line, shown_in, table_of
 
     units = {kind: unit for job in jobs for kind, unit in job.units.items()}
     kinds, rows = in_order(units), []
@@ -98,7 +98,7 @@ def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
         rows.append(
             (job.name, job.verdict, job.rows, *values, job.reduced_chi2, job.seconds, "; ".join(job.reasons[:1]))
         )
-    columns = [f"{kind} {unit_shown(units[kind])}|{units[kind]}| " for kind in kinds]
+    columns = [f"{kind} {shown_in(units[kind]).unit}|{units[kind]}| " for kind in kinds]
     table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows, wrap=True)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())
     return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))

@@ -146,7 +146,7 @@ def probability_of_noise(solution: Solution) -> float | None:
         estimated, rows that share errors but are weighted as independent.
     """
     problem = solution.problem
-    if problem.data.landmarks.names or not _is_plain(problem) or problem.missing_correlation:
+    if problem.data.landmarks.names or not _is_plain(problem) or problem.rows.counted_as_private:
         return None
     fit, J, names = regress(solution)
     least, n = 1.0, 0

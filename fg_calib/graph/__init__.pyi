@@ -57,7 +57,6 @@ from .variables import (
     corrections_of,
     frame_of,
     pose_of,
-    preference,
     prior_rows,
     unknown_prior_rows,
 )
@@ -110,7 +109,6 @@ __all__ = [
     "places_of",
     "pose_of",
     "predicted_problem",
-    "preference",
     "prior_rows",
     "problem_at",
     "problem_of",

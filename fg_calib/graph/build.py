@@ -12,7 +12,7 @@ import numpy as np
 from fg_calib import inputs
 from fg_calib.graph.normal_system import identifiable_subset
 from fg_calib.graph.problem import Problem, named_rows, problem_at, start_of, tables_of, variables_of
-from fg_calib.graph.variables import Variables, preference
+from fg_calib.graph.variables import Variables
 from fg_calib.inputs import Floats, Integers, Options, Pairing, ProblemError, check_names, checked
 from fg_calib.job import Job
 from fg_calib.measurements import (
@@ -135,7 +135,7 @@ def kept_of(problem: Problem, prefer: Sequence[str]) -> list[str]:
     """
     v, estimated = problem.variables, problem.estimated
     rows = named_rows(v, problem.start, problem.system.left.A)
-    ranks = [preference(p, prefer) for p in estimated]
+    ranks = [p.preference(prefer) for p in estimated]
     found = identifiable_subset(rows, np.array([problem.robot.scale_of(p.unit) for p in estimated]), ranks)
     kept = [v.names[i] for i in found]
     for item in v.items:

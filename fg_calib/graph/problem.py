@@ -260,11 +260,6 @@ class Problem(FrozenArrays):
         """Whether true joint values are estimated."""
         return self.options.encoder == "estimated" and bool(np.any(self.data.sigma_joint > 0.0))
 
-    @property
-    def missing_correlation(self) -> bool:
-        """Whether measurements share errors but were asked to count as independent."""
-        return self.rows.counted_as_private
-
     @cached_property
     def _square_roots(self) -> Callable[[bytes], Floats]:
         """Rows [A r] with the Gram matrix of the train rows, error states eliminated, at a parameter vector's bytes."""
@@ -529,7 +524,7 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
         With J the whitened Jacobian, landmarks eliminated, and C the covariance of the whitened rows, shape
         (n_columns, n_columns).
     """
-    if not problem.missing_correlation:
+    if not problem.rows.counted_as_private:
         return None
     n, wide = problem.variables.n_columns, problem.rows.private(problem.variables.at(parameters))
     J = wide[:, :n] + wide[:, n:-1] @ problem.linearize(parameters).left.follow

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from fg_calib.graph.error_states import State
 from fg_calib.inputs import Brief, Floats
 from fg_calib.measurements import Landmarks
-from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Parameter, Robot, build_chain, names_of, yaw_pitch_roll
+from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Robot, build_chain, names_of, yaw_pitch_roll
 
 VariableKind = Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
 
@@ -483,14 +483,3 @@ def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats
     x = np.concatenate([np.zeros(0), *(parameters[v.places] - mean for v, mean, _ in found)])
     sigma = np.concatenate([np.ones(0), *(s for _, _, s in found)])
     return x / sigma, np.eye(variables.n_columns + variables.n_nuisance)[columns] / sigma[:, None]
-
-
-def preference(parameter: Parameter, prefer: Sequence[str]) -> int:
-    """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `PARAMETER_KINDS`.
-
-    Base and tool are estimated only where the user asks for it, and may be far from nominal.
-    """
-    if parameter.name in prefer:
-        return list(prefer).index(parameter.name)
-    of_frame = parameter.name.startswith(("base.", "tool."))
-    return len(prefer) + (0 if of_frame else 1 + parameter.order)

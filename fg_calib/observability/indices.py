@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy.sparse.csgraph import connected_components
 
-from fg_calib.graph import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined, first_independent, preference
+from fg_calib.graph import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined, first_independent
 from fg_calib.inputs import Figure, Floats, FrozenArrays
 from fg_calib.robot import Parameter, names_of
 
@@ -251,7 +251,7 @@ def _groups(
     if n_lost <= 0:
         return ()
     # Eliminate the parameters one would rather give up: each relation then holds one of them and kept ones only.
-    order = sorted(alive, key=lambda i: (-preference(parameters[i], prefer), i))
+    order = sorted(alive, key=lambda i: (-parameters[i].preference(prefer), i))
     N = null[:, order]
     dropped = first_independent(N, n_lost)
     relations = np.linalg.lstsq(N[:, dropped].T, np.eye(n_lost), rcond=None)[0].T @ N  # (n_lost, n_alive)

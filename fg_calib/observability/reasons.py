@@ -208,8 +208,7 @@ class _Motion:
     def __init__(self, problem: Problem, parameters: Floats, seen: ObservedQuantities) -> None:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])
         self.robot, self._parameters, self._seen = robot, problem.estimated, seen
-        numbers = {p.name: i for i, p in enumerate(robot.parameters)}
-        columns = {numbers[p.name]: k for k, p in enumerate(self._parameters)}
+        columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
         poses = forward(chain, robot.trig(random_readings(robot, N_RANDOM, np.random.default_rng(0))))
         self._R, self._p = poses.rotation, poses.position

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
-from fg_calib.robot import Robot, pose, random_readings
+from fg_calib.robot import Robot, pose, random_readings, unit_of
 from fg_calib.statistics import TangentCovariance
 
 QUANTILES: Mapping[str, float] = {"median": 0.5, "p95": 0.95, "largest": 1.0}
@@ -214,6 +214,5 @@ def _responsible(posterior: TangentCovariance, v: Floats, along: Floats) -> tupl
         shares = np.square(covariance @ v.T).sum(axis=1) / (variance * np.trace(v @ posterior.tangent @ v.T))
         changes = covariance @ along / np.sqrt(along @ posterior.tangent @ along)
     order = np.argsort(-np.nan_to_num(shares, nan=-1.0), kind="stable")[:_NAMED].tolist()
-    units = {p.name: p.unit for p in variables.robot.parameters}
     chosen = [(variables.names[i], i) for i in order if shares[i] >= _LEAST_SHARE]
-    return tuple(Responsible(name, units[name], float(shares[i]), float(changes[i])) for name, i in chosen)
+    return tuple(Responsible(name, unit_of(name), float(shares[i]), float(changes[i])) for name, i in chosen)

@@ -24,7 +24,7 @@ from .predict import (
     write_commands,
     write_prediction,
 )
-from .tables import WIDTH, in_order, line, plain, report, section, shortened, table_of, unit_shown, width_for
+from .tables import WIDTH, in_order, line, plain, report, section, shortened, shown_in, table_of, width_for
 from .text import ReportData, build_report, format_result, judged, notes_of, summary
 
 __all__ = [
@@ -59,9 +59,9 @@ __all__ = [
     "require_commands",
     "section",
     "shortened",
+    "shown_in",
     "summary",
     "table_of",
-    "unit_shown",
     "width_for",
     "write_commands",
     "write_comparison",

@@ -90,7 +90,7 @@ def _large(value: float | None, unit: str, sign: str = "", unknown: str = "-") -
     """A value with a decimal less than usual, or in powers of ten where an estimate diverged; a count as it is."""
     if isinstance(value, int):
         return str(value)
-    large = value is not None and abs(value) * tables.factor(unit) >= 1e5
+    large = value is not None and abs(value) * tables.shown_in(unit).factor >= 1e5
     return figure(value, unit, f"{sign}.1e" if large else f"{sign}z.{tables.shown_in(unit).decimals - 1}f", unknown)
 
 
@@ -303,7 +303,7 @@ def _explanations(explanations: Sequence[Explanation]) -> Table:
     for e in explanations:
         word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "is not: distinguishable"
         several = list(zip(e.change, e.sigma, e.units, strict=True)) if len(e.change) < 3 else []
-        change = ", ".join(f"{figure(c, unit, '+')} {tables.unit_shown(unit)}" for c, _, unit in several)
+        change = ", ".join(f"{figure(c, unit, '+')} {tables.shown_in(unit).unit}" for c, _, unit in several)
         sigma = ", ".join(figure(s, unit) for _, s, unit in several)
         rows.append((named(e.parameters), KINDS.get(e.kind, ""), change, sigma, e.chi2_drop, e.p_value, word))
     columns = ("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", "")
@@ -328,7 +328,7 @@ def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
     if advice is None:
         return []
     rows = [(*q, apart) for q, apart in zip(advice.readings, advice.apart, strict=True)]
-    joints = [f"q{i} [{tables.unit_shown(unit)}]|{unit}:.2f" for i, unit in enumerate(joint_units, start=1)]
+    joints = [f"q{i} [{tables.shown_in(unit).unit}]|{unit}:.2f" for i, unit in enumerate(joint_units, start=1)]
     between = " and ".join(map(named, advice.between))
     said = (
         f"Here {between} differ most, by so much in the tool's position; measure them like the rest, in the same table."

@@ -11,7 +11,7 @@ import numpy as np
 from fg_calib.inputs import Booleans, Floats
 from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of
-from fg_calib.report.tables import factor, unit_shown
+from fg_calib.report.tables import shown_in
 from fg_calib.report.text import ReportData
 from fg_calib.robot import SCALES
 from fg_calib.simulation import link_points
@@ -52,12 +52,12 @@ def error_over_joints(data: ReportData) -> list[Chart]:
     if data.rms is None or data.configurations is None:
         return []
     (kind, rms), test, ids = data.rms, data.held_out, data.configurations["id"]
-    unit = unit_shown(data.result.unit_of(kind))
+    unit = shown_in(data.result.unit_of(kind)).unit
     worst = [k for k in np.argsort(-np.nan_to_num(rms))[:WORST].tolist() if np.isfinite(rms[k])]
     found = []
     for joint, readings in zip(data.robot.joints, data.readings.T, strict=True):
-        q = readings * factor(joint.unit)
-        names = f"{charts.short(joint.name, 40)} [{unit_shown(joint.unit)}]", f"{kind} residual [{unit}]"
+        q = readings * shown_in(joint.unit).factor
+        names = f"{charts.short(joint.name, 40)} [{shown_in(joint.unit).unit}]", f"{kind} residual [{unit}]"
         plot = Plot(limits_of(q), limits_of(rms, with_zero=True), names)
         plot.dots(q[~test], rms[~test], "a")
         plot.dots(q[test], rms[test], "b")
@@ -80,8 +80,8 @@ def parameter_whiskers(data: ReportData) -> list[Chart]:
         if not shown:
             continue
         columns = [[p.correction for p in shown], [p.sigma for p in shown], [p.prior_sigma for p in shown]]
-        value, sigma, prior = np.array(columns, dtype=np.float64) * factor(unit)
-        name, spread, row = f"[{unit_shown(unit)}]", np.nan_to_num(sigma), np.arange(float(len(shown)))
+        value, sigma, prior = np.array(columns, dtype=np.float64) * shown_in(unit).factor
+        name, spread, row = f"[{shown_in(unit).unit}]", np.nan_to_num(sigma), np.arange(float(len(shown)))
         limits = limits_of(value - spread, value + spread, [0.0], prior, -prior)
         plot = Plot(limits, [p.name for p in shown], (name, ""))
         for k in np.flatnonzero(np.isfinite(prior)).tolist():
@@ -232,4 +232,4 @@ def arm_scene(data: ReportData, most: int = 300) -> Mapping[str, Any] | None:
         }
         for k, points in zip(chosen.tolist(), link_points(data.robot, data.readings[chosen]), strict=True)
     ]
-    return {"unit": unit_shown(data.result.unit_of(kind)), "family": kind, "low": low, "high": high, "items": items}
+    return {"unit": shown_in(data.result.unit_of(kind)).unit, "family": kind, "low": low, "high": high, "items": items}

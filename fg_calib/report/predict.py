@@ -120,7 +120,7 @@ def write_prediction(
     }
     for name, of in _frames(errors).items():
         for column, (kind, unit) in zip(() if of is None else of.T, POSE_KINDS.items(), strict=False):
-            columns[f"{name}_{kind}_{tables.unit_shown(unit)}"] = column * tables.factor(unit)
+            columns[f"{name}_{kind}_{tables.shown_in(unit).unit}"] = column * tables.shown_in(unit).factor
     columns["measured_near"] = np.where(found.far, "no", "yes")
 
     def write(into: Path) -> None:

@@ -150,7 +150,7 @@ def _cell(value: Any, form: str, unknown: str, unit: str) -> Text:
     if isinstance(value, Text):
         return value
     if form == "unit":
-        return line(unit_shown(value))
+        return line(shown_in(value).unit)
     if isinstance(value, str) or form in ("", ">"):
         return line(str(value))
     if kind == "q" or kind in SCALES:
@@ -165,16 +165,6 @@ def shown_in(unit: str) -> Scale:
     return SCALES.get(unit, Scale(unit, 1.0, 6))
 
 
-def factor(unit: str) -> float:
-    """The factor from [m], [rad] or [px] to the unit in which a quantity is shown."""
-    return shown_in(unit).factor
-
-
-def unit_shown(unit: str) -> str:
-    """The name of the unit in which a quantity is shown: `mm`, `deg`, `px`, or its own."""
-    return shown_in(unit).unit
-
-
 def figure(value: float | None, unit: str, form: str = "", unknown: str = "unknown") -> str:
     """A value in the unit that is shown, without the unit's name.
 
@@ -186,13 +176,13 @@ def figure(value: float | None, unit: str, form: str = "", unknown: str = "unkno
     """
     if value is None or not np.isfinite(value):
         return unknown
-    return f"{value * factor(unit):{form if '.' in form else f'{form}z.{shown_in(unit).decimals}f'}}"
+    return f"{value * shown_in(unit).factor:{form if '.' in form else f'{form}z.{shown_in(unit).decimals}f'}}"
 
 
 def in_words(value: float | None, unit: str, form: str = ".3g") -> str:
     """A value with its unit, in three digits."""
     shown = figure(value, unit, form)
-    return shown if shown == "unknown" else f"{shown} {unit_shown(unit)}"
+    return shown if shown == "unknown" else f"{shown} {shown_in(unit).unit}"
 
 
 def shortened(names: list[str], most: int) -> str:
@@ -237,7 +227,7 @@ def weak_directions(observability: Observability, most: int = 5) -> Table:
 
 def joint_columns(robot: Robot, form: str = "") -> list[str]:
     """Columns of joint readings for `table_of`."""
-    return [f"{joint.name.replace('|', '/')} {unit_shown(joint.unit)}|{joint.unit}{form}" for joint in robot.joints]
+    return [f"{joint.name.replace('|', '/')} {shown_in(joint.unit).unit}|{joint.unit}{form}" for joint in robot.joints]
 
 
 def plain(document: Any) -> Any:

@@ -88,7 +88,7 @@ class ReportData:
         for kind in sorted(kinds, key=lambda k: ["position", "distance", "point", "pixel", k].index(k)):
             values = self.configurations[f"rms_{kind}"].cast(float).fill_null(np.nan).to_numpy()
             if np.isfinite(values).any():
-                return kind, values * tables.factor(self.result.unit_of(kind))
+                return kind, values * tables.shown_in(self.result.unit_of(kind)).factor
         return None
 
 
@@ -415,7 +415,7 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
         values = problem.variables.values(solution.parameters)
         chi2 = 2.0 * sum(factor.error(values) for factor in problem.added)
         yield f"{len(problem.added)} added factors with {problem.n_added} rows: chi-square {chi2:.6g}"
-    if problem.formed and problem.missing_correlation and problem.n_pairs >= problem.n_configurations:
+    if problem.formed and problem.rows.counted_as_private and problem.n_pairs >= problem.n_configurations:
         formed = f"{problem.n_pairs} pairs are formed from {problem.n_configurations} poses"
         yield f"{formed} and counted as independent: with many more pairs than poses the sigmas are too small"
     yield from _noise_notes(solution, assessed)

@@ -151,8 +151,8 @@ class Parameter:
     estimated: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse a kind that is not known, or that the name does not say."""
-        if self.kind not in PARAMETER_KINDS or kind_of(self.name) != self.kind:
+        """Refuse a kind that is not known, or that the name contradicts."""
+        if self.kind not in PARAMETER_KINDS or unit_of(self.name) != self.unit:
             expected = f"a name that ends in its kind, one of {', '.join(PARAMETER_KINDS)}"
             raise InputError(f"parameter {shown(self.name)}", f"kind {shown(self.kind)}", expected)
 
@@ -161,10 +161,15 @@ class Parameter:
         """Its SI unit: `m`, `rad`, or another of `SCALES`."""
         return PARAMETER_KINDS[self.kind].unit
 
-    @property
-    def order(self) -> int:
-        """The place of its kind in `PARAMETER_KINDS`: of parameters that only act together the first kind is kept."""
-        return list(PARAMETER_KINDS).index(self.kind)
+    def preference(self, prefer: Sequence[str]) -> int:
+        """Rank in the order of keeping, 0 first: the user's choice, then base and tool, then `PARAMETER_KINDS`.
+
+        Base and tool are estimated only where the user asks for it, and may be far from nominal.
+        """
+        if self.name in prefer:
+            return list(prefer).index(self.name)
+        of_frame = self.name.startswith(("base.", "tool."))
+        return len(prefer) + (0 if of_frame else 1 + list(PARAMETER_KINDS).index(self.kind))
 
     @property
     def scale(self) -> float:
@@ -423,11 +428,11 @@ class Robot:
         Raises:
             InputError: There is no such parameter.
         """
-        for i, parameter in enumerate(self.parameters):
-            if isinstance(name, str) and parameter.name == name:
-                return i
         names = names_of(self.parameters)
-        raise InputError(self.name, f"no parameter {shown(name)}", known_names(names), did_you_mean(name, names, NEAR))
+        if not isinstance(name, str) or name not in names:
+            hint = did_you_mean(name, names, NEAR)
+            raise InputError(self.name, f"no parameter {shown(name)}", known_names(names), hint)
+        return names.index(name)
 
     def owned_by(self, owner: int) -> list[int]:
         """Indices of the parameters of joint `owner` (0 is the base, n + 1 the tool)."""
@@ -694,15 +699,9 @@ def names_of(parameters: Iterable[Parameter]) -> list[str]:
     return [p.name for p in parameters]
 
 
-def kind_of(name: str) -> str:
-    """The kind of a parameter by its name: `alpha` of `alpha3`, `yaw` of `elbow.yaw`; a kind itself as it is."""
-    last = name.rpartition(".")[2]
-    return last if "." in name else last.rstrip("0123456789")
-
-
 def unit_of(name: str) -> str:
-    """The SI unit of a parameter or kind by its name; `m` of `base`, `tool`, and what is no kind."""
-    kind = kind_of(name)
+    """The SI unit of a parameter or kind by its name: `alpha3`, `elbow.yaw`; `m` of `base`, `tool`, what is no kind."""
+    kind = name.rpartition(".")[2] if "." in name else name.rstrip("0123456789")
     return PARAMETER_KINDS[kind].unit if kind in PARAMETER_KINDS else "m"
 
 

@@ -365,7 +365,7 @@ class RowStatistics:
             self.weight[mine] = weights[table.measurement[mine]]
         fitted, test = np.flatnonzero(table.used), np.flatnonzero(table.test & (table.reason_code == 0))
         known = len(fitted) <= (MAX_KEPT if self._shared else MAX_INDEPENDENT)
-        known &= not (self.robust or problem.missing_correlation)
+        known &= not (self.robust or problem.rows.counted_as_private)
         keep = (table.used & known) | (table.test & (len(test) <= MAX_KEPT))
         self._model = RowModel(solution, noises)
         self._kept, self._errors = np.flatnonzero(keep), self._read(keep)
@@ -583,7 +583,7 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
     dof -= solution.system.left.rank
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
     known = dof > 0 and problem.state.weights is None and solution.estimated_noise is None
-    p_value = float(special.chdtrc(dof, chi2)) if known and not problem.missing_correlation else None
+    p_value = float(special.chdtrc(dof, chi2)) if known and not problem.rows.counted_as_private else None
     return ChiSquare(chi2, dof, expected, chi2_bounds(dof, expected), p_value)
 
 

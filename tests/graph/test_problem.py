@@ -211,11 +211,11 @@ def test_numbers_of_rows_pairs_and_priors():
     star = build_problem(robot, m, model="distance-rotation")
     assert (star.n_configurations, star.n_residuals, star.n_pairs, star.n_independent) == (17, 32, 16, 32)
     assert star.formed
-    assert not star.missing_correlation
+    assert not star.rows.counted_as_private
     every = {"model": "distance-rotation", "pairing": Pairing("all")}
     both = [build_problem(robot, m, **every, pair_errors=errors) for errors in ("shared", "independent")]
     assert [p.n_residuals for p in both] == [2 * 136] * 2
-    assert [p.missing_correlation for p in both] == [False, True]
+    assert [p.rows.counted_as_private for p in both] == [False, True]
     assert both[0].n_independent == pytest.approx(6 * 17 - 12, abs=1)
 
 

@@ -61,7 +61,7 @@ def test_units_of_a_gain_in_files_and_options():
         quantity("3", "1", None, "growth")
 
 
-@pytest.mark.parametrize(("name", "kind"), [("q1.spring", "spring"), ("q1.shift", "x")])
+@pytest.mark.parametrize(("name", "kind"), [("q1.spring", "spring"), ("q1.shift", "yaw")])
 def test_an_unknown_kind_and_a_name_that_hides_it_are_one_line(name, kind):
     with pytest.raises(InputError, match=rf"parameter '{name}': kind '{kind}', expected a name that ends in its kind"):
         Parameter(name, kind, 1, 0.0)
