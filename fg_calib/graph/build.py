@@ -250,9 +250,7 @@ def random_problem(
         seed: Of the random configurations.
     """
     n = n_configurations or max(300, 10 * len(robot.parameters))
-    sigmas = {"sigma_position": np.full((n, 3), robot.scale_of("m"))}
-    sigmas |= {"sigma_orientation": np.full((n, 3), robot.scale_of("rad"))}
-    somewhere = Measurements.at(random_readings(robot, n, np.random.default_rng(seed)), **sigmas)
+    somewhere = Measurements.at(robot, random_readings(robot, n, np.random.default_rng(seed)))
     return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sized
+from collections.abc import Iterable, Iterator, Sized
 from dataclasses import fields
 from typing import Annotated, Any, ClassVar
 
@@ -249,20 +249,6 @@ def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any
         kind = f", {array.dtype}" if isinstance(given, np.ndarray) else ""
         raise InputError(name, f"found {_shown(given)}{kind}", expected)
     return array
-
-
-def as_columns(name: str, given: Any, expected: str) -> Mapping[str, Any]:
-    """Columns by name: those of a mapping as they are, those of a frame of polars or pandas as arrays.
-
-    Raises:
-        InputError: It is neither, or a name stands there twice.
-    """
-    if isinstance(given, Mapping):
-        return given
-    frame = as_frame(name, given)
-    if frame is None:
-        raise InputError(name, f"found {shown(given)}", expected)
-    return {column: frame[column].to_numpy() for column in frame.columns}
 
 
 def as_frame(name: str, given: Any) -> Any | None:

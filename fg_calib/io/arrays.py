@@ -14,8 +14,8 @@ from fg_calib.inputs import (
     Floats,
     InputError,
     as_array,
-    as_columns,
     as_floats,
+    as_frame,
     as_mask,
     as_names,
     as_rotations,
@@ -24,6 +24,7 @@ from fg_calib.inputs import (
     checked,
     require,
     shape_of,
+    shown,
 )
 from fg_calib.io.tables import OF_CONFIGURATIONS, OF_PAIRS, ROUNDED, Table, measurements_of
 from fg_calib.io.yaml import Units
@@ -156,7 +157,11 @@ def _pairs_of(given: Any) -> Table:
     Raises:
         InputError: An array is no column of one, has another number of rows than the longest, or holds something else.
     """
-    arrays = dict(as_columns("pairs", given, "a mapping of arrays by the names a, b, distance, angle, or a frame"))
+    frame = given if isinstance(given, Mapping) else as_frame("pairs", given)
+    if frame is None:
+        expected = "a mapping of arrays by the names a, b, distance, angle, or a frame"
+        raise InputError("pairs", f"found {shown(given)}", expected)
+    arrays = {key: frame[key] for key in (frame if isinstance(frame, Mapping) else frame.columns)}
     known = {"test" if name == "split" else name: of for name, of in OF_PAIRS.items()}
     known |= {key: Column((key,), "", "") for key in ("a", "b")}
     check_names("pairs", arrays, list(known), "key")

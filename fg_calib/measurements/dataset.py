@@ -211,11 +211,12 @@ class Measurements(FrozenArrays):
     from_arrays, from_frame = Reader("read_arrays"), Reader("read_measurements")
 
     @classmethod
-    def at(cls, readings: Floats, **fields: Any) -> Measurements:
-        """Configurations without names, of exact readings, all of them train rows; with other fields."""
-        n, n_joints = readings.shape
+    def at(cls, robot: Robot, readings: Floats) -> Measurements:
+        """Configurations without names, all of them train rows; noise of poses as `Robot.scale_of` says."""
+        n = len(readings)
         rows = np.arange(n).astype(np.str_), np.zeros(n, dtype=np.bool_)
-        return cls(readings, *rows, sigma_joint=np.zeros(n_joints), **fields)
+        position, orientation = (np.full((n, 3), robot.scale_of(unit)) for unit in ("m", "rad"))
+        return cls(readings, *rows, None, None, position, orientation, np.zeros(robot.n_joints))
 
     def __repr__(self) -> str:
         """What was measured, without its sigmas."""

@@ -205,7 +205,6 @@ class Measuring:
     def rows(self, k: Integers | None = None, **measured: Any) -> Measurements:
         """Measurements at the configurations, or at those that rows are of."""
         visits = self.visits if k is None else self.visits.select(k)
-        nothing: dict[str, Any] = dict.fromkeys(("position", "rotation", "sigma_position", "sigma_orientation"))
         return Measurements(
             readings=visits.readings,
             ids=visits.ids,
@@ -213,7 +212,7 @@ class Measuring:
             sigma_joint=joint_sigma(self.scenario.specified_noise or self.scenario.noise, self.scenario.robot),
             source=f"{self.name}.csv",
             named=True,
-            **nothing | measured,
+            **measured,
         )
 
     def nominal(self) -> Poses:
@@ -332,9 +331,8 @@ class Measuring:
         at, (distances, angles) = self.at(), PAIR_MODELS[self.model]
         assert self.instrument.pairs is not None
         true = form_pairs(self.rows(position=at.position, rotation=at.rotation), self.instrument.pairs)
-        n = true.n_pairs
-        unmeasured = np.full(n, np.nan)
-        found: dict[str, Any] = dict.fromkeys(("distance", "angle", "sigma_distance", "sigma_angle"), unmeasured)
+        n, keys = true.n_pairs, ("distance", "angle", "sigma_distance", "sigma_angle")
+        found: dict[str, Any] = dict.fromkeys(keys, np.full(n, np.nan))
         if distances:
             found["distance"] = np.abs(true.distance + self.noise("distance", n))
             found["sigma_distance"] = self.sigma("distance", n)
