@@ -48,9 +48,9 @@ def measured(name, rng, *, n=60, n_test=0, effect=None, unit=1.0):
     q = rng.uniform(-most, most, (n + n_test, robot.n_joints))
     moved = q + (0.0 if effect is None else effect(true, q))
     m = measure(true, n, rng, sigma=SIGMA, sigma_joint=SIGMA_JOINT, frame=PLACED, n_test=n_test, readings=moved)
-    stated = (m.sigma_position * unit, m.sigma_orientation * unit, m.sigma_joint * unit)
-    stated = dict(zip(("sigma_position", "sigma_orientation", "sigma_joint"), stated, strict=True))
-    return robot, replace(m, readings=q, **stated)
+    specified = (m.sigma_position * unit, m.sigma_orientation * unit, m.sigma_joint * unit)
+    specified = dict(zip(("sigma_position", "sigma_orientation", "sigma_joint"), specified, strict=True))
+    return robot, replace(m, readings=q, **specified)
 
 
 def problem_of(robot, m, model):

@@ -164,7 +164,7 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
 
 
 @pytest.mark.slow
-def test_noise_is_estimated_from_nothing_stated():
+def test_noise_is_estimated_from_nothing_specified():
     robot, m, _ = given("priors", n=40)
     specified = calibrate(robot, m, model="pose", estimate_noise=True)
     bare = replace(m, sigma_position=None, sigma_orientation=None)

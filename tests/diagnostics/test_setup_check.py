@@ -153,7 +153,7 @@ def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, monkeypatch):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed", range(24))
 def test_a_healthy_job_raises_no_alarm(seed):
-    """With large but stated tolerances; also where it is looked at although its residuals are as predicted."""
+    """With large but specified tolerances; also where it is looked at although its residuals are as predicted."""
     rng = np.random.default_rng(seed)
     large = {"a": 0.02, "d": 0.02, "alpha": 0.03, "theta": 0.05}
     robot = (

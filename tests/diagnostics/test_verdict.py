@@ -95,7 +95,7 @@ def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severi
 # --- priors ---------------------------------------------------------------------------------------------------------
 
 
-def test_tolerances_stated_too_small_for_all_are_a_finding():
+def test_tolerances_specified_too_small_for_all_are_a_finding():
     rng = np.random.default_rng(33)
     robot, loose = (small_arm(tolerance={k: f * v for k, v in TOLERANCE.items()}) for f in (1.0, 2.5))
     m = measure(true_robot(loose, rng), 30, rng, sigma=(1e-4, 1e-4))

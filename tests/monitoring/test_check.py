@@ -154,13 +154,13 @@ def test_many_pairs_of_few_configurations_are_judged_without_a_suspect_each():
 
 
 @pytest.mark.parametrize("factor", [1.3, 3.0])
-def test_noise_that_is_larger_than_stated_is_no_drift(known, factor):
+def test_noise_that_is_larger_than_specified_is_no_drift(known, factor):
     calibration, true, _ = known
     rows = measured(true, 30, np.random.default_rng(6), sigma=(factor * SIGMA[0], factor * SIGMA[1]))
-    stated = replace(
+    specified = replace(
         rows, sigma_position=rows.sigma_position / factor, sigma_orientation=rows.sigma_orientation / factor
     )
-    found = calibration.check(stated)
+    found = calibration.check(specified)
     assert found.explanations == ()
     assert found.verdict == ("fail" if factor > 2 else "pass")
     assert any("noise" in line or "times as large" in line for line in (*found.reasons, *found.cautions))

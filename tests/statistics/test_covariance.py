@@ -123,7 +123,7 @@ def test_a_tool_turned_by_a_quarter_has_no_sigma_for_roll_and_yaw():
 
 
 @pytest.mark.long
-def test_monte_carlo_agrees_with_the_stated_covariance():
+def test_monte_carlo_agrees_with_the_specified_covariance():
     """NEES and chi-square over repeated calibrations of one arm, joint noise included."""
     rng = np.random.default_rng(4)
     robot = small_arm(tolerance={"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})

@@ -38,8 +38,8 @@ def measured_directly(m, robot, rng, a, b, sigma=(1e-3, 5e-4), sigma_joint=0.0):
     return replace(m, position=None, rotation=None, pairs=pairs, sigma_joint=np.full(robot.n_joints, sigma_joint))
 
 
-def case(name, robot, rng, n=16, stated=1.0):
-    """A problem of a drawn true robot; noise specified is `stated` times the noise there is."""
+def case(name, robot, rng, n=16, specified=1.0):
+    """A problem of a drawn true robot; specified noise is `specified` times the noise there is."""
     true = true_robot(robot, rng)
     if name.startswith("direct"):
         sigma_joint = 3e-4 if "joint" in name else 0.0
@@ -49,13 +49,13 @@ def case(name, robot, rng, n=16, stated=1.0):
         m = replace(
             m,
             pairs=replace(
-                m.pairs, sigma_distance=m.pairs.sigma_distance * stated, sigma_angle=m.pairs.sigma_angle * stated
+                m.pairs, sigma_distance=m.pairs.sigma_distance * specified, sigma_angle=m.pairs.sigma_angle * specified
             ),
         )
         return build_problem(robot, m, model="distance-rotation")
     sigma_joint = 3e-4 if "joint" in name else 0.0
     m = measure(true, n, rng, sigma=(1e-3, 5e-4), sigma_joint=sigma_joint)
-    m = replace(m, sigma_position=m.sigma_position * stated, sigma_orientation=m.sigma_orientation * stated)
+    m = replace(m, sigma_position=m.sigma_position * specified, sigma_orientation=m.sigma_orientation * specified)
     if name.startswith("pose"):
         return build_problem(robot, m, model="pose")
     return build_problem(robot, m, model="distance-rotation", pairing=Pairing(name.split()[0]))
@@ -117,12 +117,12 @@ def test_leverages_are_those_of_the_hat_matrix():
 
 
 @pytest.mark.slow
-def test_verdicts_tell_outliers_from_noise_stated_wrong():
+def test_verdicts_tell_outliers_from_noise_specified_wrong():
     rng = np.random.default_rng(6)
     robot = small_arm(tolerance=TOLERANCE)
     found = {}
-    for what, stated in (("as specified", 1.0), ("too small", 0.5), ("too large", 2.0)):
-        found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, stated))).fit.goodness.kinds}
+    for what, specified in (("as specified", 1.0), ("too small", 0.5), ("too large", 2.0)):
+        found[what] = {fit.verdict for fit in assess(solve(case("pose", robot, rng, 50, specified))).fit.goodness.kinds}
     assert found == {what: {what} for what in found}
     m = measure(true_robot(robot, rng), 50, rng)
     m = replace(m, position=plus(m.position, ([3, 30], 0), 0.02))
@@ -131,7 +131,7 @@ def test_verdicts_tell_outliers_from_noise_stated_wrong():
 
 
 @pytest.mark.slow
-def test_a_kind_with_too_little_left_keeps_its_stated_noise(monkeypatch):
+def test_a_kind_with_too_little_left_keeps_its_specified_noise(monkeypatch):
     monkeypatch.setattr(noise, "LEAST_REDUNDANCY", 11.0)
     rng = np.random.default_rng(10)
     solution = estimate_noise(case("star", small_arm(tolerance=TOLERANCE), rng, 16, 2.0))

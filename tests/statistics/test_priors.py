@@ -123,7 +123,7 @@ def test_many_good_rows_leave_what_the_corrections_themselves_say():
     assert found.mean.determined[0] == pytest.approx(6.0, abs=1e-6)
 
 
-STATED = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
+SPECIFIED = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
 TRUE = {"a": 3e-3, "d": 3e-4, "alpha": 8e-3, "theta": 1e-3}
 
 
@@ -132,7 +132,7 @@ def drawn_problem(model="pose", n=12, seed=0, n_test=0, **choices):
     rng = np.random.default_rng(seed)
     true = true_robot(small_arm(tolerance=TRUE), rng)
     m = measure(true, n, rng, sigma=(1e-4, 1e-4), n_test=n_test)
-    return build_problem(small_arm(tolerance=STATED), m, model=model, **choices), true
+    return build_problem(small_arm(tolerance=SPECIFIED), m, model=model, **choices), true
 
 
 @cache
@@ -146,13 +146,13 @@ def tolerances_of(solution):
 
 def test_scales_of_every_kind_are_found_within_their_intervals():
     for one in solved().estimated_tolerances.scales:
-        assert one.low < TRUE[one.group] / STATED[one.group] < one.high
+        assert one.low < TRUE[one.group] / SPECIFIED[one.group] < one.high
         assert one.low < one.scale < one.high
         assert len(one.parameters) == 4
         assert 1.5 < one.seen < 4.0 + NEGLIGIBLE
 
 
-def test_the_estimate_is_that_with_the_tolerances_found_stated():
+def test_the_estimate_is_that_with_the_tolerances_found_specified():
     robot = small_arm(tolerance=tolerances_of(solved()))
     again = solve(build_problem(robot, solved().problem.measurements, model="pose"))
     sigma = np.array([p.sigma or 0.0 for p in assess(again).estimates.parameters])
@@ -200,7 +200,7 @@ def test_noise_and_tolerances_are_estimated_together():
     assert solution.converged
     assert solution.problem.state.factors[0, "position"] == pytest.approx(1.0 / 3.0, rel=0.35)
     for one in solution.estimated_tolerances.scales:
-        assert one.low < TRUE[one.group] / STATED[one.group] < one.high
+        assert one.low < TRUE[one.group] / SPECIFIED[one.group] < one.high
 
 
 def test_an_arm_that_is_only_evaluated_keeps_its_tolerances():

@@ -1,4 +1,4 @@
-"""Noise estimated where joint noise is stated too: a factor on each kind's own noise, and one on that of the joints."""
+"""Noise estimated where joint noise is specified too: a factor on the noise of each kind, and one on that of joints."""
 
 from dataclasses import replace
 from functools import cache
@@ -28,8 +28,8 @@ TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
 
 
-def stated(m, own, joint):
-    """Measurements whose noise is stated so many times as large as it is."""
+def specified(m, own, joint):
+    """Measurements whose noise is specified so many times as large as it is."""
     changes = {name: getattr(m, name) for name in ("sigma_position", "sigma_orientation")}
     changes = {name: own * sigma for name, sigma in changes.items() if sigma is not None}
     changes["sigmas"] = {name: own * sigma for name, sigma in m.sigmas.items()}
@@ -91,19 +91,19 @@ CHOICES = {
 
 
 def draw(name, rng, own=1 / 3, joint=2.0, n=30):
-    """A problem and its true robot; noise is stated `own` and `joint` times as large as it is."""
+    """A problem and its true robot; noise is specified `own` and `joint` times as large as it is."""
     robot = small_arm(tolerance=TOLERANCE, estimate=TOOL_POINT if name == "touches" else ())
     true = true_robot(robot, rng)
     if name == "tables":
-        tracker, bar = (stated(m, own, joint) for m in tracker_and_bar(true, rng, n))
+        tracker, bar = (specified(m, own, joint) for m in tracker_and_bar(true, rng, n))
         return build_problem(robot, [Table(tracker, "position"), Table(bar, "distance")]), true
     if name == "touches":
-        return build_problem(robot, stated(touched(true, rng), own, joint), **CHOICES[name]), true
+        return build_problem(robot, specified(touched(true, rng), own, joint), **CHOICES[name]), true
     there = 0.0 if name in ("no joint noise", "joints drowned") else SIGMA_JOINT
     m = measure(true, n, rng, sigma=SIGMA, sigma_joint=there, n_test=n // 3)
     if name == "joints drowned":
         m = replace(m, sigma_joint=np.full(4, SIGMA_JOINT))
-    return build_problem(robot, stated(m, own, joint), **CHOICES[name]), true
+    return build_problem(robot, specified(m, own, joint), **CHOICES[name]), true
 
 
 def factors_of(solution):
@@ -234,7 +234,7 @@ def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeyp
 
 N_DRAWS = 24
 
-CELLS = {  # how much own and joint noise is stated, as a multiple of what there is
+CELLS = {  # how much own and joint noise is specified, as a multiple of what there is
     "pose": (1 / 3, 2.0),
     "encoder estimated": (1 / 3, 2.0),
     "joints drowned": (1 / 3, 1.0),
