@@ -4,8 +4,9 @@ Measurements may see a combination of parameters only by its square: distances s
 +5 mm and -5 mm predict the same. A square shows itself: its sigma falls with the distance from its vertex. So
 directions whose sigma is smaller at the estimate than at nominal start again from the mirror image about the vertex;
 directions that stay weak start again from 2 prior sigmas to either side. Planes and anchors start again from their
-mirror images, one after the other from the best optimum so far. The best optimum is kept; those that chi-square cannot
-distinguish from it are reported in `Solution.others`.
+mirror images, one after the other from the best optimum so far, if these explain the data nearly as well with the
+nominal arm. The best optimum is kept; those that chi-square cannot distinguish from it are reported in
+`Solution.others`.
 
 Note:
     Pairs whose sign is ambiguous within the priors are not searched: the verdict names them (see `verdict`).
@@ -48,6 +49,9 @@ SEPARATE_SIGMAS = 3.0
 CHI2_INDISTINCT = 10.8276
 """The 99.9 % point of chi-square with one degree of freedom: a smaller difference of chi-square decides nothing."""
 
+MAX_MIRROR_COST = 10.0
+"""Cost of a mirrored landmark with the nominal arm, over that of the given start, beyond which it is no alternative."""
+
 LEAST_GAIN = 0.01
 """Cost by which another optimum must be lower to count as better."""
 
@@ -76,7 +80,8 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
         found += _solve_from(solution, solution.problem, options, start)
     for landmark in _mirrored_landmarks(solution.problem) if solution.problem.options.loss == "none" else ():
         mirrored = _mirrored(min(found, key=_objective), landmark)
-        found += [] if mirrored is None else _solve_from(solution, mirrored, options)
+        if mirrored is not None and mirrored.system.cost < MAX_MIRROR_COST * solution.initial_cost:
+            found += _solve_from(solution, mirrored, options)
     best, others = min(found, key=_objective), list[Solution]()
     kept = best if solution.objective - best.objective > LEAST_GAIN else solution
     for one in found:
