@@ -5,8 +5,11 @@ surface, the covariance on its tangent plane. Linearised a posterior sigma d awa
 d, the rows seem to have their optimum c = J^+ q off it, q the second-order part of the residuals; what is odd in d
 cancels.
 
-Norms are not differentiable at 0, nor angles at 180 degrees. A length or an angle is of *ambiguous sign* where the
-prior sigma of its vector is above half the way there: the vector may as well point the other way.
+Norms are not differentiable at 0, nor angles at 180 degrees. A length or an angle is *ambiguous* where the prior sigma
+of its vector is above half the way there: the vector may as well point the other way. It is also where the vector's
+direction is known too badly: errors with variance t^2 in each direction across lengthen a vector of length f by t^2 / f
+on average (see `measurements.moments`). Where that is near the noise, with t by priors and all other rows, the true arm
+lies on a ring about the vector's axis, and the estimate may be on its other side, whatever its sigma.
 """
 
 from __future__ import annotations
@@ -26,6 +29,9 @@ MAX_ROWS = 5_000
 
 NEGLIGIBLE, NONLINEAR = 1e-3, 0.1
 """Mean squared errors beyond the covariance, over it: below which one draw suffices, above which it matters."""
+
+MAX_SECOND_ORDER = 0.4
+"""Mean lengthening of a vector by errors across, over the row's noise, above which its direction is ambiguous."""
 
 N_DRAWS = 8
 """Draws of d: sums of all determined directions, each a sigma one way or the other."""
@@ -87,21 +93,23 @@ def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class AmbiguousRows:
-    """Lengths and angles between configurations whose sign is ambiguous within the priors.
+    """Lengths and angles between configurations whose sign or direction is ambiguous within the priors.
 
     Attributes:
         n_rows: Train lengths and angles that were looked at.
-        names: Names of the ambiguous ones, `5-17`.
+        names: Names of those of ambiguous sign, `5-17`.
         share: Part of the determined directions that rests on these (sum of leverage over rank).
+        turned: Names of those of ambiguous direction.
     """
 
     n_rows: int = 0
     names: tuple[str, ...] = ()
     share: float = 0.0
+    turned: tuple[str, ...] = ()
 
 
 def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> AmbiguousRows:
-    """Lengths and angles of ambiguous sign; of many an even sample.
+    """Lengths and angles of ambiguous sign or direction; of many an even sample.
 
     Args:
         solution: The solution.
@@ -110,7 +118,7 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
     """
     problem, at = solution.problem, solution.problem.variables.at(solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
-    n_rows, names, share = 0, list[str](), 0.0
+    n_rows, names, share, turned = 0, list[str](), 0.0, list[str]()
     if not problem.pair_series:
         return AmbiguousRows()
     for noise in (noise for noise in solution.noises if len(noise.series.train)):
@@ -131,11 +139,31 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
             f = np.linalg.norm(vector, axis=1)
             to_180 = np.inf if is_length else np.pi - f
             direction = vector / np.maximum(f, 1e-300)[:, None]
-            prior_along, along = (np.sum((direction[:, None] @ J @ S) ** 2, axis=(1, 2)) for S in (prior, sqrt_cov))
+            prior_along = np.sum((direction[:, None] @ J @ prior) ** 2, axis=(1, 2))
             flips = np.sum((J @ prior) ** 2, axis=(1, 2)) > np.maximum(f / 2.0, 2.0 * sigma) ** 2
             flips |= prior_along > np.maximum(to_180 / 2.0, 2.0 * sigma) ** 2
-            names += ["-".join(problem.end_names[i + 1] for i in pair) for pair in places[flips & used]]
+            leverage, across = _without_itself(direction, J @ sqrt_cov, np.maximum(sigma, 1e-300))
+            half = 0.5 * np.maximum(f, 1e-300)
+            second_order = 0.25 * across / (half if is_length else np.tan(half))
+            turns = second_order > MAX_SECOND_ORDER * sigma
+            for found, which in ((names, flips), (turned, turns)):
+                found += ["-".join(problem.end_names[i + 1] for i in pair) for pair in places[which & used]]
             n_rows += int(used.sum())
-            leverage = along / np.square(np.maximum(sigma, 1e-300)) * (len(s.train) / len(rows))
-            share += float(leverage[flips & used].sum()) / max(rank, 1)
-    return AmbiguousRows(n_rows, tuple(names), min(share, 1.0))
+            share += float(leverage[flips & used].sum()) * (len(s.train) / len(rows)) / max(rank, 1)
+    return AmbiguousRows(n_rows, tuple(names), min(share, 1.0), tuple(turned))
+
+
+def _without_itself(direction: Floats, A: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    """Leverage of rows, and the variance across their vectors by all other rows and priors, shapes (n,).
+
+    Args:
+        direction: Unit vectors, shape (n, 3); a row measures along it.
+        A: Derivatives of the vectors times a square root of the posterior covariance, shape (n, 3, k).
+        sigma: Noise of the rows, shape (n,).
+    """
+    a = (direction[:, None] @ A)[:, 0]
+    along = np.sum(a**2, axis=1)
+    leverage = along / sigma**2
+    both = (A @ a[:, :, None])[:, :, 0] - direction * along[:, None]  # covariance of what is across with the row
+    returned = np.sum(both**2, axis=1) / (sigma**2 * np.maximum(1.0 - leverage, 1e-9))
+    return leverage, np.sum(A**2, axis=(1, 2)) - along + returned

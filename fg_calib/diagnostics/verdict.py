@@ -322,16 +322,18 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
     """Check ambiguous signs, else nonlinearity, by which the covariance is optimistic: one statement with the remedy.
 
     Args:
-        rows: Lengths and angles of ambiguous sign.
+        rows: Lengths and angles of ambiguous sign or direction.
         nonlinear: Nonlinearity within the posterior.
         high: Whether residuals are too large for the noise, which a single wrong sign may be the cause of.
     """
     curved = nonlinear.directions >= NONLINEAR
-    ambiguous = bool(rows.names) and (high or curved or rows.share >= AMBIGUOUS_SHARE)
-    text = f"the sign of {len(rows.names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
-    share = f"{100.0 * rows.share:.0f} % of the information rests on them"
-    text += f" ({listed(rows.names)} near 0 or 180 deg; {share}): there may be a better optimum far away, and sigmas"
+    sign = bool(rows.names) and (high or curved or rows.share >= AMBIGUOUS_SHARE)
+    names, what = (rows.names, "sign") if sign else (rows.turned, "direction")
+    share = f"; {100.0 * rows.share:.0f} % of the information rests on them" * sign
+    text = f"the {what} of {len(names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
+    text += f" ({listed(names)} near 0 or 180 deg{share}): there may be a better optimum far away, and sigmas"
     text += " may be too small; leave these out, or measure longer and wider motions, in which more joints move"
+    ambiguous = sign or (bool(rows.turned) and not curved)
     yield Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text, ambiguous)
     most = f" (most: {listed(nonlinear.rows)})" * bool(nonlinear.rows)
     beyond = f"some {np.sqrt(1.0 + nonlinear.directions):.2g}" if np.isfinite(nonlinear.directions) else "many"

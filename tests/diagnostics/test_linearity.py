@@ -112,6 +112,22 @@ def test_rows_of_ambiguous_sign_are_those_that_the_prior_lets_pass_zero_or_half_
     assert (rows(9e-4).names, rows(9e-4).share) == ((), 0.0)
 
 
+def test_variance_across_a_row_is_that_of_all_other_rows():
+    """Against the inverse of the information without the row."""
+    rng = np.random.default_rng(0)
+    J, direction, sigma = rng.normal(size=(4, 3, 6)), rng.normal(size=(4, 3)), rng.uniform(0.1, 0.3, 4)
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    rows = np.einsum("ni,nij->nj", direction, J) / sigma[:, None]
+    priors = np.diag(rng.uniform(1.0, 4.0, 6))
+    S = np.linalg.cholesky(np.linalg.inv(priors + rows.T @ rows))
+    leverage, across = linearity._without_itself(direction, J @ S, sigma)
+    for k in range(4):
+        assert leverage[k] == pytest.approx(rows[k] @ S @ S.T @ rows[k])
+        others = np.delete(rows, k, axis=0)
+        C, P = np.linalg.inv(priors + others.T @ others), np.eye(3) - np.outer(direction[k], direction[k])
+        assert across[k] == pytest.approx(np.trace(P @ J[k] @ C @ J[k].T @ P))
+
+
 def test_one_statement_names_the_rows_and_the_remedy():
     names, linear = ("0-1", "0-2", "0-3", "0-4"), Nonlinearity()
     assert check_linear(AmbiguousRows(60, names, 0.04), linear) == []
@@ -119,6 +135,8 @@ def test_one_statement_names_the_rows_and_the_remedy():
     assert few.severity == "warning"
     assert few.text.startswith(f"the sign of 4 of 60 lengths and angles {AMBIGUOUS} (0-1, 0-2, 0-3 and 1 more near 0")
     assert few.text.endswith("leave these out, or measure longer and wider motions, in which more joints move")
+    (turned,) = check_linear(AmbiguousRows(60, turned=names[:1]), linear)
+    assert turned.text.startswith(f"the direction of 1 of 60 lengths and angles {AMBIGUOUS} (0-1 near 0 or 180 deg):")
     (many,) = check_linear(AmbiguousRows(60, names, 0.31), linear)
     assert many.severity == "error"
     for high, nonlinear in ((True, 0.0), (False, 0.1)):
@@ -190,16 +208,17 @@ ARMS = {
 """alpha, a and d of each joint, modified DH; the SCARA's third is prismatic."""
 
 
-def star(name, wider, seed, model):
-    """A star of poses of an arm whose prior sigmas are 1 mm and 1 mrad times `wider`."""
+def star(name, wider, seed, model, configurations=3):
+    """A star of poses of an arm whose prior sigmas are 1 mm and 1 mrad times `wider`; its problem, and the true arm."""
     rng, rows = np.random.default_rng(seed), [(a, alpha, d, 0.0, 0.0) for alpha, a, d in ARMS[name]]
     types = ["prismatic" if name == "SCARA" and i == 2 else "revolute" for i in range(len(rows))]
     tolerance = dict.fromkeys(("a", "d", "alpha", "theta", "beta"), 1e-3 * wider)
     robot = Robot.from_dh(rows, "mdh-hayati", types=types, tolerance=tolerance)
     most = [0.1 if kind == "prismatic" else 2.4 for kind in types]
-    q = np.random.default_rng(3).uniform(-1.0, 1.0, (40, len(rows))) * most
-    m = measure(true_robot(robot, rng), 40, rng, sigma=(5e-5, 1.7e-4), readings=q)
-    return build_problem(robot, m, model=model, pairing=Pairing("star"))
+    q = np.random.default_rng(configurations).uniform(-1.0, 1.0, (40, len(rows))) * most
+    true = true_robot(robot, rng)
+    m = measure(true, 40, rng, sigma=(5e-5, 1.7e-4), readings=q)
+    return build_problem(robot, m, model=model, pairing=Pairing("star")), true
 
 
 CELLS = {
@@ -228,7 +247,7 @@ def test_pairs_of_ambiguous_sign_that_a_result_rests_on_are_named(cell, seed):
 )
 def test_stars_at_wide_priors_are_warned_of(name, wider, model, seed):
     """Mean NEES of 10 draws 2.4 for the SCARA at tolerances times 10, of single draws up to 14."""
-    found = assess(solve(star(name, wider, seed, model))).verdict
+    found = assess(solve(star(name, wider, seed, model)[0])).verdict
     (said,) = [text for text in (*found.errors, *found.warnings) if AMBIGUOUS in text or NONLINEAR in text]
     assert re.search(r"nonlinear within the posterior sigmas \(most: 0-\d+", said)
     assert said.endswith("measure at more configurations, or specify smaller prior sigmas")
@@ -236,5 +255,23 @@ def test_stars_at_wide_priors_are_warned_of(name, wider, model, seed):
 
 @pytest.mark.parametrize("name", ARMS)
 def test_stars_at_usual_priors_are_not_warned_of(name):
-    found = assess(solve(star(name, 1.0, 0, "distance-rotation"))).verdict
+    found = assess(solve(star(name, 1.0, 0, "distance-rotation")[0])).verdict
     assert not any(words in text for text in (*found.errors, *found.warnings) for words in (AMBIGUOUS, NONLINEAR))
+
+
+@pytest.mark.slow
+def test_a_scara_whose_tilts_rest_on_short_turns_is_warned_of():
+    """Of 60 stars of random poses errors are as large as said where no warning is, and far larger where one is."""
+    found = {False: [], True: []}
+    for seed in range(60):
+        problem, true = star("SCARA", 1.0, seed, "distance-rotation", configurations=100 + seed)
+        assessed = assess(solve(problem))
+        known = np.isfinite(np.diag(assessed.covariance))
+        e = np.array([assessed.robot.nominal[true.index(n)] - true.nominal[true.index(n)] for n in assessed.names])
+        C, e = assessed.covariance[np.ix_(known, known)], e[known]
+        warned = any(AMBIGUOUS in text for text in assessed.verdict.warnings)
+        found[warned].append(e @ np.linalg.solve(C, e) / len(e))
+    healthy, warned = (np.array(found[which]) for which in (False, True))
+    assert len(healthy) > len(warned) > 0
+    assert 0.85 < np.mean(healthy) < 1.1
+    assert healthy.max() < warned.max()
