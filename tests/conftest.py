@@ -4,7 +4,6 @@ import gc
 import os
 import shutil
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -37,25 +36,6 @@ def pytest_collection_modifyitems(items):
         for i, item in enumerate(quick):
             if i not in kept:
                 item.add_marker("slow")
-
-
-COMPILE = "from fg_calib import calibrate_job, cli; calibrate_job(cli.EXAMPLES / 'space-robot' / 'calibration.yaml')"
-
-
-def pytest_configure(config):
-    """Compile the kernels once, while the workers collect, and not once in each of them."""
-    if config.pluginmanager.hasplugin("dsession"):
-        config.pluginmanager.register(Compilation())
-
-
-class Compilation:
-    """Compiles in a process of its own, which tests of workers wait for."""
-
-    def __init__(self):
-        self.process = subprocess.Popen([sys.executable, "-c", COMPILE], cwd=REPOSITORY)
-
-    def pytest_xdist_node_collection_finished(self):
-        self.process.wait()
 
 
 def pytest_collection_finish():
