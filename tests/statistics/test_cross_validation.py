@@ -9,11 +9,10 @@ from simulated import measure, small_arm, true_robot
 
 from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, calibrate
 from fg_calib.assessment import solve_job
-from fg_calib.measurements import Groups, Pairs
 from fg_calib.measurements.kinds.pose import Position
 from fg_calib.measurements.table import Table
-from fg_calib.statistics.cross_validation import _train_tables, wide
 from fg_calib.statistics.cross_validation import cross_validate as cross_validate_with
+from fg_calib.statistics.cross_validation import wide
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 TOOL = ("tool.x", "tool.y", "tool.z")
@@ -171,15 +170,3 @@ def test_test_rows_alone_have_nothing_to_hold_out():
     robot, m = poses(n=20)
     with pytest.raises(InputError, match="folds: test rows alone"):
         cross_validate(job_of(robot, replace(m, test=np.ones(20, dtype=bool))), 5)
-
-
-def test_distances_of_points_touched_in_another_table_stay():
-    _, m = poses(n=40)
-    touches = Measurements.from_arrays(m.readings, group=np.repeat(["a", "b"], 20), sigma_point=1e-3)
-    zero, nan = np.array([0]), np.array([np.nan])
-    pairs = Pairs(zero, zero + 1, np.array([0.4]), nan, np.array([1e-4]), nan, np.array([False]))
-    between = Measurements.from_arrays(m.readings[:1], position=m.position[:1], sigma_position=1e-3)
-    between = replace(between, groups=Groups(("a", "b"), zero - 1, pairs))
-    first, second = _train_tables((Table(touches, "distance"), Table(between, "distance")))
-    assert second.measurements.groups.pairs.n_pairs == 1
-    assert len(first.measurements.groups.names) == 2
