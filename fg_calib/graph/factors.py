@@ -210,7 +210,7 @@ _PAIR_FACTORS: dict[type, type[MeasurementFactor]] = {Distance: DistanceFactor, 
 
 def prior_factors(variables: Variables) -> list[gtsam.NonlinearFactor]:
     """One factor for each variable that has parameters with a prior, or that was said to be somewhere."""
-    factors = [_prior_factor(variables, v) for v in variables.items if variables.stated[v.key][0]]
+    factors = [_prior_factor(variables, v) for v in variables.items if variables.prior_weights[v.key][0]]
     for v in variables.nuisance:
         if v.prior is not None:
             mean, sigma = (np.array(figures) for figures in v.prior)
@@ -224,7 +224,7 @@ def _prior_factor(variables: Variables, variable: Variable) -> gtsam.NonlinearFa
         return r, J[:, variable.columns]
 
     local = replace(variable, columns=slice(0, len(variable.parameters)))
-    return CheckedFactor([local], len(variables.stated[variable.key][0]), rows)
+    return CheckedFactor([local], len(variables.prior_weights[variable.key][0]), rows)
 
 
 def linearize_factors(

@@ -220,7 +220,7 @@ class Problem(FrozenArrays):
         """Scalar priors."""
         v = self.variables
         of_unknowns = sum(len(one.prior[0]) for one in v.nuisance if one.prior is not None)
-        return of_unknowns + sum(len(stated) for stated, _ in v.stated.values())
+        return of_unknowns + sum(len(places) for places, _ in v.prior_weights.values())
 
     @property
     def n_added(self) -> int:

@@ -15,10 +15,9 @@ before anything is said of the core.
 
 Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
 
-Priors are rows (value - nominal) / tolerance. Of a Pose3 they act on x, y and z as they stand, and on its turn away
-from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y and z axes take the tolerances of roll,
-pitch and yaw. The angles themselves would not do: at a pitch of a quarter turn they are no coordinates.
-
+Priors are rows (value - nominal) / tolerance. Of a Pose3 they act on x, y and z as they stand, and on its rotation
+from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y and z axes have the tolerances of roll,
+pitch and yaw: at a pitch of 90 degrees the angles themselves are no coordinates.
 """
 
 from __future__ import annotations
@@ -51,8 +50,8 @@ class Variable:
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.
-        scales: Of a nuisance variable: a change of ordinary size in each of its columns.
-        prior: Of a nuisance variable: where it was said to be, and 1 sigma of that; None where nothing was.
+        scales: A change of ordinary size in each column of a nuisance variable.
+        prior: Mean and sigma of a nuisance variable's prior; None without one.
     """
 
     key: int
@@ -64,12 +63,12 @@ class Variable:
 
     @cached_property
     def places(self) -> NDArray[np.int64]:
-        """`parameters` to index with."""
+        """`parameters` as an array, to index with."""
         return np.array(self.parameters, dtype=np.int64)
 
     @property
     def number(self) -> int:
-        """Number in its symbol: of a measurement frame that of its table."""
+        """Number in its symbol; a measurement frame has that of its table."""
         return int(gtsam.symbolIndex(self.key))
 
     @property
@@ -79,7 +78,7 @@ class Variable:
 
     @property
     def symbol(self) -> str:
-        """How it is written: `K(3)`, `T(0)`, `X(0)`; one that was added as GTSAM does."""
+        """Its symbol, `K(3)`, `T(0)`, `X(0)`; GTSAM's own notation for an added one."""
         own = self.kind.startswith("own")
         return str(gtsam.Symbol(self.key)).strip() if own else f"{self.letter}({self.number})"
 
@@ -105,8 +104,7 @@ class Variables(Brief):
         chains: The kinematic chain with these columns from the measurement frame of each table.
         priors: Whether the robot's tolerances are priors.
         nuisance: The nuisance variables; their columns follow those of the core.
-        coordinates: Of the measurements' unknown coordinates, where each stands in the parameter vector; -1 for those
-            that are not estimated.
+        coordinates: Index into the parameter vector of each coordinate of the landmarks; -1 if it is not estimated.
     """
 
     robot: Robot
@@ -172,8 +170,8 @@ class Variables(Brief):
         """`scales`, but where there is a prior its sigma: how far each column may be off, shape (n_columns,)."""
         scales = self.scales.copy()
         for v in self.items:
-            stated, weight = self.stated[v.key]
-            places = [_ALONG_TANGENT.index(k) if v.is_pose else k for k in stated]
+            with_prior, weight = self.prior_weights[v.key]
+            places = [_ALONG_TANGENT.index(k) if v.is_pose else k for k in with_prior]
             scales[v.columns][places] = 1.0 / weight
         return scales
 
@@ -183,8 +181,8 @@ class Variables(Brief):
         return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
 
     @cached_property
-    def stated(self) -> dict[int, tuple[list[int], Floats]]:
-        """Of each core variable, by its key: which of its parameters have a prior, and 1 / sigma of these."""
+    def prior_weights(self) -> dict[int, tuple[list[int], Floats]]:
+        """By key of each core variable: which of its parameters have a prior, and 1 / sigma of these."""
         found = {}
         for v in self.items:
             of_v = () if v.kind == "frame" or not self.priors else v.parameters
@@ -398,9 +396,9 @@ def frame_of(pose: gtsam.Pose3, near: Floats | None = None) -> Floats:
 def corrections_of(robot: Robot, values: Floats) -> Floats:
     """Parameter values minus a robot's nominal ones, shape (n_parameters,), [m] and [rad].
 
-    Angles of a frame (base, tool, origins of a URDF's joints) by the shorter way. Near a pitch of a quarter turn yaw
-    and roll change by much where the frame has turned by little; if they change by more than twice what it has turned,
-    its turn about its own z, y and x axes stands in place of the differences of yaw, pitch and roll.
+    Angles of a frame (base, tool, origins of a URDF's joints) by the shorter way. Near a pitch of 90 degrees yaw and
+    roll may change far more than the frame rotates: beyond twice its rotation, the rotation's components about its own
+    z, y and x axes replace the differences of yaw, pitch and roll.
     """
     off = values - robot.nominal
     for owner in range(robot.n_joints + 2):
@@ -448,17 +446,17 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         only: The variable whose priors are wanted; all if None.
     """
     items = variables.items if only is None else (only,)
-    n = sum(len(variables.stated[v.key][0]) for v in items)
+    n = sum(len(variables.prior_weights[v.key][0]) for v in items)
     nominal, r, J, first = variables.nominal(), np.zeros(n), np.zeros((n, variables.n_columns)), 0
     for v in items:
-        stated, weight = variables.stated[v.key]
-        if not stated:
+        with_prior, weight = variables.prior_weights[v.key]
+        if not with_prior:
             continue
-        of_v, rows, columns = v.places, slice(first, first + len(stated)), v.columns
+        of_v, rows, columns = v.places, slice(first, first + len(with_prior)), v.columns
         first = rows.stop
         x, of = parameters[of_v], nominal[of_v]
         off, D = _off_nominal(x, of) if v.is_pose else (x - of, np.eye(len(x)))
-        r[rows], J[rows, columns] = weight * off[stated], weight[:, None] * D[stated]
+        r[rows], J[rows, columns] = weight * off[with_prior], weight[:, None] * D[with_prior]
     return r, J
 
 

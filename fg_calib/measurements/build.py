@@ -285,7 +285,7 @@ def _check_fitted(blocks: Sequence[MeasurementBlock], landmarks: Landmarks) -> N
     for block in blocks:
         coordinates = block.nuisances[~touched[block.nuisances]]
         for item in (landmarks.items[i] for i in np.unique(landmarks.owners[coordinates]).tolist()):
-            if item.kind.must_be_fitted and not item.is_stated:
+            if item.kind.must_be_fitted and not item.is_specified:
                 name = item.name if item.kind.is_one else f"{item.kind.name} {item.name}"
                 raise ProblemError(block.source, f"{name} has test rows alone", "train rows too, or its place as known")
 

@@ -102,7 +102,7 @@ class Landmark:
     known: bool = False
 
     @property
-    def is_stated(self) -> bool:
+    def is_specified(self) -> bool:
         """Whether a table says where it is, or is started."""
         return not bool(np.isnan(self.start).any())
 
@@ -190,9 +190,9 @@ class Landmarks:
             if i == n:
                 self.items.append(new)
                 self._first.append(self._first[-1] + len(new.start))
-            elif not self.items[i].is_stated:
+            elif not self.items[i].is_specified:
                 self.items[i] = new
-            elif new.is_stated and str(new) != str(self.items[i]):
+            elif new.is_specified and str(new) != str(self.items[i]):
                 expected = f"that of the other {new.name}: {self.items[i]}"
                 raise ProblemError(source, f"start {new} of unknown {new.name}", expected)
             span = self.span(i)
@@ -202,7 +202,7 @@ class Landmarks:
     def start_at(self, coordinate: int, place: Floats) -> None:
         """Start the landmark with that first coordinate somewhere, unless a table says where it is."""
         i = self._first.index(coordinate)
-        if not self.items[i].is_stated:
+        if not self.items[i].is_specified:
             self.items[i] = replace(self.items[i], start=place)
 
     def with_starts(self, starts: Mapping[int, Floats]) -> Landmarks:

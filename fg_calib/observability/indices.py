@@ -227,7 +227,7 @@ def _accuracy(J: Floats, names: Sequence[str], scales: Floats) -> dict[str, Any]
     for value, direction in zip(s[::-1], Vt[::-1], strict=True):
         if value >= WEAK:
             break
-        size = np.round(np.abs(direction), 6)  # so that equal members keep their order whatever the rounding
+        size = np.round(np.abs(direction), 6)  # equal members keep their order, however they are rounded
         members = sorted(np.flatnonzero(size > 0.3 * size.max()).tolist(), key=lambda i: -size[i])
         sign = np.sign(direction[members[0]])
         weak.append(WeakDirection(float(value), {names[i]: float(sign * direction[i]) for i in members}))
@@ -250,7 +250,7 @@ def _groups(
     n_lost = len(null) - int(dead.sum())
     if n_lost <= 0:
         return ()
-    # Eliminate the parameters one would rather give up: each relation then holds one of them and kept ones only.
+    # Eliminate the parameters that are kept last: each relation then holds one of them and kept ones alone.
     order = sorted(alive, key=lambda i: (-parameters[i].preference(prefer), i))
     N = null[:, order]
     dropped = first_independent(N, n_lost)
@@ -282,7 +282,7 @@ def _connected(relations: Floats) -> list[tuple[list[int], list[int]]]:
 
 
 def _chained(relations: Floats) -> Floats:
-    """Each relation against the next, where that needs no more parameters: d3 - d4, d4 - d5 for d3 - d5, d4 - d5."""
+    """Relations minus multiples of the next one if that adds no parameter: d3 - d4, d4 - d5 for d3 - d5, d4 - d5."""
     chained = relations.copy()
     for r in range(len(relations) - 1):
         shared = np.flatnonzero((relations[r] != 0.0) & (relations[r + 1] != 0.0))

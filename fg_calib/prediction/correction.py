@@ -1,10 +1,10 @@
 """Commands for a controller with the nominal model, so that the calibrated arm reaches its targets.
 
-The controller is given joint values with which the true arm is at the target; or, where it only takes poses, the pose
-for which its own model finds these joint values: a wrong pose for the right place.
+The controller is given joint values with which the calibrated arm is at the target; or, if it takes poses alone, the
+pose for which its own model finds these joint values.
 
-An arm of fewer than six joints, or one that a limit stops, reaches the point of many a pose, but not its orientation.
-There the point is kept, and the orientation made as near as the remaining freedom allows, by Gauss-Newton steps in the
+An arm of fewer than six joints, or at a limit, may reach the point of a target but not its orientation. Then the point
+is kept, and the orientation is brought as near as the remaining freedom allows, by Gauss-Newton steps in the
 null space of the point's derivative Jv: q + Jv^+ p + N (Jw N)^+ (w - Jw Jv^+ p), with p and w what is missing of
 position and orientation, and N a basis of that null space.
 """
@@ -24,7 +24,7 @@ from fg_calib.robot import N_STARTS, REACHED, Inverse, Robot, build_chain, forwa
 from fg_calib.statistics import TangentCovariance
 
 LARGE_CHANGE = 0.1
-"""Change of a joint, [rad] (prismatic: [m]), beyond which it is near a singularity or on another branch."""
+"""Change of a joint, [rad] (prismatic: [m]), which only a singularity or another branch of solutions explains."""
 
 _N_STEPS = 30
 """Steps that rotate the tool; they converge in a few, linearly where the pose is far out of reach."""
@@ -54,9 +54,9 @@ class Correction(FrozenArrays):
         missed: Errors with the correction, shape (n, 2), [m] and [rad]; 0 but for rounding where it reaches them.
         expected: RMS errors that the calibration's uncertainty leaves, of position and orientation, in the frame of the
             targets, shape (n, 2), [m] and [rad]; nan where they depend on what is not determined.
-        expected_fitted: RMS position error after the best rigid fit of all targets: how well they fit each other,
-            wherever the base is, [m]; nan where it is not determined.
-        turns: Whether the targets state an orientation.
+        expected_fitted: RMS position error after the best rigid fit of all targets, which needs no base, [m];
+            nan where it is not determined.
+        turns: Whether the targets have an orientation.
     """
 
     readings: Floats

@@ -39,8 +39,8 @@ POINT = LandmarkKind(
 class SamePoint(Coincidence):
     """`p_B - p_A` in the base frame, up to a rotation, [m]: a distance of zero between configurations.
 
-    Its derivative in a parameter is `dp_B - dp_A` minus `a x (p_B - p_A)`: all vectors may be rotated by one rotation a
-    of each column without changing their lengths, so by one that undoes motions of the base.
+    Its derivative in a parameter is `dp_B - dp_A - a x (p_B - p_A)`: a common rotation a changes no length, so each
+    column has the one that cancels motions of the base.
     """
 
     ends, turned_back = 2, True
@@ -103,7 +103,7 @@ class PairQuantity(NamedTuple):
         name: Field of `Pairs`; with `sigma_` before it, that of its noise.
         kind: What it is.
         pose: What of a measured pose it is formed from.
-        other: Model of pairs without it.
+        other: The model of pairs of the other quantity alone.
     """
 
     name: str
@@ -151,7 +151,7 @@ def usable_pairs(table: Table) -> Pairs:
 
 
 def missing_values(table: Table) -> list[str]:
-    """A sentence on each quantity that the model uses and no measured pair of a table has: a misspelt column?"""
+    """A sentence on each quantity that the model needs and no measured pair of a table has."""
     pairs = table.measurements.pairs
     lacking = [of for of in quantities_of(table.model) if pairs is not None and np.isnan(getattr(pairs, of.name)).all()]
     of_table = f"{table.measurements.source}: no pair has a value of"
@@ -184,8 +184,8 @@ class PairGauge(Instrument):
     def blocks(self, table: Table, number: int, landmarks: Landmarks) -> list[MeasurementBlock]:
         """Distances and angles of pairs; vectors of those whose distance was measured as exactly 0; contacts.
 
-        A directly measured 0 is not a noisy number: it says that both points are one. Where both readings are the same,
-        nothing changes the prediction.
+        A distance that was measured as exactly 0 says that both points are one. Pairs of equal readings depend on no
+        parameter.
 
         Raises:
             ProblemError: Poses to form pairs from are missing, or a sigma is.

@@ -14,7 +14,7 @@ from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, K
 from fg_calib.measurements.kinds.pose import point_on_tool
 
 MAX_IMAGES = 60
-"""Images of a board that it is started from, the fullest: more would not make the start better."""
+"""Images that a board's start is computed from, those with most corners."""
 
 
 class Pixel(Kind):
@@ -23,7 +23,7 @@ class Pixel(Kind):
     Data: u, v, [px], and the point on the board, x and y, [m]. Nuisances: the board, as of `BoardPose`.
 
     Args:
-        camera: What the camera does to what it sees.
+        camera: The camera's model.
     """
 
     names, units = ("pixel.u", "pixel.v"), ("px", "px")
@@ -86,7 +86,7 @@ class PixelCamera(Instrument):
         return {"of": _corners(table.measurements).of(rows)}
 
     def start_frames(self, start: FrameStart, table: Table, blocks: Blocks, landmarks: Landmarks) -> None:
-        """Boards, or the frame, and the tool: first what the board's pose in each image may be."""
+        """Start boards, or the frame, and the tool from the two poses that each image of a board leaves."""
         for block in blocks:
             if not isinstance(block.kind, Pixel):
                 continue
@@ -97,14 +97,14 @@ class PixelCamera(Instrument):
                 start.align_choices(rows, choices, unknown_frame=start.unknown_frame)
 
     def random_model(self, table: Table) -> str:
-        """Poses stand for points, which must be in sight. See `Instrument.random_model`."""
+        """Poses, as points of random configurations would not be in sight. See `Instrument.random_model`."""
         return "pose" if table.fixed_camera else "board"
 
 
 def _poses_of_images(
     table: Table, block: MeasurementBlock, camera: Camera
 ) -> tuple[Integers, Integers, tuple[Floats, Floats]]:
-    """Configuration and first coordinate of the board of each good image, and the poses that it leaves.
+    """Configuration, first coordinate of the board, and the two possible poses of each image with enough corners.
 
     Raises:
         ProblemError: No image shows enough of a board.
