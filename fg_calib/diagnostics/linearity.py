@@ -9,7 +9,7 @@ Norms are not differentiable at 0, nor angles at 180 degrees. A length or an ang
 of its vector is above half the way there: the vector may as well point the other way. It is also where the vector's
 direction is known too badly: errors with variance t^2 in each direction across lengthen a vector of length f by t^2 / f
 on average (see `measurements.moments`). Where that is near the noise, with t by priors and all other rows, the true arm
-lies on a ring about the vector's axis, and the estimate may be on its other side, whatever its sigma.
+lies on a ring about the vector's axis, and the estimate may be opposite it, whatever its sigma.
 """
 
 from __future__ import annotations
