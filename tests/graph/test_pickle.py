@@ -5,9 +5,7 @@ import json
 import pickle
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -83,15 +81,3 @@ def test_kernels_are_not_compiled_again_for_read_only_arrays():
     here = Path(__file__).parent
     command = [sys.executable, "-c", ONCE, str(here), str(here.parent)]
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "{False}\n"
-
-
-@pytest.mark.slow
-def test_a_worker_process_returns_solutions():
-    """Spawned, not forked: a process of its own that has only what was sent to it."""
-    problems = [problem("pose in an unknown frame"), problem("star by a robust loss")]
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        found = list(pool.map(solve, problems))
-    for one, here in zip(found, map(solve, problems), strict=True):
-        assert np.array_equal(one.parameters, here.parameters)
-        assert one.cost == here.cost
-        assert np.array_equal(assess(one).covariance, assess(here).covariance, equal_nan=True)

@@ -22,7 +22,7 @@ from fg_calib.io.tables import read_measurements
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Axis, Element, Joint, RobotBuilder
+from fg_calib.robot.model import Joint, RobotBuilder
 from fg_calib.robot.rotations import rotation_angle
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
@@ -229,19 +229,3 @@ def test_angles_about_180_degrees_converge(seed):
         assert assess(solution).verdict.errors
     else:
         assert 2.0 * solution.cost < chi2.ppf(0.999, 40)
-
-
-def test_a_parameter_of_two_elements_is_calibrated_with_both():
-    """Twists add up: one length along two axes, whose derivative is that of both."""
-    rng = np.random.default_rng(3)
-    robot = small_arm(tolerance=dict.fromkeys(("a", "d", "theta", "alpha"), 1e-3))
-    shared = robot.index("a2")
-    place = next(i for i, e in enumerate(robot.elements) if e.joint == 2)
-    elements = (*robot.elements[:place], Element(Axis.TY, parameter=shared), *robot.elements[place:])
-    robot = replace(robot, elements=elements)
-    true = true_robot(robot, rng)
-    found = assess(solve(build_problem(robot, measure(true, 60, rng, sigma=(1e-5, 1e-5)), model="pose")))
-    columns = [robot.index(name) for name in found.names]
-    error = (found.robot.nominal - true.nominal)[columns]
-    assert error @ np.linalg.solve(found.covariance, error) < chi2.ppf(0.9999, len(error))
-    assert found.covariance[columns.index(shared), columns.index(shared)] < 1e-10

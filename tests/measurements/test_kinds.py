@@ -10,7 +10,7 @@ from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.initialization import Camera
-from fg_calib.measurements import Frames, Kind, Rows, check_rows, residuals
+from fg_calib.measurements import Frames, check_rows, residuals
 from fg_calib.measurements.kind import Stacked
 from fg_calib.measurements.kinds.anchor import AnchorContact, AnchorDistance
 from fg_calib.measurements.kinds.board import BoardPose
@@ -205,26 +205,6 @@ def test_an_image_is_that_of_the_textbook():
 
 def test_what_is_behind_a_camera_has_no_image_that_leads_anywhere():
     assert not CAMERA.image(np.array([[0.1, 0.2, -1.0]]))[1].any()
-
-
-class FixedPoint(Kind):
-    """Distance from the tool point to a fixed point: data x, y, z of the point and the distance, [m]."""
-
-    names, units = ("ball",), ("m",)
-    ends, residual_dim, width = 1, 1, 4
-
-    def rows(self, at, data, nuisances):
-        away = at.position[:, 0] - data[:, :3]
-        length = np.linalg.norm(away, axis=1)[:, None]
-        D = np.zeros((len(data), 1, 1, 6))
-        D[:, 0, 0, 3:] = away / length
-        return Rows(length - data[:, 3:], D)
-
-
-def test_a_kind_of_ones_own_takes_ten_lines():
-    test_derivatives_are_those_of_central_differences(FixedPoint(), "mdh-hayati")
-    test_the_reductions_are_those_of_the_rows(FixedPoint())
-    test_the_reductions_are_those_of_the_rows(Stacked(FixedPoint(), Position(), FixedPoint()))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, np.pi - 1e-9, np.pi])
