@@ -230,7 +230,7 @@ def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Flo
 
 
 def _coordinates(data: Dataset, variables: Variables) -> dict[tuple[str, str], Integers]:
-    """Where landmarks and unknown frames (see `places_of`) stand in a parameter vector; -1 where not estimated."""
+    """Index of landmarks and unknown frames (see `places_of`) in a parameter vector; -1 where not estimated."""
     parts = np.split(variables.coordinates, np.cumsum(data.landmarks.sizes)[:-1])
     frames = {("X", data.labels[v.number]): v.places for v in variables.frames}
     return dict(zip(data.landmarks.keys, parts, strict=False)) | frames

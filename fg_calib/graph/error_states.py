@@ -177,7 +177,7 @@ class State(Brief):
     n_nuisance: int
 
     def without_columns(self) -> State:
-        """The same without derivatives."""
+        """This state without derivatives."""
         return replace(self, chains=tuple(chain.without_columns() for chain in self.chains), n_columns=0, n_nuisance=0)
 
 
@@ -364,7 +364,7 @@ def all_errors(noises: Sequence[RowNoise], rows: WhitenedRows) -> Sparse:
 
 
 def whitener_of(noise: RowNoise, part: WhitenedSeries) -> Floats:
-    """What the train rows of a series were multiplied by to be whitened, shape (n, residual_dim, residual_dim)."""
+    """Matrices that whitened the train rows of a block, shape (n, residual_dim, residual_dim)."""
     h, plain = part.block.residual_dim, noise.rows_at(noise.series.train)
     out: Floats = unpack(part.block.whitening, h) @ np.linalg.inv(unpack(plain.whitening, h))
     return out

@@ -1,4 +1,4 @@
-"""What earlier rows say, without these rows: the square root of their information, about where they were linearised.
+"""Information of earlier rows, without these rows: its square root, about where they were linearised.
 
 Of rows r(x), whitened, all is kept that acts on the arm and on what stays with it (targets on the tool, anchors):
 `|r|^2 = |z + R s|^2 + constant` to second order, s the step from where they were linearised in the tangent space of the
@@ -43,7 +43,7 @@ View = tuple[Model, FrameKnowledge]
 
 @dataclass(frozen=True)
 class Knowledge(FrozenArrays):
-    """What earlier rows say of an arm and of what stays with it.
+    """Information of earlier rows about an arm and what stays with it.
 
     Attributes:
         robot: The arm with its values where the rows were linearised; what they are about is estimated.
@@ -97,7 +97,7 @@ class Knowledge(FrozenArrays):
         return replace(bare, rows=s[:rank, None] * Vt[:rank] / bare.scales, right=U[:, :rank].T @ R[:, -1])
 
     def about(self, unknowns: Sequence[Name]) -> Knowledge:
-        """The same of some of the unknowns alone, the others eliminated."""
+        """The information about some of the unknowns, the others eliminated."""
         kept = [name for name in unknowns if name in self.unknowns]
         n = self.variables.n_columns
         if list(self.unknowns) == kept:
@@ -109,7 +109,7 @@ class Knowledge(FrozenArrays):
         return self._with(Knowledge.of_rows(self.robot, kept, self.at[columns[n:] - n], left.A, left.b), nominal)
 
     def grown(self, directions: Floats, free: NDArray[np.bool_]) -> Knowledge:
-        """The same of an arm that may have changed since.
+        """The information after random parameter changes with given sigmas.
 
         Args:
             directions: Of independent changes of 1 sigma each in the columns, shape (n_columns + len(at), n).
@@ -130,7 +130,7 @@ class Knowledge(FrozenArrays):
         return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, left.A, left.b), self.nominal)
 
     def with_rows(self, A: Floats, b: Floats) -> Knowledge:
-        """The same with more rows about the same place, none of them measured: `nominal` stays."""
+        """The information with more rows about the same point, none of them measured: `nominal` stays."""
         A, b = np.vstack([self.rows, A]), np.append(self.right, b)
         return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, A, b), self.nominal)
 
@@ -143,7 +143,7 @@ class Knowledge(FrozenArrays):
         return self.variables.n_columns + SIZE * self.unknowns.index(name) + np.arange(SIZE)
 
     def place(self, name: Name) -> Floats:
-        """Where an unknown was, shape (3,), [m]."""
+        """Position of an unknown then, shape (3,), [m]."""
         return self.at[self.span(name) - self.variables.n_columns]
 
     def follow(self) -> tuple[Floats, Floats, NDArray[np.bool_]]:
@@ -183,7 +183,7 @@ class Knowledge(FrozenArrays):
         return s, D
 
     def seen_by(self, variables: Variables, unknowns: Landmarks) -> Knowledge:
-        """The same of what a problem estimates, the other unknowns eliminated."""
+        """The information about a problem's unknowns, the others eliminated."""
         return self.about([n for n in self.unknowns if coordinates_of(variables, unknowns, n) is not None])
 
     def at_parameters(self, variables: Variables, unknowns: Landmarks, parameters: Floats) -> tuple[Floats, Floats]:
@@ -201,7 +201,7 @@ class Knowledge(FrozenArrays):
 
 
 def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:
-    """Where an unknown's coordinates stand in a parameter vector; None for one that is not there, or not estimated."""
+    """Index of an unknown's coordinates in a parameter vector; None for one that is not there, or not estimated."""
     parts = np.split(variables.coordinates, np.cumsum(unknowns.sizes)[:-1])
     place = dict(zip(unknowns.keys, parts, strict=False)).get(name)
     return place if place is not None and np.all(place >= 0) else None

@@ -42,7 +42,7 @@ _MOMENTS = {kernels.DISTANCE: (0, length_moments), kernels.ROTATION_ANGLE: (1, a
 
 @dataclass(frozen=True)
 class NoiseState:
-    """What has been learned of the measurements' noise on the way to a solution.
+    """Estimated noise of the measurements on the way to a solution.
 
     Attributes:
         weights: Robust weight of each measurement of each series, in [0, 1]; None for 1.
@@ -208,7 +208,7 @@ class RowNoise:
         return loading
 
     def _pose_loading(self) -> Floats:
-        """Of distances and angles between measured poses: minus at the first end, plus at the second.
+        """Loading of distances and angles by measured poses: minus at the first end, plus at the second.
 
         Directions are those predicted: those of measured poses would depend on the errors whose effect they give.
         """

@@ -229,7 +229,7 @@ class Problem(FrozenArrays):
 
     @cached_property
     def known(self) -> Knowledge | None:
-        """What earlier rows say of what is estimated; None where they say nothing."""
+        """Information of earlier rows about what is estimated; None without any."""
         if self.knowledge is None:
             return None
         found = self.knowledge.seen_by(self.variables, self.data.landmarks)
@@ -357,7 +357,7 @@ def _coordinates(frame: Frame, near: Floats | None = None) -> Floats:
 
 
 def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Floats]) -> Floats:
-    """Of each coordinate of a contact point the mean of what touched it, of other landmarks the start as given.
+    """Start of each landmark coordinate; a contact point starts at the mean of its tool positions.
 
     Train touches say where a point is; test touches do where there are no others.
     """
@@ -373,7 +373,7 @@ def contact_points(data: Dataset, chains: Sequence[Chain], trigs: Sequence[Float
 
 
 def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | None = None) -> Problem:
-    """The same problem with its rows whitened, and started, at other parameters.
+    """Whiten and start a problem at other parameters.
 
     Args:
         problem: The problem.
@@ -389,7 +389,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
 
 
 def subsampled(problem: Problem, share: float) -> Problem | None:
-    """The same problem with some of its train rows, drawn evenly, whitened at its start.
+    """Draw some train rows of a problem evenly, whitened at its start.
 
     Args:
         problem: The problem.
@@ -407,7 +407,7 @@ def subsampled(problem: Problem, share: float) -> Problem | None:
 
 
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:
-    """Of each series the length of each measurement's residual, whitened by all its noise, and its number of rows.
+    """Length of each measurement's residual by block, whitened by all its noise, and its number of rows.
 
     Args:
         problem: The problem.
@@ -532,7 +532,7 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
 
 
 def frames_only(problem: Problem) -> Problem | None:
-    """The same problem with the arm at nominal: measurement frame, base and tool alone; None if none is estimated."""
+    """Keep the arm nominal: estimate measurement frame, base and tool alone; None if none is estimated."""
     robot, n = problem.robot, problem.robot.n_joints
     frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= n]
     if not frames and not problem.variables.frames:

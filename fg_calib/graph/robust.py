@@ -42,13 +42,13 @@ from scipy import special
 from fg_calib.inputs import Floats, Loss
 
 EFFICIENCY = 0.95
-"""Of the estimate from clean Gaussian measurements, for the losses that do not reject."""
+"""Efficiency on clean Gaussian measurements of losses that do not reject."""
 
 INLIERS = 0.99
 """Share of clean measurements that `gnc` keeps."""
 
 HALF_WEIGHT: dict[Loss, float] = {"huber": 2.0, "cauchy": 1.0, "geman-mcclure": (2.0**0.5 - 1.0) ** 0.5, "gnc": 1.0}
-"""Where a loss has the weight 1/2, in its constant c: what is farther off counts as an outlier."""
+"""Residual, in the constant c, where a loss has the weight 1/2: larger ones are outliers."""
 
 SCHEDULE = 1.4
 """Factor by which `gnc` makes its surrogate less convex in each round (Yang et al. 2020)."""
@@ -66,7 +66,7 @@ def weight(loss: Loss, e: Floats, c: Floats | float) -> Floats:
 
 
 def cost(loss: Loss, e: Floats, c: Floats | float) -> Floats:
-    """What a loss has measurements cost: its derivative in `e` is `e` times their `weight`, whose arguments it has."""
+    """Cost of measurements under a loss: its derivative in `e` is `e` times their `weight`, whose arguments it has."""
     return _LOSSES[loss][1](e, c)
 
 
@@ -109,7 +109,7 @@ def constants(loss: Loss, residual_dim: NDArray[np.int64]) -> Floats:
 
 @dataclass(frozen=True)
 class Effect:
-    """What a loss does to clean Gaussian measurements.
+    """Efficiency of a robust loss on Gaussian residuals.
 
     Attributes:
         variance: What the covariance from weighted rows is multiplied by to be that of the estimate.
@@ -122,7 +122,7 @@ class Effect:
 
 @cache
 def effect(loss: Loss, dim: int) -> Effect:
-    """What a loss does to clean Gaussian measurements of `dim` rows."""
+    """Efficiency of a loss on Gaussian measurements of `dim` rows."""
     if loss == "none":
         return Effect(1.0, 1.0)
     c = tuning(loss, dim)
@@ -161,7 +161,7 @@ def _means(terms: Callable[[Floats], Floats], dim: int, ends: tuple[float, ...])
 
 
 _LAST = 1e9
-"""Where the schedule of gnc ends: weights are 0 or 1 but for what lies on the line to nine figures."""
+"""Last constant of gnc: weights are 0 or 1 but for what lies on the line to nine figures."""
 
 
 class Weighting:

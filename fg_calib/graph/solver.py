@@ -40,10 +40,10 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING, DAMPING_FACTOR = 1e-3, 1e-15, 1e12, 
 """Damping of damped steps, as a share of the largest curvature: that of the first one, its bounds, and its factor."""
 
 NEAR_ENOUGH = 1e-3
-"""What may be left to go when all iterations are spent, [sigma]."""
+"""Largest decrement that passes when all iterations are spent, [sigma]."""
 
 MAX_AT_ONCE, SAMPLE_SHARE = 200_000, 0.1
-"""Of more residuals than the first this share of the measurements is solved before all are."""
+"""Residuals above which a share of the measurements is solved before all, and this share."""
 
 SLOWEST = 0.9
 """Largest share of what is left to go that whitening anew is taken to leave each time, without end."""
@@ -122,7 +122,7 @@ class ToleranceScales(FrozenArrays):
 
 @dataclass(frozen=True)
 class Solution(FrozenArrays):
-    """What the solver found.
+    """Result of the solver.
 
     Attributes:
         problem: The problem solved; its rows are judged at the estimate.
@@ -184,7 +184,7 @@ class Solution(FrozenArrays):
 
     @cached_property
     def objective(self) -> float:
-        """What it is an optimum of: the cost; with a robust loss by what that has each measurement cost."""
+        """Objective at the solution: the cost, or the robust cost."""
         weights, loss = self.problem.state.weights, self.problem.options.loss
         if weights is None:
             return self.cost
@@ -286,7 +286,7 @@ class _Point:
 
     @property
     def rounding(self) -> float:
-        """What rounding of the residuals makes of the decrement, [sigma]."""
+        """Part of the decrement that is rounding of the residuals, [sigma]."""
         largest, angle = float(self.system.singular_values.max(initial=0.0)), self.problem.robot.scale_of("rad")
         return 10.0 * float(np.finfo(float).eps) / angle * largest
 
@@ -300,7 +300,7 @@ class _Point:
         return replace(self, parameters=self.problem.variables.moved(self.parameters, step))
 
     def descend(self, damping: float) -> tuple[_Point, float, float] | None:
-        """Where the next step leads, undamped if that keeps what it promises; its damping, and the next one.
+        """Take the next step, undamped if that keeps what it promises: the point, its damping, and the next one.
 
         None if no step lowers the cost.
 
@@ -355,7 +355,7 @@ class _Point:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Where a descent has arrived, its steps, whether it has converged, and why it stopped."""
+    """Result of a descent: its point, its steps, whether it has converged, and why it stopped."""
 
     here: _Point
     history: tuple[Iteration, ...]
@@ -431,7 +431,7 @@ def take_steps(problem: Problem, most: int) -> Floats:
 
 
 def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[NoiseState, bool]:
-    """What the residuals at some parameters say of the noise, and whether the loss has its final form."""
+    """Estimate the noise from the residuals, and whether the loss has its final form."""
     state, final = problem.state, True
     if problem.options.loss != "none":
         found = [noise.lengths() for noise in noises_at(problem, parameters)]

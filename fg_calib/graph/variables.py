@@ -78,7 +78,7 @@ class Variable:
 
     @property
     def symbol(self) -> str:
-        """Its symbol, `K(3)`, `T(0)`, `X(0)`; GTSAM's own notation for an added one."""
+        """Symbol `K(3)`, `T(0)`, `X(0)`; GTSAM's own notation for an added one."""
         own = self.kind.startswith("own")
         return str(gtsam.Symbol(self.key)).strip() if own else f"{self.letter}({self.number})"
 
@@ -133,7 +133,7 @@ class Variables(Brief):
 
     @property
     def robot_span(self) -> slice:
-        """Where the robot's parameters stand in the parameter vector."""
+        """Slice of the robot's parameters in the parameter vector."""
         return slice(0, len(self.robot.parameters))
 
     @property
@@ -143,13 +143,13 @@ class Variables(Brief):
 
     @property
     def frame_span(self) -> slice:
-        """Where the measurement frames' values stand in the parameter vector."""
+        """Slice of the measurement frames' values in the parameter vector."""
         first = len(self.robot.parameters)
         return slice(first, first + 6 * max(1, len(self.frames)))
 
     @property
     def nuisance_span(self) -> slice:
-        """Where the nuisance values stand in the parameter vector."""
+        """Slice of the nuisance values in the parameter vector."""
         return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance)
 
     @property
@@ -239,7 +239,7 @@ class Variables(Brief):
         return out
 
     def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
-        """The same with the measurements' unknowns as nuisance variables, those that are estimated."""
+        """Add the measurements' estimated unknowns as nuisance variables."""
         column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
         coordinates, more, taken = list[int](), list[Variable](), {v.symbol for v in self.items}
         for index, (item, size) in enumerate(zip(unknowns.items, unknowns.sizes, strict=True)):
