@@ -38,7 +38,7 @@ class Job(Brief):
 
     @property
     def tables(self) -> tuple[Table, ...]:
-        """What was measured, table by table."""
+        """Measurements, table by table."""
         if not isinstance(self.measurements, Measurements):
             return self.measurements
         return (Table(self.measurements, self.options.model, self.options.pairing, self.options.frame),)

@@ -1,4 +1,4 @@
-"""Where a board is, from one image of its points: the start of what cameras measure.
+"""Pose of a board from one image of its points: the start of what cameras measure.
 
 A homography takes the board to the image without its distortion. What it is at the middle of the board, and how it
 changes there, leaves two poses (Collins & Bartoli 2014): a board that is small against its distance looks nearly the
@@ -40,7 +40,7 @@ HALVINGS = 3
 """The first of them are on the half of the points that is nearest (least trimmed squares)."""
 
 LEAST_NOISE = 1e-6
-"""What points may be off by without being far off, [sigma]."""
+"""Noise that points may have without being far off, [sigma]."""
 
 
 def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None) -> list[tuple[float, Frame]]:
@@ -150,7 +150,7 @@ def _turned_towards(direction: Floats) -> Floats:
 
 
 def _place(R: Floats, points: Floats, seen: Floats) -> Floats:
-    """Where a board with a known rotation is: `(R p + t)` is along what is seen, linear in t, shape (3,), [m]."""
+    """Position of a board of known rotation: `(R p + t)` is along what is seen, linear in t, shape (3,), [m]."""
     p, n = points @ R[:, :2].T, len(points)
     A, right = np.zeros((2 * n, 3)), (seen * p[:, 2:] - p[:, :2]).T.ravel()
     A[:n, 0], A[n:, 1], A[:, 2] = 1.0, 1.0, -seen.T.ravel()

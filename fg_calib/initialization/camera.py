@@ -54,7 +54,7 @@ class Camera:
             object.__setattr__(self, f.name, float(figure))
 
     def image(self, points: Floats) -> tuple[Floats, Floats]:
-        """Where points in the camera's frame are seen, shape (n, 2), [px], and its derivative, shape (n, 2, 3).
+        """Image of points in the camera's frame, shape (n, 2), [px], and its derivative, shape (n, 2, 3).
 
         x to the right, y down, z ahead. With x, y over z and r their distance from the axis: x (1 + k1 r^2 + k2 r^4 +
         k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2), and likewise in y with p1 and p2 exchanged.

@@ -32,7 +32,7 @@ FAR_OFF = 6.0
 """A pose is wrong if it is off by so many times what half of them are."""
 
 LEAST_OFF = 1e-6
-"""What poses may be off by without being wrong, [m] and [rad]."""
+"""Error that poses may have without being wrong, [m] and [rad]."""
 
 MOST_ROUNDS = 10
 """Times that poses are chosen and left out."""
@@ -48,7 +48,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What of the two frames is to be found.
+    """Parts of the two frames to be found.
 
     Attributes:
         frame: Whether world_T_base is.

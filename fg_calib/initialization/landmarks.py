@@ -18,7 +18,7 @@ from fg_calib.robot import nearest_rotation
 def targets_from_positions(
     tool: tuple[Floats, Floats], measured: Floats, target: Integers, known: Floats, unknown_frame: bool
 ) -> tuple[Frame, Floats]:
-    """Where targets are on the tool and, where it is unknown, the measurement frame.
+    """Positions of targets on the tool and, where it is unknown, the measurement frame.
 
     `X^T (m - x) = p + R t` is linear in X^T, X^T x and every t: the frame's rotation comes from there, then all
     translations together from `m = x + X (p + R t)`.
@@ -89,7 +89,7 @@ def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, at: F
 
 
 def offset_from_lengths(points: Floats, length: Floats, anchor: Integers, at: Floats) -> float:
-    """What an instrument adds to every length: what all have in common that no anchors explain.
+    """Offset that an instrument adds to every length: common to all, explained by no anchors.
 
     `|p|^2 - d^2 = 2 p a - 2 d c - (|a|^2 - c^2)` is linear in the anchor a, the offset c and the last bracket: with one
     offset for all anchors, a bracket each. Arguments are as of `anchors_from_lengths`.

@@ -12,7 +12,7 @@ WORLD = Frame(np.eye(3), np.zeros(3))
 
 
 class FrameStart:
-    """What tables say of frames, tool and landmarks; the first table that says something of the tool says it all.
+    """Start of frames, tool and landmarks; the first table that has something of the tool gives it all.
 
     Args:
         tool: flange_T_tool at the nominal parameters.

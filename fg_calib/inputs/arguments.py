@@ -27,7 +27,7 @@ LEAST_SIZE, MOST_SIZE = 1e-30, 1e15
 """The smallest sigma and the largest number that are accepted: beyond them squares overflow."""
 
 ORDINARY = f"a number no larger than {MOST_SIZE:g}; sigmas and tolerances no less than {LEAST_SIZE:g}"
-"""What is expected, for messages."""
+"""Expected size of a number, for messages."""
 
 EXAMPLES = {
     "Generator": "numpy.random.default_rng(0)",
@@ -41,7 +41,7 @@ EXAMPLES = {
     "SolverOptions": "SolverOptions(max_iterations=200)",
     "Units": "Units(length='mm')",
 }
-"""Where an object of a class comes from, for messages."""
+"""Example of an object of a class, for messages."""
 
 _COMPARED = ("fg_calib.", "concurrent.", "numpy.random.", "pathlib")
 """Modules whose classes are compared; choices, switches, text and None are too."""

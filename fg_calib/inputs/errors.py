@@ -29,7 +29,7 @@ class CalibrationError(Exception):
 
 
 class InputError(CalibrationError):
-    """What the user gave cannot be used as it is.
+    """Input of the user that cannot be used as it is.
 
     The message is one line in a fixed order, so that every module words it alike:
     `place: found, expected; hint`. It is printable whatever stands in the file.

@@ -23,7 +23,7 @@ MODELS = {
     "board": "board",
     "pixels": "pixel",
 }
-"""What a calibration compares with the measurements, each with the file of `measurements.kinds` that describes it."""
+"""Models of measurements, each with the file of `measurements.kinds` that describes it."""
 
 if TYPE_CHECKING:
     Model = str
@@ -34,7 +34,7 @@ FrameKnowledge = Literal["known", "unknown"]
 """Whether the measurement frame is the base, or world_T_base is estimated too."""
 
 Gauge = Literal["prior", "keep", "none"]
-"""What holds the directions that data do not determine: tolerances as priors; leaving parameters out; nothing."""
+"""How to fix the directions that data do not determine: tolerances as priors; leaving parameters out; nothing."""
 
 Strategy = Literal["star", "chain", "all", "random"]
 """How pairs are formed from poses."""
@@ -46,7 +46,7 @@ EncoderNoise = Literal["propagated", "estimated"]
 """Whether the noise of joint readings is added to that of the rows, or each true joint vector is estimated too."""
 
 Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
-"""What becomes of large residuals: least squares, or a robust loss."""
+"""Treatment of large residuals: least squares, or a robust loss."""
 
 SharedScale = Literal["kind", "joint"]
 """Whether the tolerances of a kind of parameters, or those of a joint, are off by the same factor."""
@@ -83,7 +83,7 @@ class Pairing:
 
 
 LIMITED: dict[str, Literal["m", "rad"]] = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad"}
-"""What `Limits` may limit, and its unit."""
+"""Quantities that `Limits` limits; units."""
 
 
 @dataclass(frozen=True)

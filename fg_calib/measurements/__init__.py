@@ -1,4 +1,4 @@
-"""What was measured, in memory: configurations, kinds of measurement, how pairs are formed."""
+"""Measurements in memory: configurations, kinds of measurement, how pairs are formed."""
 
 import lazy_loader
 

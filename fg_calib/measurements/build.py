@@ -101,7 +101,7 @@ class Dataset(Brief):
 
     @property
     def source(self) -> str:
-        """What the tables are called in messages."""
+        """Name of the tables in messages."""
         return ", ".join(dict.fromkeys(table.measurements.source for table in self.tables))
 
     def estimated(self) -> Booleans:

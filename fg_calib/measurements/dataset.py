@@ -1,4 +1,4 @@
-"""What was measured, in [m] and [rad]: configurations, poses and pairs, and their noise; pairs formed from poses."""
+"""Measurements in [m] and [rad]: configurations, poses and pairs, and their noise; pairs formed from poses."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class Pairs(FrozenArrays):
 
 @dataclass(frozen=True)
 class Labels(FrozenArrays):
-    """What each row is of, by name: the target that was seen, the station it was seen from.
+    """Name in each row: the target that was seen, the station it was seen from.
 
     Attributes:
         names: The different names.
@@ -135,7 +135,7 @@ class Labels(FrozenArrays):
     index: Integers
 
     def of(self, rows: Integers) -> Labels:
-        """Those of some rows, the same names."""
+        """Labels of some rows, the same names."""
         return replace(self, index=self.index[rows])
 
     def only_of(self, chosen: Booleans) -> Booleans:
@@ -219,7 +219,7 @@ class Measurements(FrozenArrays):
         return cls(readings, *rows, None, None, position, orientation, np.zeros(robot.n_joints))
 
     def __repr__(self) -> str:
-        """What was measured, without its sigmas."""
+        """Measurements without their sigmas."""
         names = [f.name for f in fields(self) if not f.name.startswith(("sigma", "ids", "test", "named", "part"))]
         return brief(self, (name for name in names if getattr(self, name) is not None))
 
@@ -240,7 +240,7 @@ class Measurements(FrozenArrays):
         return replace(self, **rows_of, **named, labels=labels, pairs=None, groups=None)
 
     def value(self, name: str) -> Floats | None:
-        """What was measured, by a field or a column that one instrument alone has; None where it was not."""
+        """Measured values, by a field or a column that one instrument alone has; None where there are none."""
         found: Floats | None = self.columns.get(name, getattr(self, name, None))
         return found
 
@@ -250,7 +250,7 @@ class Measurements(FrozenArrays):
         return found
 
     def with_values(self, values: Mapping[str, Floats]) -> Measurements:
-        """The same with other measured values, by the names that `value` takes."""
+        """Replace measured values, by the names that `value` takes."""
         own: dict[str, Any] = {name: v for name, v in values.items() if hasattr(self, name)}
         return replace(self, **own, columns={**self.columns, **{k: v for k, v in values.items() if k not in own}})
 
@@ -307,7 +307,7 @@ def outside_limits(readings: Floats, robot: Robot) -> Booleans:
 
 
 def _limit_hint(readings: Floats, robot: Robot, joint: int, unit: str) -> str:
-    """What to do about a joint that has a reading outside its limits.
+    """Advice on a joint that has a reading outside its limits.
 
     A smaller unit is suggested where a reading is far outside and all are within the limits in that unit.
 

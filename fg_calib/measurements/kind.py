@@ -1,4 +1,4 @@
-"""What a kind of measurement says: residual and derivatives as a function of the tool frames of its ends.
+"""A kind of measurement: residual and derivatives as a function of the tool frames of its ends.
 
 A kind gives, besides its residual, *wrench rows* D: its derivative in the tool frame of each end, in a turn w about the
 base's axes through the tool point and in a shift dp of that point, as in `kinematics.Poses.jacobian`. Whatever moves
@@ -333,7 +333,7 @@ N_COMPARED = 3
 """Measurements whose derivatives are compared."""
 
 STEP = 1e-6
-"""Of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size."""
+"""Step of differences, [rad] and [m]: their error is some 1e-9 of a derivative of ordinary size."""
 
 MAX_DERIVATIVE_ERROR = 1e-4
 """Difference of a derivative, relative to 1 or its size, that is a mistake."""

@@ -67,7 +67,7 @@ class Moments:
 
 
 def length_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Moments:
-    """Of measured lengths.
+    """Moments of measured lengths.
 
     Args:
         f: True lengths, >= 0, any shape, [m].
@@ -80,7 +80,7 @@ def length_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mom
 
 
 def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Moments:
-    """Of measured rotation angles.
+    """Moments of measured rotation angles.
 
     Args:
         f: True angles in [0, pi], any shape, [rad].
@@ -107,7 +107,7 @@ def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mome
 
 
 def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:
-    """Of the length of a vector in error."""
+    """Moments of the length of a vector with a random error."""
     near = (f < FAR * np.sqrt(np.maximum(along, across))) & (across > 0.0)
     relative = np.divide(across, f**2, out=np.zeros_like(f), where=(f > 0.0) & ~near)
     excess, slope, variance = relative * f, 1.0 - relative, along + (across - 2.0 * along) * relative
@@ -120,7 +120,7 @@ def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:
 
 
 def _near_length(f: Floats, along: Floats, across: Floats) -> Moments:
-    """The same near 0, shape (n,): `across` above 0."""
+    """Moments near length 0, shape (n,): `across` above 0."""
     t = np.sqrt(across)[:, None]
     s = np.maximum(np.sqrt(along)[:, None], 0.05 * t)  # what errors across add is as good as constant over less
     first, last = np.maximum(f[:, None] - FAR * s, 0.0), f[:, None] + FAR * s
@@ -136,7 +136,7 @@ def _near_length(f: Floats, along: Floats, across: Floats) -> Moments:
 
 
 def _folded(f: Floats, inner: Moments, own: Floats) -> Moments:
-    """Of |n + e|, n a length with moments `inner` at f, e an error of its own."""
+    """Moments of |n + e|, n a length with moments `inner` at f, e its private error."""
     mean = f + inner.excess
     fold = _fold(mean, own)
     variance = fold.variance + inner.variance * fold.slope**2
@@ -144,7 +144,7 @@ def _folded(f: Floats, inner: Moments, own: Floats) -> Moments:
 
 
 def _fold(x: Floats, variance: Floats) -> Moments:
-    """Of |x + e|, x >= 0 and e of that variance."""
+    """Moments of |x + e|, x >= 0 and e of that variance."""
     s = np.sqrt(variance)
     excess, slope, left = np.zeros_like(x), np.ones_like(x), variance.astype(np.float64).copy()
     near = (x <= FAR * s) & (s > 0.0)

@@ -32,7 +32,7 @@ QR_COLUMNS = 8
 """Columns that are reduced together: of so narrow a panel the fastest, a quarter of the time of `numpy.linalg.qr`."""
 
 _NOTHING = np.zeros((0, 0)), np.zeros((0, 0, 0, 0)), np.zeros((0, 0, 0))
-"""What `_given` gives for a kind that has a twin."""
+"""Arrays that `_given` gives for a kind that has a twin."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def pack(whitening: Floats) -> Floats:
 
 
 def unpack(whitening: Floats, residual_dim: int) -> Floats:
-    """What `pack` packed, shape (n, residual_dim, residual_dim)."""
+    """Undo `pack`, shape (n, residual_dim, residual_dim)."""
     rows, columns = np.tril_indices(residual_dim)
     out = np.zeros((len(whitening), residual_dim, residual_dim))
     out[:, rows, columns] = whitening

@@ -212,7 +212,7 @@ class CustomMeasurements(Brief):
 
 @dataclass(frozen=True)
 class KnownPoint(FrozenArrays):
-    """Where a target is on the tool, or an anchor in the base frame.
+    """Position of a target on the tool, or of an anchor in the base frame.
 
     Attributes:
         xyz: Its place, shape (3,), [m].
@@ -274,16 +274,16 @@ class Table(Brief):
         return self.model in PAIR_MODELS
 
     def by_itself(self) -> Table:
-        """The same without known places that none of its own rows is of."""
+        """Drop known places that none of its own rows is of."""
         there = {name for labels in self.measurements.labels.values() for name in labels.names}
         return replace(self, known={name: place for name, place in self.known.items() if name in there})
 
     def all_train(self) -> Table:
-        """The same with its test rows as train rows."""
+        """Take its test rows as train rows."""
         return self.tested_on(np.zeros(self.measurements.n_configurations, dtype=np.bool_))
 
     def tested_on(self, configurations: Booleans) -> Table:
-        """The same with what was measured at some configurations as its test rows, all others as train rows.
+        """Take the measurements at some configurations as test rows, all others as train rows.
 
         Args:
             configurations: True for those, shape (n_configurations,).

@@ -80,7 +80,7 @@ class AnchorGauge(Instrument):
         return super().landmark(table, kind, name)
 
     def start_landmarks(self, blocks: Blocks, points: Sequence[Floats], landmarks: Landmarks) -> None:
-        """What each table adds, from its rows alone; then anchors from all tables. See `Instrument.start_landmarks`."""
+        """Offset of each table, from its rows alone; then anchors from all tables. See `Instrument.start_landmarks`."""
         at, lengths = landmarks.start, []
         for block, there in zip(blocks, points, strict=True):
             length = np.zeros(block.n)

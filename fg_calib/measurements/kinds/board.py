@@ -30,7 +30,7 @@ COVARIANCE = tuple(f"cov_{i}{j}" for i in range(1, 7) for j in range(i, 7))
 
 
 def point_in_camera(at: Frames, boards: Floats, corners: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where points of boards are in the camera's frame, shape (n, 3), with the derivatives in camera and board.
+    """Points of boards in the camera's frame, shape (n, 3), with the derivatives in camera and board.
 
     With R, p the camera, B = Exp(v), b the board and c the point on it, `R^T (B c + b - p)` is where it is. A rotation
     w and a translation dp of the camera move it by `R^T ((B c + b - p) x w - dp)`, shape (n, 3, 6), the board's

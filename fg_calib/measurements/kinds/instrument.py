@@ -1,4 +1,4 @@
-"""What an instrument says of itself: columns, landmarks with their start, what it measures and sees."""
+"""Description of an instrument: columns, landmarks with their start, what it measures and sees."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ LENGTH_COLUMNS = (
 
 
 class Quantity(NamedTuple):
-    """What an instrument measures at a configuration.
+    """A quantity that an instrument measures at a configuration.
 
     Attributes:
         field: Field of `Measurements`, or column, that holds it.
@@ -123,7 +123,7 @@ class Instrument:
 
     @property
     def measured(self) -> tuple[Quantity, ...]:
-        """Its quantities, or those of its generic columns."""
+        """Measured quantities, or those of generic columns."""
         return self.quantities or tuple(Quantity(name, name, name, self.words) for name in self.generic_columns)
 
     def kinds(self, table: Table) -> Kinds:
@@ -159,7 +159,7 @@ class Instrument:
         return Landmark(kind, name, known.xyz, known.tolerance, known.tolerance is None)
 
     def values(self, table: Table) -> Floats:
-        """What was measured, in the order of `measured`, shape (n_configurations, width).
+        """Measured values, in the order of `measured`, shape (n_configurations, width).
 
         Raises:
             ProblemError: A column is missing.
@@ -225,7 +225,7 @@ class Instrument:
         return {} if labels is None else {"of": labels.of(rows)}
 
     def _nuisances(self, m: Measurements, kinds: Kinds, of: Places) -> Floats:
-        """What landmarks have, by kind and names, for each row, shape (n_configurations, n_nuisances)."""
+        """Landmark coordinates of each row, by kind and names, shape (n_configurations, n_nuisances)."""
         found = [np.zeros((m.n_configurations, 0))]
         for kind in self.landmarks if any(kind.n_nuisances for kind, _ in kinds) else ():
             labels = self.names(m, kind)

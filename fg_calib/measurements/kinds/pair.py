@@ -97,7 +97,7 @@ class RotationAngle(Kind):
 
 
 class PairQuantity(NamedTuple):
-    """What is measured between two configurations.
+    """A quantity measured between two configurations.
 
     Attributes:
         name: Field of `Pairs`; with `sigma_` before it, that of its noise.

@@ -18,7 +18,7 @@ MAX_IMAGES = 60
 
 
 class Pixel(Kind):
-    """Where a camera on the tool sees a point of a board in the room, minus where it did, [px].
+    """Image of a point of a board in the room, predicted minus measured, by a camera on the tool, [px].
 
     Data: u, v, [px], and the point on the board, x and y, [m]. Nuisances: the board, as of `BoardPose`.
 
@@ -33,7 +33,7 @@ class Pixel(Kind):
         self.camera = camera
 
     def place(self, at: Frames, boards: Floats, corners: Floats) -> tuple[Floats, Floats, Floats]:
-        """Where points are in the camera's frame, with the derivatives in the tool and in the boards."""
+        """Points in the camera's frame, with the derivatives in the tool and in the boards."""
         return point_in_camera(at, boards, corners)
 
     def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
@@ -44,7 +44,7 @@ class Pixel(Kind):
 
 
 class RoomPixel(Pixel):
-    """Where a camera fixed in the room sees a point of a board on the tool, minus where it did, [px].
+    """Image of a point of a board on the tool, predicted minus measured, by a camera fixed in the room, [px].
 
     The chain starts in the camera's frame. Data: u, v, [px], and the point on the board, x and y, [m]. Nuisances: none.
     """

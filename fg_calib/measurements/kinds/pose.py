@@ -40,7 +40,7 @@ ORIENTATION = Quantity("rotation", "orientation", ANGLES, "measured orientations
 
 
 def point_on_tool(at: Frames, t: Floats) -> tuple[Floats, Floats]:
-    """Where points t of the tool are, `p + R t`, shape (n, 3), and `dp + w x R t`, shape (n, 1, 3, 6)."""
+    """Points t of the tool, `p + R t`, shape (n, 3), and `dp + w x R t`, shape (n, 1, 3, 6)."""
     arm = np.einsum("nij,nj->ni", at.rotation[:, 0], t)
     D = np.zeros((len(t), 1, 3, 6))
     D[:, 0, :, :3], D[:, 0, :, 3:] = -cross_matrix(arm), np.eye(3)
