@@ -39,7 +39,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Assessment(FrozenArrays):
-    """What `assess` finds out about a solution.
+    """Assessment of a solution by `assess`.
 
     Attributes:
         robot: The calibrated robot.

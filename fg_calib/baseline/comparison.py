@@ -83,7 +83,7 @@ class RealErrors(Brief):
 
 @dataclass(frozen=True)
 class Estimate(Brief):
-    """What one estimator made of a job.
+    """Result of one estimator on a job.
 
     Attributes:
         name: A key of `ESTIMATORS`.

@@ -1,4 +1,4 @@
-"""What a calibration can reach: the Cramér-Rao bound at true parameters, and what an estimator of a kind makes of it.
+"""Attainable accuracy: the Cramér-Rao bound at true parameters, and the errors of an estimator of a kind.
 
 With J the whitened derivatives of the rows in the parameters that may be wrong, x the parameters' errors (true minus
 nominal), n the whitened noise and P the rows 1/sigma of the priors, the estimate of the kept parameters K is, to first

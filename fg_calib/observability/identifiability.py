@@ -36,7 +36,7 @@ from fg_calib.robot import Robot, names_of
 def observability_of(
     problem: Problem, parameters: Floats, prefer: Sequence[str] = (), floor: float = SIGNAL_FLOOR
 ) -> Observability:
-    """What the train rows, without priors, determine of the robot's parameters around a parameter vector.
+    """Observability of the robot's parameters by the train rows, without priors, around a parameter vector.
 
     Args:
         problem: The problem.
@@ -51,7 +51,7 @@ def observability_of(
 
 @dataclass(frozen=True)
 class Identifiability(Brief):
-    """What measurements determine of a robot's parameters, and why not the rest.
+    """Identifiability of a robot's parameters, with reasons for the rest.
 
     Attributes:
         robot: The robot's name.
@@ -88,7 +88,7 @@ def observe_structure(
     n_configurations: int = 0,
     seed: int = 0,
 ) -> Identifiability:
-    """What a model can determine of a robot's parameters at all.
+    """Identifiability of a robot's parameters by a model at all.
 
     All parameters of the joints are looked at, and those of base and tool that the robot's file has estimated; what
     it calls fixed is looked at both as unknown and as known.
@@ -130,7 +130,7 @@ def observe_configurations(
     pairing: Pairing | None = None,
     prefer: Sequence[str] = (),
 ) -> Identifiability:
-    """What a model determines at given configurations, with their noise; measured values are not looked at.
+    """Identifiability by a model at given configurations, with their noise; measured values are not looked at.
 
     Args:
         robot: The robot; what is fixed counts as known.
@@ -159,7 +159,7 @@ def identifiability_of(
     kind: Literal["structural", "practical"],
     prefer: Sequence[str] = (),
 ) -> Identifiability:
-    """What the train rows of a problem, without priors, determine around a parameter vector."""
+    """Identifiability by the train rows of a problem, without priors, around a parameter vector."""
     floor = STRUCTURAL_FLOOR if kind == "structural" else SIGNAL_FLOOR
     observability = observability_of(problem, parameters, prefer, floor)
     return Identifiability(

@@ -1,4 +1,4 @@
-"""What data determine: rank, null space, the paper's three classes, and observability indices.
+"""Observability: rank, null space, the paper's three classes, and observability indices.
 
 Everything is read from one matrix, the Jacobian of the whitened residuals with its columns scaled to changes of
 ordinary size (1 mrad, or what that moves at the arm's reach), so that a singular value is a signal-to-noise ratio: how
@@ -57,7 +57,7 @@ class RelativeGroup:
         return len(self.relations)
 
     def combinations(self, kept: Sequence[str]) -> dict[str, dict[str, float]]:
-        """What kept members are estimated for where the others are left at nominal: factors by name, by kept member.
+        """Combinations estimated by kept members where the others are left at nominal: factors by name, by kept member.
 
         With K the kept and L the others a relation moves `n_K + n_L` with no effect; the estimate of K stays the same
         in `x_K + G x_L` where G undoes every relation: `n_K + G n_L = 0`.
@@ -102,7 +102,7 @@ class WeakDirection:
 
 @dataclass(frozen=True)
 class Observability(FrozenArrays):
-    """What a set of measurements determines of the parameters.
+    """Observability of the parameters by a set of measurements.
 
     Attributes:
         names: The parameters, shape (n,).

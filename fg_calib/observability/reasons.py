@@ -28,7 +28,7 @@ from fg_calib.robot import build_chain, forward, random_readings
 
 @dataclass(frozen=True)
 class ObservedQuantities:
-    """What tables together see of the tool's motion; custom kinds may see anything, in any frame.
+    """Quantities of the tool's motion that tables see; custom kinds may see anything, in any frame.
 
     Attributes:
         views: Models with the knowledge of their frames, each once.
@@ -40,7 +40,7 @@ class ObservedQuantities:
 
     @classmethod
     def of(cls, problem: Problem) -> ObservedQuantities:
-        """What the tables of a problem see, and those that its prior information is from."""
+        """Quantities that a problem's tables see, and those of its prior information."""
         views: list[tuple[Model, FrameKnowledge]] = []
         for t in problem.data.tables:
             if t.model is not None:
@@ -136,7 +136,7 @@ def find_confounding(problem: Problem, parameters: Floats, directions: Floats) -
 
 
 def confounding_in_words(letters: Sequence[str]) -> str:
-    """What a direction is confounded with, and which additional knowledge would show it."""
+    """Name the confounding of a direction, and which additional knowledge would show it."""
     names = [OTHERS.get(letter) or LANDMARKS[letter].description for letter in letters]
     kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
     remedy = f": to see it, give places of {kind.name}s (key {kind.key})" if kind is not None and kind.key else ""
@@ -203,7 +203,7 @@ def explain(problem: Problem, parameters: Floats, observability: Observability) 
 
 
 class _Motion:
-    """What a problem's parameters do to the tool at random configurations."""
+    """Motion of the tool by a problem's parameters at random configurations."""
 
     def __init__(self, problem: Problem, parameters: Floats, seen: ObservedQuantities) -> None:
         robot = problem.robot.with_values(parameters[problem.variables.robot_span])

@@ -1,4 +1,4 @@
-"""What rows say of a solution: covariance, residuals, goodness of fit, outliers, variance components."""
+"""Statistics of a solution: covariance, residuals, goodness of fit, outliers, variance components."""
 
 import lazy_loader
 

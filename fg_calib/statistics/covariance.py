@@ -249,7 +249,7 @@ def _errors(problem: graph.Problem, parameters: Floats) -> tuple[Floats, Floats]
 
 
 def _orthonormal(directions: Floats, scales: Floats) -> Floats:
-    """The same span of directions, shape (n, n_columns), orthonormal in changes of ordinary size."""
+    """Orthonormal basis, in changes of ordinary size, of the span of directions, shape (n, n_columns)."""
     scaled = directions / scales
     scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
     _, s, Vt = np.linalg.svd(scaled, full_matrices=False)

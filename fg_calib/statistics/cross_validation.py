@@ -276,7 +276,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Acceptance:
-    """What became of all limits.
+    """Outcome of all limits.
 
     Attributes:
         judgements: Limit by limit.

@@ -54,7 +54,7 @@ OUTLIER_WEIGHT = 0.5
 """A row with a robust weight below this is an outlier."""
 
 FLAGS = ("", "suspect", "outlier", "excluded", "test")
-"""What is said of a row, in the order of the codes."""
+"""Flags of a row, in the order of the codes."""
 
 LEAST_VARIANCE = 1e-6
 """Variance of a residual, over that of its noise, below which the row is met whatever was measured."""
@@ -111,7 +111,7 @@ class KindFit:
     @computed_field  # type: ignore[prop-decorator]
     @property
     def verdict(self) -> str:
-        """What the figures say, as a key of `VERDICTS`."""
+        """Verdict of the test, as a key of `VERDICTS`."""
         ratio, p = self.observed_over_specified / self.factor, self.p_value
         if not np.isfinite(ratio):
             return "unknown"
@@ -132,14 +132,14 @@ VERDICTS = {
     "others": "as specified once the outliers are left out",
     "unknown": "too few rows to tell",
 }
-"""What a fit by kind means, in words."""
+"""Verdict on a fit by kind, in words."""
 
 PREDICTION_VERDICTS = VERDICTS | {
     "as specified": "as expected",
     "too large": "smaller than expected",
     "too small": "larger than expected",
 }
-"""The same of predicted rows."""
+"""Verdict on predicted rows."""
 
 
 @dataclass(frozen=True)
@@ -384,7 +384,7 @@ class RowStatistics:
         self.predicted = self._predict(test, squares[test])
 
     def _of(self, rows: Integers) -> ResidualCovariance:
-        """What some of the kept rows follow from, over sigma."""
+        """Covariance of some of the kept rows, over sigma."""
         return self._errors.at(np.searchsorted(self._kept, rows))
 
     def _read(self, keep: Booleans) -> ResidualCovariance:
@@ -566,7 +566,7 @@ class ChiSquare:
 
     @property
     def ratio(self) -> float:
-        """It over its mean; 1 where nothing is expected."""
+        """Ratio to its mean; 1 where nothing is expected."""
         return self.value / self.expected if self.expected > 0.0 else 1.0
 
 

@@ -125,7 +125,7 @@ def estimate_tolerances(
 
 @dataclass(frozen=True)
 class Corrections:
-    """What the data say of the corrections in prior sigmas.
+    """Information of the data on the corrections in prior sigmas.
 
     Attributes:
         information: G, shape (n, n).
@@ -230,7 +230,7 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
 def _corrections(
     solution: graph.Solution, specified: graph.Variables, scale: Floats, group: Integers
 ) -> tuple[Corrections, Floats]:
-    """What the data say of the corrections in specified prior sigmas, to first order at a solution.
+    """Information of the data on the corrections in specified prior sigmas, to first order at a solution.
 
     At the optimum the data pull as hard one way as the priors do the other, so that `g = (G + 1 / scale^2) u`. Where
     rows share errors but count as independent, g varies by H = G + (what they share) instead of by G: then the data
@@ -339,7 +339,7 @@ def judge_priors(solution: graph.Solution, spread: Spread) -> PriorFit | None:
 
 
 def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats]:
-    """What prior rows are of, those of landmarks last; z, and its covariance A."""
+    """Names of prior rows, those of landmarks last; z, and its covariance A."""
     problem, variables = solution.problem, solution.problem.variables
     z, P = graph.prior_rows(variables, solution.parameters)
     names = [p.name for p in _prior_parameters(variables)]

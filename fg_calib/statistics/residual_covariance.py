@@ -75,7 +75,7 @@ class ResidualCovariance:
         return replace(self, M=np.block([[K, felt_], [felt_, np.zeros_like(K)]])[:n, :n])
 
     def split(self) -> ResidualCovariance:
-        """The same covariance with errors of more than one in `FEW` rows among the columns of P."""
+        """Move errors of more than one in `FEW` rows into the columns of P."""
         many = FEW * np.bincount(self.L.indices, minlength=self.L.shape[1]) > len(self.d)
         P, M = np.hstack([self.P, self.L[:, many].toarray()]), block_diag(self.M, np.eye(int(many.sum())))
         return ResidualCovariance(self.d, self.L[:, ~many], P, M)
@@ -116,7 +116,7 @@ class ResidualCovariance:
 
 
 class RowModel:
-    """What the rows of every block follow from at the estimate.
+    """Linear model of every block's rows at the estimate.
 
     Test rows that touch a point which no train row touched are judged about their mean: with W what takes the mean of
     each coordinate off, W J and W L, their private noise one more column of L each.
@@ -163,7 +163,7 @@ class RowModel:
         return out
 
     def errors(self, number: int, rows: Integers) -> ResidualCovariance:
-        """What the rows of some measurements of a block follow from; M is still open."""
+        """Covariance of the rows of some measurements of a block; M is still open."""
         alone, width = self._of_alone[number], int(self._first[-1])
         P, L = self._derivatives(number, rows)
         d, n = self._noises[number].variance[rows].ravel(), len(P) // max(len(rows), 1)
@@ -191,7 +191,7 @@ class RowModel:
         return W @ P, Sparse(Sparse(W) @ L)
 
     def _derivatives(self, number: int, rows: Integers) -> tuple[Floats, Sparse]:
-        """Of the rows of some measurements of a block in core and landmarks, and in errors."""
+        """Derivatives of some measurements' rows in core and landmarks, and in errors."""
         noise, at = self._noises[number], self._at
         J, nuisances = residuals.linearise(noise.rows_at(rows), self.chain(number))[1], noise.series.nuisances[rows]
         P = np.zeros((*J.shape[:2], at.n_columns + at.n_nuisance))

@@ -347,7 +347,7 @@ def same_readings(readings: Floats) -> Integers:
 
 
 def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:
-    """What each of n measurements is of, as codes; names that have none yet get one."""
+    """Name of each of n measurements as a code; names that have none yet get one."""
     if of is None:
         return np.zeros(n, dtype=np.int32)
     known = [codes.setdefault(name, len(codes)) for name in of.names]
@@ -368,7 +368,7 @@ def _table_rows(series: MeasurementBlock, part: Integers | None) -> Indices:
 
 
 def _ends(ends: Integers, landmarks: Integers, n: int) -> tuple[Indices, Indices]:
-    """What each measurement is between: configurations, or landmarks (counted on from n) where it has none.
+    """Ends of each measurement: configurations, or landmarks (counted on from n) where it has none.
 
     Args:
         ends: Configurations of each, shape (n_measurements, ends).

@@ -72,7 +72,7 @@ TINY = 1e-100
 
 @dataclass(frozen=True)
 class NoiseComponents:
-    """What the residuals say of the noise of each origin, as it is taken to be.
+    """Noise of each origin by the residuals, with the noise as taken.
 
     Attributes:
         names: The origins.
