@@ -276,7 +276,7 @@ class Calibration:
 
     @property
     def report_data(self) -> ReportData:
-        """What its report, page and figures are made of."""
+        """Data of its report, page and figures."""
         return ReportData(self.result, self.robot, self.posterior, self.configurations, self.residuals)
 
     @property
@@ -286,7 +286,7 @@ class Calibration:
 
     @property
     def calibrated(self) -> Calibrated:
-        """What is known of the arm, for new rows."""
+        """The arm's prior information for new rows."""
         result = self.result
         nominal = _with_priors(self.posterior.variables.robot, result)
         values = np.array([p.estimate for p in result.parameters])
@@ -487,7 +487,7 @@ class Calibration:
     @checked
     @single_threaded
     def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
-        """Where the tool truly is at joint readings, and how well that is known.
+        """Predict the true tool poses at joint readings, with their uncertainty.
 
         Args:
             readings: Shape (n, n_joints), or (n_joints,) of one configuration, [rad] (prismatic: [m]).
@@ -544,7 +544,7 @@ def predict(
             measured, as a calibration just made does.
         readings: Configurations, shape (n, n_joints), or (n_joints,) of one, [rad] (prismatic: [m]); drawn all over the
             workspace if None.
-        limit: What position errors are held to, [m].
+        limit: Limit of position errors, [m].
         measured: Readings of the measured configurations, shape (m, n_joints), of a calibration that was loaded.
 
     Raises:

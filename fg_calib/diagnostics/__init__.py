@@ -1,4 +1,4 @@
-"""What is wrong with a set-up, a model or a solution, and the verdict on it."""
+"""Errors and warnings of a set-up, a model or a solution, and the verdict."""
 
 import lazy_loader
 

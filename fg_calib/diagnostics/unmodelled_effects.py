@@ -302,7 +302,7 @@ def _by_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:
 
 
 def _joint_errors(robot: Robot, readings: Floats) -> Floats:
-    """What a joint's error may follow by configuration, shape (n, len(_STAGES), n_joints).
+    """Effects that a joint's error may follow, shape (n, len(_STAGES), n_joints).
 
     Loads along z; how far the tool reaches out; harmonics of one and two periods a turn (of a prismatic joint its
     position and the square of that); loads along x and y.

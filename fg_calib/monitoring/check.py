@@ -76,7 +76,7 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Check:
-    """What new rows say of a calibration.
+    """Check of a calibration by new rows.
 
     Attributes:
         verdict: Whether it is still good.

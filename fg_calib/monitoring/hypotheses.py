@@ -88,7 +88,7 @@ class ChangeHypothesis:
 
 @dataclass(frozen=True)
 class HypothesisTest:
-    """What a hypothesis explains.
+    """Test of a hypothesis.
 
     Attributes:
         hypothesis: The change.
@@ -138,7 +138,7 @@ def quantile(probability: float, k: int) -> float:
 
 
 def fit_change(hypothesis: ChangeHypothesis, rows: Linear, n: int) -> HypothesisTest | None:
-    """What a hypothesis explains of rows; None where they do not see it.
+    """Fit a hypothesis to rows; None where they do not see it.
 
     Args:
         hypothesis: The change.
@@ -178,7 +178,7 @@ def single_changes(rows: Linear) -> list[ChangeHypothesis]:
 
 
 def zero_names(robot: Robot) -> tuple[str, ...]:
-    """What the zero of each joint is called: theta3 or d3 where the convention has it, else `<joint>.zero`."""
+    """Name of each joint's zero: theta3 or d3 where the convention has it, else `<joint>.zero`."""
     moving = {e.joint: robot.parameters[e.parameter].name for e in robot.elements
               if e.joint is not None and e.parameter is not None}  # fmt: skip
     return tuple(moving.get(j, f"{joint.name}.zero") for j, joint in enumerate(robot.joints))
@@ -233,7 +233,7 @@ def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
 
 
 def fit_changes(rows: Linear) -> list[HypothesisTest]:
-    """What each hypothesis explains, pairs of zeros among them where no single change explains the rows."""
+    """Fit each hypothesis, pairs of zeros among them where no single change explains the rows."""
     hypotheses = [*single_changes(rows), *gross_errors(rows)]
     found = [f for one in hypotheses if (f := fit_change(one, rows, len(hypotheses))) is not None]
     if not found or max(special.chdtrc(f.dof, f.left) for f in found) >= CERTAIN:

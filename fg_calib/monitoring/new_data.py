@@ -30,7 +30,7 @@ class Rows:
     """New tables, as they are to be compared with a calibrated arm.
 
     Attributes:
-        tables: They, those of one station each.
+        tables: The new tables, split by station.
         like: Of each the name of the calibration's table that it is like.
     """
 
@@ -42,7 +42,7 @@ class Rows:
         """Tables apart by their stations.
 
         Args:
-            tables: They.
+            tables: The new tables.
             like: Of each the name of the calibration's table that it is like.
             options: Of the calibration.
         """
@@ -177,7 +177,7 @@ class Linear:
         return float(np.sum(self.left**2))
 
     def new(self, columns: Floats) -> Floats:
-        """What columns of the rows, shape (m, n), have that is not fitted, shape (m + k, n)."""
+        """Part of columns of the rows, shape (m, n), that is not fitted, shape (m + k, n)."""
         wide = np.pad(columns, ((0, len(self.left) - len(columns)), (0, 0)))
         for _ in range(2):  # once more: rounding of the first time
             wide = wide - self.fitted @ (self.fitted.T @ wide)

@@ -1,4 +1,4 @@
-"""What a calibration has learned, for the next one: what its rows say, and fingerprints of these, without the rows.
+"""Prior information for the next calibration: that of this one's rows, and fingerprints of these, without the rows.
 
 A fingerprint is a hash of one measurement's values, joint readings included, to 1e-12 m or rad, so that units and the
 file's format make no difference: integers multiplied and added modulo 2^64, of which the upper bits count.
@@ -56,7 +56,7 @@ class Calibrated:
 
     @cached_property
     def information(self) -> graph.Knowledge | None:
-        """What rows say, and tolerances about the nominal values as rows of their own."""
+        """Information of the rows, and tolerances about the nominal values as rows of their own."""
         known = self.knowledge
         if known is None or not self.options.has_priors:
             return known
@@ -74,7 +74,7 @@ class Calibrated:
 
     @property
     def fixed_options(self) -> Options:
-        """Its options, noise and prior sigmas as they were found."""
+        """Options with noise and prior sigmas as estimated."""
         return replace(self.options, estimate_noise=False, estimate_tolerance=None)
 
     def noise_of(self, like: Sequence[str]) -> graph.NoiseState:
@@ -95,7 +95,7 @@ class Calibrated:
 
 @single_threaded
 def knowledge_of(solution: graph.Solution) -> graph.Knowledge | None:
-    """What the rows of a solution say of the arm, targets and anchors, with what was known before.
+    """Information of a solution's rows about the arm, targets and anchors, with earlier information.
 
     Tolerances of the arm are not counted among it, said places of targets and anchors are. Parameters that were left
     out to fix the gauge have their columns. Rows that share errors but were to count as independent do so here, as in
@@ -136,7 +136,7 @@ def at_nominal(problem: graph.Problem, before: Floats) -> tuple[graph.Problem, F
 
 
 def _known_at(problem: graph.Problem, x: Floats, *, with_loss: bool) -> graph.Knowledge:
-    """What the rows of a problem, and those before, say, linearised at a parameter vector; not the arm's tolerances."""
+    """Information of a problem's rows, and of those before, at a parameter vector; without the arm's tolerances."""
     v, known, unknowns = problem.variables, problem.knowledge, problem.data.landmarks
     staying = {name: _place(problem, name) for name in unknowns.keys if name[0] in graph.STAYING}
     places = {name: place for name, place in staying.items() if place is not None}

@@ -94,7 +94,7 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
 
 
 def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]) -> Knowledge:
-    """What is known of an arm that may have changed since, the tolerances among it.
+    """Information about an arm that may have changed since, the tolerances among it.
 
     Growth of a parameter's name counts before that of its kind.
     """

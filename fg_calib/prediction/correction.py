@@ -81,7 +81,7 @@ class Correction(FrozenArrays):
 
     @cached_property
     def far(self) -> Booleans:
-        """Where a joint changes by more than a calibration alone explains, shape (n,)."""
+        """Joints that change by more than a calibration alone explains, shape (n,)."""
         return np.asarray((np.abs(self.changed) > LARGE_CHANGE).any(axis=1))
 
     def __repr__(self) -> str:

@@ -59,7 +59,7 @@ class Responsible:
 
 @dataclass(frozen=True)
 class WorstConfiguration(FrozenArrays):
-    """Where the expected position error is largest, as far as it is known.
+    """Configuration with the largest expected position error, as far as known.
 
     Attributes:
         errors: Expected there, of one configuration.
@@ -104,7 +104,7 @@ class PredictedErrors(FrozenArrays):
 
     @cached_property
     def worst(self) -> WorstConfiguration | None:
-        """Where the error is largest; None where it is known nowhere."""
+        """Configuration with the largest error; None where it is known nowhere."""
         if self.unknown == 1.0:
             return None
         row = int(np.nanargmax(self.expected[:, 0]))
