@@ -207,7 +207,7 @@ def map_jobs(
 
 
 def _submit(executor: Executor | None, function: Callable[[T], R], job: T, name: str) -> Callable[[], R | Failure]:
-    """Where a job's result comes from: a future, or a call to be made later where there is no executor."""
+    """Start a job: its result is a future, or a call to be made later where there is no executor."""
     if executor is None:
         return lambda: _call(function, job, name)
     try:

@@ -62,7 +62,7 @@ def design(
 
 
 def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
-    """What is to be designed, the units of its tables, and the arm."""
+    """Read the scenario or job, the units of its tables, and the arm."""
     from fg_calib.inputs import InputError
     from fg_calib.io import Units, is_job, read_job, units_of
     from fg_calib.simulation import read_scenario
@@ -83,7 +83,7 @@ def _readings(path: Path, robot: Robot, units: Units) -> Any:
 
 
 def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
-    """Where the candidates come from."""
+    """Options that say where the candidates come from."""
     from fg_calib.simulation import GivenReadings, read_scenario
 
     if given is None:

@@ -1,4 +1,4 @@
-"""What commands share: options, output of reports, JSON and progress, exit codes."""
+"""Shared by all commands: options, output of reports, JSON and progress, exit codes."""
 
 from __future__ import annotations
 

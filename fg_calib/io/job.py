@@ -48,7 +48,7 @@ from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
 from fg_calib.robot import Robot, names_of
 
 UNSPECIFIED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
-"""Where the noise starts from if it is to be estimated and nothing was specified."""
+"""Start of the noise if it is to be estimated and nothing was specified."""
 
 NOISE_UNITS = {"position": "m", "orientation": "rad", "distance": "m", "angle": "rad", "point": "m", "pixel": "px"}
 NOISE_UNITS |= {name: column.si for name, column in GENERIC_COLUMNS.items()}
@@ -71,7 +71,7 @@ _Columns = dict[
         BeforeValidator(lambda one: {"name": one} if isinstance(one, str) else one),
     ],
 ]
-"""What a table calls its columns: by the name that is known here."""
+"""A table's own names of columns, by the name that is known here."""
 
 
 class _Point(Schema):

@@ -72,7 +72,7 @@ Observability = Annotated[
     WrapSerializer(_flat),
     BeforeValidator(lambda value: {**value, "observability": value} if isinstance(value, dict) else value),
 ]
-"""What the data determine; flat in JSON."""
+"""Identifiability by the data; flat in JSON."""
 
 
 class Section(BaseModel):
@@ -166,7 +166,7 @@ class Knowledge(Section):
 
 
 class Carried(Section):
-    """What the next calibration of this arm takes over.
+    """Prior information for the next calibration of this arm.
 
     `job` is the job without its robot, by which tables like its own are read; `rows` are fingerprints of the fitted
     rows, so that none counts twice; `noise` the factors on specified sigmas by table and kind, where it was estimated.
@@ -501,7 +501,7 @@ def _upgraded(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def _shapes(result: Result) -> Iterator[tuple[str, Any, Any]]:
-    """What a result holds in two forms: the key, the shape or number there, and what the rest makes of it."""
+    """Quantities that a result holds twice: the key, the shape or number there, and that by the rest of it."""
     names, known = result.covariance.names, {p.name for p in result.parameters}
     matrices = [("covariance", result.covariance.matrix, len(names))]
     if (posterior := result.posterior) is not None:

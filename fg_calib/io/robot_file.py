@@ -441,7 +441,7 @@ class _Robot(Schema):
     tolerance: dict[str, Positive] = Field(default_factory=dict)
 
     def choices(self, place: str) -> dict[str, Any]:
-        """What `RobotBuilder.build` wants to know, [m] and [rad].
+        """Arguments of `RobotBuilder.build`, [m] and [rad].
 
         Raises:
             InputError: A tolerance is too small.

@@ -187,7 +187,7 @@ class Table:
         return int(self.frame.height)
 
     def present(self, *columns: str) -> tuple[str, ...]:
-        """Those of `columns` that the table has."""
+        """Columns among `columns` that the table has."""
         return tuple(c for c in columns if c in self.columns)
 
     def has(self, *columns: str) -> bool:
@@ -628,7 +628,7 @@ def read_joint_table(
 
 @dataclass(frozen=True)
 class Targets(FrozenArrays):
-    """What the tool is to reach.
+    """Targets of the tool.
 
     Attributes:
         ids: The targets' names: their ids, or 0-based row numbers.
@@ -673,7 +673,7 @@ def read_targets(path: Path | str | Any, robot: Robot, units: Units | None = Non
 
 
 def _measured(table: Table, known: Iterable[str], units: Units, noise: Noise) -> dict[str, Any]:
-    """What was measured at configurations, by the names of the fields of `Measurements`.
+    """Measurements at configurations, by the names of the fields of `Measurements`.
 
     Args:
         table: The table.

@@ -127,7 +127,7 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
 
 
 def number_hint(found: object) -> str:
-    """What to do about a text that is no number although people read it as one; else nothing."""
+    """Advice on a text that is no number although people read it as one; else nothing."""
     text = str(found).strip()
     if re.fullmatch(r"[-+]?\d*,\d+", text):
         return _DECIMAL_COMMA
@@ -176,7 +176,7 @@ _EXPECTED = {
     "too_short": "at least {min_length} in the list",
     "too_long": "at most {max_length} in the list",
 }
-"""What was expected, by pydantic's type of misfit."""
+"""Expected values, by pydantic's type of misfit."""
 
 
 def shown(value: object) -> str:
@@ -281,7 +281,7 @@ class Units:
         return {"m": self.length, "rad": self.angle}.get(unit, unit)
 
     def factor(self, unit: str) -> float:
-        """What a value of the file is multiplied by to be in `unit`: `m`, `rad`, or one that no file has another of."""
+        """Factor from a value of the file to `unit`: `m`, `rad`, or one that no file has another of."""
         return {"m": LENGTHS[self.length], "rad": ANGLES[self.angle]}.get(unit, 1.0)
 
     def sigma(self, figure: float, unit: str, place: str) -> float:

@@ -101,7 +101,7 @@ def limits_of(*values: Any, around: float = 0.05, with_zero: bool = False) -> tu
 
 
 Axis = tuple[float, float] | Sequence[str]
-"""What an axis shows: values from a lowest to a highest, or names, whose values are 0, 1, 2 ..."""
+"""Range of an axis: values from a lowest to a highest, or names, whose values are 0, 1, 2 ..."""
 
 
 class Plot:

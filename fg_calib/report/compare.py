@@ -1,4 +1,4 @@
-"""What is compared: estimators on one job, two calibrations, the runs of a calibration, a calibration with new rows."""
+"""Comparisons: estimators on one job, two calibrations, the runs of a calibration, a calibration with new rows."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _comparison_notes(comparison: Comparison) -> Iterator[str]:
 
 @checked
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
-    """What `comparison.json` holds: SI, full precision, None for what is unknown or infinite.
+    """The document `comparison.json`: SI, full precision, None for what is unknown or infinite.
 
         { "schema": "fg-calib/comparison/1", "version", "robot", "model", "frame", "pairing",
           "judged_on": "test" | "train", "n_judged", "truth_known", "trustworthy", "findings",
@@ -251,7 +251,7 @@ KINDS = {
     "frame": "the measurement frame, or the base",
     "row": "gross errors of one configuration",
 }
-"""What each kind of explanation changes."""
+"""Change that each kind of explanation is."""
 
 SHOWN_CHANGES = "Joint offset changes that these rows show in 9 of 10 cases"
 

@@ -235,7 +235,7 @@ def _is_touched(table: Table) -> bool:
 
 
 def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:
-    """Where to go, in order, and where the tool then is by the arm as it is known."""
+    """Poses to measure, in order, with the tool's position by the arm as it is known."""
     at = pose(design.pool.robot, design.readings).position / units.factor("m")
     group = {"table": np.where(design.group == "", "all", design.group)} if np.any(design.group != "") else {}
     tool = {f"tool_{axis}": np.round(at[:, k], DECIMALS) for k, axis in enumerate("xyz")}

@@ -211,7 +211,7 @@ def _draw_cells(plot: Plot, at: Floats, error: Floats, edges: Floats) -> None:
 
 
 def arm_scene(data: ReportData, most: int = 300) -> Mapping[str, Any] | None:
-    """What `arm.js` draws: the measured configurations with the arm's shape and residual; None where unknown.
+    """Data of `arm.js`: the measured configurations with the arm's shape and residual; None where unknown.
 
     Args:
         data: The calibration.

@@ -47,7 +47,7 @@ def write_observability(folder: Path | str, found: Identifiability) -> None:
 
 
 def build_identifiability_report(found: Identifiability) -> Group:
-    """What can be identified, as in the paper's Tables 3 and 4, and why the rest cannot."""
+    """Report identifiable parameters, as in the paper's Tables 3 and 4, and reasons for the rest."""
     where = "random configurations" if found.kind == "structural" else "configurations"
     known = line(f"With {', '.join(found.fixed)} known, as the robot's file says", "bold")
     return tables.report(
@@ -82,7 +82,7 @@ def _classes(found: Identifiability) -> Iterator[Content | Section]:
 
 
 def build_inspection_report(found: Inspection, job: Job) -> Group:
-    """What looks wrong, then what the tables hold and what they can determine."""
+    """Report warnings, then what the tables hold and what they can determine."""
     words = [table_in_words(table) for table in job.tables]
     if len(words) > 1:
         words = [f"{table.measurements.source} ({of})" for table, of in zip(job.tables, words, strict=True)]

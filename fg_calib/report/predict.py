@@ -92,7 +92,7 @@ def _configuration(errors: ToolErrors, k: int, name: str, far: bool) -> dict[str
 
 
 FILES = {"predict.json": b'{\n "schema": "fg-calib/predict/', "predict.csv": b"id,", "predict.svg": b"<svg"}
-"""What `write_prediction` may write, and how it begins."""
+"""Files that `write_prediction` may write, and how each begins."""
 
 
 def write_prediction(

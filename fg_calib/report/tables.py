@@ -62,7 +62,7 @@ def line(text: str, style: str = "") -> Text:
 
 
 Content = Table | Text | str
-"""What a section holds: tables, lines with a style, and sentences."""
+"""Content of a section: tables, lines with a style, and sentences."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Section:
 
     @property
     def sentences(self) -> list[str]:
-        """Its sentences, and what stands below its tables."""
+        """Sentences of the section, and what stands below its tables."""
         return [str(part.caption or "") if isinstance(part, Table) else str(part) for part in self.content]
 
 

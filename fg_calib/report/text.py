@@ -35,7 +35,7 @@ UNMOVED = 1e-9
 
 @dataclass(frozen=True)
 class ReportData:
-    """What the report, the page and the figures of a calibration are made of.
+    """Data of the report, the page and the figures of a calibration.
 
     Attributes:
         result: The result.
@@ -403,7 +403,7 @@ def summary(result: Result, most: int = 4) -> list[str]:
 
 
 def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
-    """What a reader of the report should know besides, a sentence each."""
+    """Notes for a reader of the report, a sentence each."""
     problem, weights, series = solution.problem, solution.problem.state.weights, solution.problem.data.blocks
     for reason, count in problem.n_excluded.items():
         if count:
@@ -431,7 +431,7 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
 
 
 def _noise_notes(solution: Solution, assessed: Assessment) -> Iterator[str]:
-    """What the ratio of observed to specified noise means, and how to estimate the noise."""
+    """Explain the ratio of observed to specified noise, and how to estimate the noise."""
     estimated, verdicts = solution.estimated_noise, {fit.verdict for fit in assessed.fit.goodness.kinds}
     if estimated and solution.converged:
         kinds = " and ".join(dict.fromkeys(kind for _, kind in estimated))
@@ -442,7 +442,7 @@ def _noise_notes(solution: Solution, assessed: Assessment) -> Iterator[str]:
 
 
 def _undetermined(solution: Solution, assessed: Assessment) -> Iterator[str]:
-    """What fixes the parameters that the data alone do not determine."""
+    """Explain what fixes the parameters that the data do not determine."""
     estimated, fixed = set(assessed.names), dict[str, list[str]]()
     for p in assessed.estimates.parameters:
         if p.identifiability in ("relative", "ineffective"):
