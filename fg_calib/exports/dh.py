@@ -87,7 +87,7 @@ FARTHEST = 10.0
 """How far along an axis the next frame of a table may be, in the arm's length."""
 
 SAME = 1e-12
-"""What of a transform counts as nothing, [m] and [rad]: rounding of a product is some 1e-16."""
+"""Entries of a transform up to this count as 0, [m] and [rad]: rounding of a product is some 1e-16."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def plane_crossing(M: Floats) -> dict[str, float]:
 
 
 def left_over(M: Floats, row: Mapping[str, float]) -> Floats:
-    """What is left of a transform behind a row of figures, shape (4, 4)."""
+    """Remainder of a transform after a row of values, shape (4, 4)."""
     return inverse(row_transform("dh-hayati", dict(row))) @ M
 
 
@@ -223,7 +223,7 @@ def _direction(p: Floats) -> float:
 
 
 def _upright(row: dict[str, float]) -> dict[str, float]:
-    """The same row with theta within a quarter turn of 0."""
+    """An equivalent row with theta within a quarter turn of 0."""
     if np.cos(row["theta"]) < -SAME:
         row = row | {"theta": row["theta"] + np.pi, "a": -row["a"], "alpha": -row["alpha"]}
     return {kind: _turn(kind, value) for kind, value in row.items()}
@@ -322,7 +322,7 @@ def links_of(robot: Robot) -> Links:
 
 
 def _product(robot: Robot, elements: Sequence[Element]) -> Floats:
-    """What elements of a robot without readings do together, shape (4, 4)."""
+    """Product of elements of a robot without readings, shape (4, 4)."""
     part = replace(robot, elements=(Element(Axis.TX), *elements))  # a chain has at least one
     at = forward(build_chain(part), part.trig(np.zeros((1, robot.n_joints))))
     return rigid(at.rotation[0], at.position[0])
@@ -364,8 +364,8 @@ N_FITTED, N_JUDGED = 300, 1000
 """Configurations drawn within the joint limits to fit, and others to judge by."""
 
 HOLD = 1e-2
-"""What a change of a figure by 1 m or 1 rad counts against a miss of the tool by 1 m: a fit that gains hundredths of a
-millimetre by figures of metres is none. Of a UR10 off by 0.5 mm and 0.5 mrad, 1e-3 to 1e-1 give the same fit, 0.168 mm
+"""Weight of a value's change by 1 m or 1 rad against a miss of the tool by 1 m: a fit that gains hundredths of a
+millimetre by values of metres is none. Of a UR10 off by 0.5 mm and 0.5 mrad, 1e-3 to 1e-1 give the same fit, 0.168 mm
 RMS; 1e-4 gives 0.163 mm with d of 16 m."""
 
 
@@ -414,7 +414,7 @@ def poses(robot: Robot, readings: Floats) -> Poses:
 
 
 def fit_zeros(nominal: Robot, calibrated: Robot, readings: Floats) -> Floats:
-    """What is to be added to joint readings so that the nominal arm comes nearest to the calibrated one.
+    """Fit offsets of the joint readings that bring the nominal arm nearest to the calibrated one.
 
     Where zeros act alike, such as those of two slides along one line, the least of them are taken.
 

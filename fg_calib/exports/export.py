@@ -87,7 +87,7 @@ class Export:
         write_text(path, self.text)
 
     def document(self) -> dict[str, Any]:
-        """What `--json` prints.
+        """The document of `--json`.
 
         { "schema": "fg-calib/export/1", "version", "to", "robot", "text", "notes": [text], "findings": [text],
           "not_accepted": [text],
@@ -107,7 +107,7 @@ class Export:
 
 @dataclass(frozen=True)
 class _Arm:
-    """What is exported: the calibrated arm, its nominal robot where that is known, and the comments for its file."""
+    """Data to export: the calibrated arm, its nominal robot where that is known, and comments for the file."""
 
     robot: Robot
     nominal: Robot | None
@@ -217,7 +217,7 @@ def _frame_words(robot: Robot, owner: int) -> str:
 
 
 def _frames_outside(robot: Robot, start: str, end: str) -> tuple[str, ...]:
-    """That a format has no place for base and tool of an arm, where it has any."""
+    """Notes that a format has no place for the arm's base and tool, if any."""
     notes = []
     for owner, name, where in ((0, "base", f"before {start}"), (robot.n_joints + 1, "tool", f"behind {end}")):
         if words := _frame_words(robot, owner):

@@ -1,4 +1,4 @@
-"""What ROS and Tesseract read: URDFs, kinematics for `ur_description`, and joint origins for Tesseract.
+"""Files for ROS and Tesseract: URDFs, kinematics for `ur_description`, and joint origins for Tesseract.
 
 A URDF is the file that the arm came from with its calibrated origins, or a new one of nothing but the chain.
 

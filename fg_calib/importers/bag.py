@@ -48,7 +48,7 @@ from fg_calib.robot import Robot, build_chain, forward
 
 @dataclass(frozen=True)
 class Source:
-    """Where a stream is from.
+    """Origin of a stream.
 
     Attributes:
         topic: Its topic.
@@ -211,7 +211,7 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Stops(FrozenArrays):
-    """What was measured while the arm stood still, a row a stop.
+    """Measurements while the arm stood still, a row a stop.
 
     Attributes:
         ids: Names, by the order of all stops that were found.
@@ -239,7 +239,7 @@ class Stops(FrozenArrays):
 
 
 class _Stop(NamedTuple):
-    """What was measured during one stop: means, and measurements minus these, by quantity, [m] and [rad].
+    """Measurements of one stop: means, and measurements minus these, by quantity, [m] and [rad].
 
     Rotations are relative to their mean, about its axes.
     """
@@ -565,7 +565,7 @@ def _messages(reader: Any, topic: tuple[str, str]) -> Iterator[tuple[int, Any]]:
 
 
 def _stamp(header: Any) -> int:
-    """Of a message's header, [ns]."""
+    """Time stamp of a message's header, [ns]."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 

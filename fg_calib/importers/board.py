@@ -74,7 +74,7 @@ MIN_IMAGES = 3
 the lens."""
 
 MIN_CORNERS = 6
-"""Of a ChArUco board: four determine its pose, and more its accuracy."""
+"""Corners of a ChArUco board: four determine its pose, and more its accuracy."""
 
 
 class CalibrationBoard(Schema):
@@ -642,7 +642,7 @@ BOARD_FILES = {
     "pixels.csv": b"id,",
     "camera.yaml": b"",
 }
-"""What is written and how it begins."""
+"""Files to write, and how each begins."""
 
 
 Readings = Mapping[str, Mapping[str, str]]
@@ -674,7 +674,7 @@ def read_readings(path: Path) -> Readings:
 
 @dataclass(frozen=True)
 class BoardTables:
-    """What is written of images of a board.
+    """Tables of a board's images.
 
     Attributes:
         fit: Poses and camera.
@@ -702,7 +702,7 @@ class BoardTables:
 
     @property
     def posed(self) -> tuple[View, ...]:
-        """Those of them whose pose stands in the table of poses: it is not one of two."""
+        """Used images whose pose stands in the table of poses: it is not one of two."""
         return tuple(view for view in self.used if not view.ambiguous)
 
     @property
@@ -717,7 +717,7 @@ class BoardTables:
         return tuple(name for name in self.readings or () if name not in seen)
 
     def document(self) -> dict[str, Any]:
-        """What `board.json` holds: SI, full precision.
+        """The document `board.json`: SI, full precision.
 
         { "schema": "fg-calib/board/1", "version", "board": {keys of its file, in m}, "image_size": [width, height],
           "rms_pixel", "sigma_pixel", "images": [{"id", "n_corners", "rms_pixel", "sigma_pixel", "position",
@@ -778,7 +778,7 @@ def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
 
 
 def _row_columns(tables: BoardTables, views: Sequence[View], each: Sequence[int]) -> dict[str, Any]:
-    """What rows begin with: id, readings, the board's name; those of an image stand as often as `each` says."""
+    """First columns: id, readings, the board's name; rows of an image repeat as often as `each` says."""
     board = {"board": tables.fit.board.name} if tables.fit.board.name else {}
     rows = [{"id": view.name, **(tables.readings or {}).get(view.name, {}), **board} for view in views]
     return {key: np.repeat([row[key] for row in rows], each) for key in rows[0]}

@@ -20,7 +20,7 @@ if config.DISABLE_JIT:  # integers of numpy overflow where those of the compiled
     raise InputError("NUMBA_DISABLE_JIT in the environment", f"found {os.environ.get('NUMBA_DISABLE_JIT')!r}", "none")
 
 _OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-"""Of all kernels: without the GIL, with fused multiply-adds."""
+"""Options of all kernels: without the GIL, with fused multiply-adds."""
 
 
 class _CompileNotice(event.Listener):  # type: ignore[misc]

@@ -163,7 +163,7 @@ class _Search:
         self.good_enough = 0.1 * REACHED / max(1.0, self.length)
 
     def look(self, q: Floats, rows: Integers) -> tuple[Floats, Floats]:
-        """What is missing to the poses, and the derivative of where the tool is in the joints.
+        """Errors of the tool poses, and the derivative of where the tool is in the joints.
 
         Returns:
             Pose minus tool, shape (n, 6), rotation vector first, about and along the base's axes; and the

@@ -29,7 +29,7 @@ LANES = 32
 
 
 class ChainArrays(NamedTuple):
-    """What the kernels take of a `kinematics.Chain`: arrays with an entry an element, then the counts.
+    """Arrays of a `kinematics.Chain` for the kernels, with an entry an element, then the counts.
 
     Attributes:
         axis: `model.Axis`.

@@ -67,7 +67,7 @@ class Chain(Brief):
     joint_columns: bool = False
 
     def at(self, parameters: Floats) -> Chain:
-        """The same chain with parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
+        """Set parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
 
         The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
         """
@@ -81,16 +81,16 @@ class Chain(Brief):
         return out
 
     def without_columns(self) -> Chain:
-        """The same chain with no derivatives."""
+        """Drop the derivatives."""
         return replace(self, column=np.full_like(self.column, -1), n_columns=0, joint_columns=False)
 
     def with_joint_columns(self) -> Chain:
-        """The same chain with the derivatives in the joints as well."""
+        """Add the derivatives in the joints."""
         return replace(self, joint_columns=True)
 
     @cached_property
     def arrays(self) -> ChainArrays:
-        """What the kernels take."""
+        """Arguments of the kernels."""
         return ChainArrays(
             axis=self.axis,
             value=self.value,
@@ -274,7 +274,7 @@ LEAST_TURNING = 1e-4
 
 
 def turning_of_base(w: Floats, rotation: Floats) -> Floats:
-    """What of the tool's turning is that of the base: the best a in `w_k = a + R_k b`, shape (3, n_columns), [rad/...].
+    """Rotation of the base in that of the tool: the best a in `w_k = a + R_k b`, shape (3, n_columns), [rad/...].
 
     Points that should coincide are off by some vectors. If the base turns, all of them turn with it, and their lengths
     stay; if the tool turns about its own point they stay as they are. Which turn of all vectors together belongs to a

@@ -1,4 +1,4 @@
-"""What to simulate: the robot's true errors, configurations, noise, instruments. A YAML file has the same fields.
+"""Scenario to simulate: the robot's true errors, configurations, noise, instruments. A YAML file has the same fields.
 
 ```yaml
 name: space-robot                     # default: the file's name
@@ -186,7 +186,7 @@ def _scale(unit: str) -> AfterValidator:
 
 
 def _fit(read: Callable[[], Any], place: str) -> Any:
-    """What pydantic makes of something.
+    """Validate something by pydantic.
 
     Raises:
         InputError: The first misfit.
@@ -571,7 +571,7 @@ _MODELS_WITH: Mapping[str, tuple[str, ...]] = {
 
 @schema
 class Instrument:
-    """What measures a table of a scenario; a table at the top of the module says which models take which fields.
+    """Instrument of a scenario's table; a table at the top of the module says which models take which fields.
 
     Every target is seen at every configuration; anchors, planes and contact points are measured in turn. A board is
     seen where its centre (pixels: the corner) is in front of the camera (pixels: and in the image, which is twice as
@@ -642,7 +642,7 @@ def override_noise(noise: Noise, more: Noise | None) -> Noise:
 
 
 def frame_knowledge(frame: str | Placement) -> FrameKnowledge:
-    """What the calibration knows of a frame."""
+    """The calibration's knowledge of a frame."""
     return "known" if isinstance(frame, str) and frame == "base" else "unknown"
 
 

@@ -76,7 +76,7 @@ MAX_BASE_M = 5.0
 """How far from the world's origin an unknown frame puts the base, along each axis, [m]."""
 
 Truth = Mapping[str, Mapping[str, Any]]
-"""Where landmarks truly are, by kind and name: `Spot`, `Plane`, `Placement`; offsets of instruments, [m]."""
+"""True landmarks, by kind and name: `Spot`, `Plane`, `Placement`; offsets of instruments, [m]."""
 
 
 def generator_of(seed: int, *names: str) -> np.random.Generator:
@@ -251,7 +251,7 @@ class Measuring:
         return self.named(what, [Spot(p) for p in places])
 
     def known(self, spots: Mapping[str, Spot]) -> dict[str, KnownPoint]:
-        """What the calibration knows of points: they are off by their tolerances."""
+        """Points as the calibration knows them: off by their tolerances."""
         found = {}
         for name, spot in spots.items():
             if spot.tolerance is not None:
@@ -531,7 +531,7 @@ class Simulation(Brief):
 
     @property
     def measurements(self) -> Measurements:
-        """What the first instrument measured."""
+        """Measurements of the first instrument."""
         return self.tables[0].measurements
 
     def n_configurations(self, *, test: bool) -> int:

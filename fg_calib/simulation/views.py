@@ -65,7 +65,7 @@ class Candidates(FrozenArrays):
     rejected: Mapping[str, int]
 
     def reasons(self) -> str:
-        """What became of all that were drawn: `1000 drawn: 83 % out of reach, 9.1 % in a box`."""
+        """Reasons of rejection, of all that were drawn: `1000 drawn: 83 % out of reach, 9.1 % in a box`."""
         shares = (f"{float(f'{100.0 * n / self.asked:.2g}'):g} % {reason}" for reason, n in self.rejected.items())
         return f"{self.asked} drawn: {', '.join(shares) or 'none rejected'}"
 
@@ -117,7 +117,7 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
 
 
 def _draw(robot: Robot, of: Configurations, generator: np.random.Generator, place: str) -> Draw:
-    """What draws configurations of a kind."""
+    """Choose how configurations are drawn."""
     match of:
         case BoardViews():
             return _views(robot, of, generator, f"{place}: board")

@@ -204,7 +204,7 @@ def _xyz(point: Floats, units: Units) -> dict[str, float]:
 
 
 def _place(landmark: Any, units: Units) -> Any:
-    """Where a landmark truly is, as a scenario would state it, in a file's units."""
+    """True place of a landmark, as a scenario would state it, in a file's units."""
     match landmark:
         case Placement():
             yaw, pitch, roll = yaw_pitch_roll(landmark.rotation)
