@@ -201,7 +201,7 @@ def assess(solution: Solution) -> Assessment:
     whole = statistics.with_left_out(solution, spread)
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     table = residual_table(solution)
-    goodness = statistics.judge_without_outliers(solution, spread, table, statistics.judge_fit(solution, spread, table))
+    goodness = statistics.judge_without_outliers(solution, table, statistics.judge_fit(solution, spread, table))
     table = table.without(goodness.unknown(table))
     chi_square, priors = statistics.chi_square(solution, spread), statistics.judge_priors(solution, spread)
     fit = statistics.Fit(chi_square, table, goodness, priors)

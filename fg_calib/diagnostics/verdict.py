@@ -409,8 +409,8 @@ def check_setup(case: Case, *, fits: bool) -> Iterator[Statement]:
             yield Statement("error", str(check))
 
 
-def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
-    """Check for other optima: parameters that differ most, in their prior sigmas, with both corrections."""
+def check_optima(case: Case) -> Iterator[Statement]:
+    """Check for other optima: the four parameters that differ most, in their prior sigmas, with both corrections."""
     robot = case.problem.robot
     advice = "; measure positions, or pairs between which more joints move" if case.problem.pair_series else ""
     for other in case.solution.others:
@@ -418,7 +418,7 @@ def check_optima(case: Case, most: int = 4) -> Iterator[Statement]:
         here, there = (at[span] - robot.nominal for at in both)
         apart = np.abs(there - here) / [p.scale for p in robot.parameters]
         words = []
-        for i in [i for i in np.argsort(-apart, kind="stable")[:most].tolist() if apart[i] > 0.3 * apart.max()]:
+        for i in [i for i in np.argsort(-apart, kind="stable")[:4].tolist() if apart[i] > 0.3 * apart.max()]:
             unit, factor, *_ = SCALES[robot.parameters[i].unit]
             words.append(f"{robot.parameters[i].name} {factor * here[i]:+.3g} or {factor * there[i]:+.3g} {unit}")
         text = f"a second optimum that the data cannot distinguish from this one: {', '.join(words)} from nominal"

@@ -49,19 +49,18 @@ def determined(singular_values: Floats, floor: float = SIGNAL_FLOOR) -> int:
     return int(np.sum(singular_values > max(RANK_TOLERANCE * singular_values.max(initial=0.0), floor)))
 
 
-def identifiable_subset(rows: Floats, scales: Floats, ranks: Sequence[int], floor: float = SIGNAL_FLOOR) -> list[int]:
+def identifiable_subset(rows: Floats, scales: Floats, ranks: Sequence[int]) -> list[int]:
     """Columns that can be estimated together, the others held: of those that only act together some are given up.
 
     Args:
         rows: Whitened derivatives, shape (m, n).
         scales: A change of ordinary size in each column, shape (n,).
         ranks: Rank of each column in the order of keeping, 0 first.
-        floor: Signal-to-noise ratio below which a direction counts as not determined.
     """
     n, J = len(scales), rows * scales
     _, s, Vt = np.linalg.svd(np.vstack([J, np.zeros((n, n))]), full_matrices=False)
-    null = Vt[determined(s, floor) :]
-    dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s.max(initial=0.0), floor)
+    null = Vt[determined(s) :]
+    dead = np.linalg.norm(J, axis=0) <= max(RANK_TOLERANCE * s.max(initial=0.0), SIGNAL_FLOOR)
     order = sorted(np.flatnonzero(~dead).tolist(), key=lambda i: (-ranks[i], i))
     given_up = first_independent(null[:, order], max(len(null) - int(dead.sum()), 0))
     return sorted(set(order).difference(order[i] for i in given_up))

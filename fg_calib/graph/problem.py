@@ -480,7 +480,7 @@ def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
 
 
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:
-    """`whitened_triangle` by named parameters, the measurement frames projected out: shape (m, n_robot_columns)."""
+    """The system's triangle by named parameters, measurement frames projected out, shape (m, n_robot_columns)."""
     return named_rows(problem.variables, parameters, problem.linearize(parameters).left.A)
 
 

@@ -63,7 +63,7 @@ class ProblemError(InputError):
 
 
 class SolverError(CalibrationError):
-    """The solver could not do its work at all (a doubtful result is a `Status`, not this)."""
+    """The solver could not do its work at all (a doubtful result is no error)."""
 
 
 def shown(value: object) -> str:

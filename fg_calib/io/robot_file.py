@@ -10,10 +10,8 @@ joints:                                units: {length: mm, angle: deg}
 ```
 Both take `name`, `base`, `tool`, `fixed`, `estimate` and `tolerance` too. Rows without `name` are called q1 to qn.
 
-URDF: the chain between any two links of the file, and its calibrated origins written back.
-
-Of each joint its type, parent, child, origin, axis, limit and mimic are read; meshes, inertias and whatever else a URDF
-may hold are not. Calibrated origins are written into the same XML, so that everything else stays as it was.
+A URDF's chain is that between any two links. Of each joint its type, parent, child, origin, axis, limit and mimic are
+read. Calibrated origins are written into the same XML, so that everything else stays as it was.
 """
 
 from __future__ import annotations

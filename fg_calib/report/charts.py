@@ -80,23 +80,23 @@ class Scale:
         """The coordinate of a value, or of an array of them."""
         return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)
 
-    def ticks(self, most: int = 5) -> list[float]:
+    def ticks(self) -> list[float]:
         """Round values along the axis."""
-        width = (self.high - self.low) / most
+        width = (self.high - self.low) / 5
         power = 10.0 ** np.floor(np.log10(width))
         step = next(float(power * k) for k in (1.0, 2.0, 5.0, 10.0) if power * k >= width * (1.0 - 1e-9))
         first, last = np.ceil(self.low / step - 1e-9), np.floor(self.high / step + 1e-9)
         return [float(k * step) for k in np.arange(first, last + 1.0)]
 
 
-def limits_of(*values: Any, around: float = 0.05, with_zero: bool = False) -> tuple[float, float]:
+def limits_of(*values: Any, with_zero: bool = False) -> tuple[float, float]:
     """The lowest and highest finite value, with room around them."""
     every = np.concatenate([np.ravel(np.asarray(v, dtype=np.float64)) for v in values] or [np.zeros(0)])
     every = every[np.isfinite(every)]
     low, high = (float(every.min()), float(every.max())) if len(every) else (0.0, 1.0)
     if with_zero:
         low, high = min(low, 0.0), max(high, 0.0)
-    room = around * (high - low) or around * abs(high) or 1.0
+    room = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     return (low if with_zero and low == 0.0 else low - room), high + room
 
 

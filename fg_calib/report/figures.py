@@ -31,6 +31,9 @@ MAX_PARAMETERS = 40
 MAX_SIGMA = 5.0
 """Residuals in their sigma, up to which a histogram distinguishes them."""
 
+MAX_STUDENTISED = 12.0
+"""Residuals in their sigma, up to which rows are drawn where they are."""
+
 WORST = 5
 """Dots that are marked by name."""
 
@@ -135,8 +138,8 @@ def residual_charts(data: ReportData) -> list[Chart]:
     return [*found, _row_by_row(rows, values, test)] if found else []
 
 
-def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans, most: float = 12.0) -> Chart:
-    shown, order = np.clip(values, -most, most), np.arange(len(values), dtype=np.float64)
+def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans) -> Chart:
+    shown, order = np.clip(values, -MAX_STUDENTISED, MAX_STUDENTISED), np.arange(len(values), dtype=np.float64)
     plot = Plot((0.0, max(len(shown), 2)), limits_of(shown, [-4.0, 4.0]), ("row", "in its sigma"))
     for level in (-3.0, 3.0):
         plot.line((plot.x.low, plot.x.high), level, "level")
@@ -147,7 +150,7 @@ def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans, most: float 
         name = " ".join(str(row[key]) for key in ("kind", "a", "b", "of") if row.get(key))
         plot.ring(row["number"], shown[row["number"]], f"{name}: {row['studentised']:+.1f}")
     rings = ", rings suspicious" if len(suspects) else ""
-    cut = f"; larger ones are drawn at {most:g}" if np.any(np.abs(values) > most) else ""
+    cut = f"; larger ones are drawn at {MAX_STUDENTISED:g}" if np.any(np.abs(values) > MAX_STUDENTISED) else ""
     return plot.chart(f"Residuals row by row: {_colours(test)}{rings}{cut}")
 
 
@@ -210,17 +213,15 @@ def _draw_cells(plot: Plot, at: Floats, error: Floats, edges: Floats) -> None:
         plot.box((x[i], x[i + 1]), (y[j], y[j + 1]), fill=colour)
 
 
-def arm_scene(data: ReportData, most: int = 300) -> Mapping[str, Any] | None:
+def arm_scene(data: ReportData) -> Mapping[str, Any] | None:
     """Data of `arm.js`: the measured configurations with the arm's shape and residual; None where unknown.
 
-    Args:
-        data: The calibration.
-        most: Configurations that are shown; of more, as many that are evenly spaced, and the worst.
+    Of more than 300 configurations these are as many that are evenly spaced, and the worst.
     """
     if data.rms is None or data.configurations is None:
         return None
     kind, rms = data.rms
-    evenly = np.linspace(0, len(rms) - 1, min(most, len(rms))).astype(np.int64)
+    evenly = np.linspace(0, len(rms) - 1, min(300, len(rms))).astype(np.int64)
     chosen = np.unique(np.concatenate([evenly, np.argsort(-np.nan_to_num(rms))[:20]]))
     low, high = np.nanquantile(rms[chosen], [0.0, 0.98]).tolist()
     items = [

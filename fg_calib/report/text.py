@@ -325,13 +325,13 @@ def _suspicious_rows(residuals: pl.DataFrame | None, split: str, most: int) -> l
     return [table_of(("a", "b", "", *more, "residual|q:+", "|unit", "in its sigma|+.1f", ""), rows, most=most)]
 
 
-def _suspicious_configurations(result: Result, most: int = 8) -> Table:
+def _suspicious_configurations(result: Result) -> Table:
     """The configurations whose residuals together are larger than noise."""
     rows = [(c.id, c.n, c.chi2, c.expected) for c in result.suspect_configurations]
-    return table_of(("", "rows|d", "chi-square|.4g", "expected|.4g"), rows, most=most)
+    return table_of(("", "rows|d", "chi-square|.4g", "expected|.4g"), rows, most=8)
 
 
-def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
+def _joint_values(found: ReportData) -> list[Section]:
     """Estimated joint positions compared with the readings, joint by joint, and the suspicious readings."""
     values, configurations = found.result.joint_values, found.configurations
     if values is None:
@@ -346,11 +346,11 @@ def _joint_values(found: ReportData, most: int = 5) -> list[Section]:
         wrong.append((name, values.names[k], values.error[i, k], units[k], values.studentised[i, k]))
     title = f"Joint readings (estimate minus reading; scatter is 1 where all is as {sigma})"
     columns = ("", f"{sigma}|q", "|unit", f"mean error / {sigma}|+z.3f", "scatter|.3f")
-    suspicious = table_of(("", "", "error|q:+", "|unit", "in its sigma|+.1f"), wrong, most=most)
+    suspicious = table_of(("", "", "error|q:+", "|unit", "in its sigma|+.1f"), wrong, most=5)
     return [*section(title, table_of(columns, rows)), *section("Suspicious joint readings", suspicious)]
 
 
-def _landmarks(result: Result, most: int = 8) -> list[Section]:
+def _landmarks(result: Result) -> list[Section]:
     """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
     sections: list[Section] = []
     for kind, title in ((kind.name, kind.heading) for kind in LANDMARKS.values() if kind.heading):
@@ -359,7 +359,7 @@ def _landmarks(result: Result, most: int = 8) -> list[Section]:
             units = ["" if kind == "unknown" else unit for unit in p.units]
             sigma = _vector(p.sigma, *units) if p.sigma.any() else "known"
             rows.append((p.name, p.n, _vector(p.xyz, *units), "±", sigma))
-        sections += section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows, most=most))
+        sections += section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows, most=8))
     return sections
 
 
@@ -380,18 +380,13 @@ def _vector(values: Floats, *units: str) -> str:
     return "  ".join(map(figure, values.tolist(), units))
 
 
-def summary(result: Result, most: int = 4) -> list[str]:
-    """Robot, verdict, counts and residuals in at most ten lines.
-
-    Args:
-        result: The result.
-        most: How many lines of the verdict are shown.
-    """
+def summary(result: Result) -> list[str]:
+    """Robot, the verdict's first four lines, counts and residuals: ten lines at most."""
     title, *verdict = map(str, _verdict(result))
     chi2 = "" if result.reduced_chi2 is None else f", reduced chi-square {result.reduced_chi2:.3g}"
     known = sum(p.sigma is not None for p in result.estimated)
     lines = [
-        *(title, *verdict[:most]),
+        *(title, *verdict[:4]),
         f"{result.n_configurations} configurations, {result.n_residuals} residuals{chi2}",
         f"{len(result.estimated)} of {len(result.parameters)} parameters estimated, {known} of them with a known sigma",
     ]

@@ -175,8 +175,9 @@ def build_chain(
 
 def _joint_of(element: Element) -> int:
     """The joint whose reading an element's value depends on, -1 for none."""
-    joint = element.joint if element.basis is None else element.basis.joint
-    return -1 if joint is None else joint
+    if element.basis is not None:
+        return element.basis.joint
+    return -1 if element.joint is None else element.joint
 
 
 def _tangent(first: int | None) -> list[tuple[Element, int, int]]:

@@ -71,9 +71,7 @@ SCALES: Mapping[str, Scale] = {
     "m": Scale("mm", 1e3, 4),
     "rad": Scale("deg", 180.0 / np.pi, 5),
     "1": Scale("ppm", 1e6, 1),
-    "rad/(N m)": Scale("mrad/(kN m)", 1e6, 3, 1e-5),
     "px": Scale("px", 1.0, 3),
-    "s": Scale("ms", 1e3, 2),
 }
 """Each SI unit of a parameter or a residual, and how reports show it."""
 
@@ -184,39 +182,24 @@ BASES: Mapping[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]
     "sin 2": (lambda q: np.sin(2.0 * q), lambda q: 2.0 * np.cos(2.0 * q)),
     "cos 2": (lambda q: np.cos(2.0 * q), lambda q: -2.0 * np.sin(2.0 * q)),
 }
-"""Functions of a joint's reading and their slopes."""
+"""Functions of a joint's reading and their slopes, for the effects of joints that `RobotBuilder.add_effect` adds."""
 
 
 @dataclass(frozen=True)
 class Basis:
-    """What an element's coefficient is multiplied by: a function of a joint's reading, or a column of values given.
+    """The function of a joint's reading that an element's coefficient is multiplied by.
 
     Attributes:
-        function: A key of `BASES`; "given" for values given, one a configuration.
-        index: Of the joint, or of the column.
+        function: A key of `BASES`.
+        joint: Index of the joint.
     """
 
     function: str
-    index: int
+    joint: int
 
-    @property
-    def joint(self) -> int | None:
-        """The joint whose reading it is a function of; None for values given."""
-        return None if self.function == "given" else self.index
-
-    def values(self, readings: Floats, given: Floats | None) -> Floats:
-        """Values and slopes in the reading, shape (n, 2).
-
-        Raises:
-            InputError: It is of values given, and they are not.
-        """
-        if self.function == "given":
-            if given is None or given.shape[1:] <= (self.index,) or len(given) != len(readings):
-                found = "none" if given is None else f"shape {given.shape}"
-                raise InputError("given", found, f"{len(readings)} rows with a column {self.index}")
-            return np.stack([given[:, self.index], np.zeros(len(given))], axis=1)
-        value, slope = BASES[self.function]
-        return np.stack([value(readings[:, self.index]), slope(readings[:, self.index])], axis=1)
+    def values(self, readings: Floats) -> Floats:
+        """Values and slopes in the reading, shape (n, 2)."""
+        return np.stack([of(readings[:, self.joint]) for of in BASES[self.function]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -362,7 +345,7 @@ class Robot:
         """What the elements' coefficients are multiplied by, each once."""
         return tuple(dict.fromkeys(e.basis for e in self.elements if e.basis is not None))
 
-    def trig(self, readings: Floats, given: Floats | None = None) -> Floats:
+    def trig(self, readings: Floats) -> Floats:
         """Joint readings as the kernels take them, shape (n, n_joints + n_bases, 2).
 
         Cosine and sine of each revolute reading (value and 0 of a prismatic one), then value and slope of each of the
@@ -370,7 +353,6 @@ class Robot:
 
         Args:
             readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
-            given: Values that bases of no joint take, one column each, shape (n, n_given).
 
         Raises:
             InputError: The readings are of more or fewer joints.
@@ -387,7 +369,7 @@ class Robot:
             trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
         if not self.bases:
             return trig
-        return np.concatenate([trig, np.stack([b.values(readings, given) for b in self.bases], axis=1)], axis=1)
+        return np.concatenate([trig, np.stack([b.values(readings) for b in self.bases], axis=1)], axis=1)
 
     @property
     def nominal(self) -> Floats:
@@ -537,6 +519,8 @@ class RobotBuilder:
     @checked
     def add_effect(self, kind: str, function: str, nominal: float = 0.0) -> None:
         """Add to the value of the joint added last: a parameter `<joint>.<kind>` times a function of its reading.
+
+        The package calls it nowhere: it is where effects of joints are added (see `docs/architecture.md`).
 
         Args:
             kind: A key of `PARAMETER_KINDS`.

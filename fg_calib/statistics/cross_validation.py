@@ -110,7 +110,7 @@ def wide(ratio: Mapping[str, float], n: int) -> list[str]:
 
 @checked
 def cross_validate(
-    job: Job, solve: Callable[[Job], Solution], n: int = 5, seed: int = 0, *, executor: Executor | None = None
+    job: Job, solve: Callable[[Job], Solution], n: int = 5, *, executor: Executor | None = None
 ) -> CrossValidation:
     """Hold every configuration out once, and calibrate without it.
 
@@ -118,7 +118,6 @@ def cross_validate(
         job: The job; its test rows take no part.
         solve: Calibrates a job; other processes must be able to import it.
         n: Number of folds; as many as configurations leave one out at a time.
-        seed: Of the division into folds.
         executor: Where the folds are calibrated; one after the other in this process if None.
 
     Raises:
@@ -135,7 +134,7 @@ def cross_validate(
         raise InputError("folds", "test rows alone", "rows to calibrate with, and to hold out")
     whole = replace(job, measurements=tables)
     data = problem_of(whole).data  # whose tables are those of one station each
-    fold = _divided(data, n, np.random.default_rng(seed))
+    fold = _divided(data, n, np.random.default_rng(0))
     if len(np.unique(fold[fold >= 0])) < n:
         raise InputError("folds", f"found {n}", f"at most {np.sum(fold >= 0)}: so many configurations can be held out")
     tables_of = list(zip(data.tables, data.places, strict=True))

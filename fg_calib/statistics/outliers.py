@@ -35,12 +35,11 @@ FINE = ("as specified", "too large", "unknown")
 _State = tuple[Solution, Spread, ResidualTable]
 
 
-def judge_without_outliers(solution: Solution, spread: Spread, table: ResidualTable, fit: Goodness) -> Goodness:
+def judge_without_outliers(solution: Solution, table: ResidualTable, fit: Goodness) -> Goodness:
     """The goodness of a fit, by kind with its cause where a few outliers make it bad.
 
     Args:
         solution: The solution.
-        spread: Its covariance.
         table: Its residuals.
         fit: Its goodness of fit.
     """

@@ -177,12 +177,12 @@ def test_a_parameter_and_a_joint_of_several_elements_have_the_sum_of_their_deriv
 def with_coefficients(robot, rng):
     """Two further elements behind each, of all axes and functions: coefficients away from zero, some of them shared."""
     elements, parameters = [], list(robot.parameters)
-    functions = [*BASES, "given"]
+    functions = list(BASES)
     for i, element in enumerate(robot.elements):
         elements.append(element)
         for k in range(2):
             function = functions[(2 * i + k) % len(functions)]
-            basis = Basis(function, int(rng.integers(3 if function == "given" else robot.n_joints)))
+            basis = Basis(function, int(rng.integers(robot.n_joints)))
             axis, shared = Axis(int(rng.integers(6))), k == 1 and i % 4 == 3
             if not shared:
                 kind = "x" if axis < 3 else "roll"
@@ -191,15 +191,15 @@ def with_coefficients(robot, rng):
     return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
 
 
-def pose_with_coefficients(robot, values, q, given):
+def pose_with_coefficients(robot, values, q):
     """base_T_tool as a product of 4x4 matrices, the functions written out."""
     T = np.eye(4)
     of = {"reading": lambda i: q[i], "sin": lambda i: np.sin(q[i]), "cos": lambda i: np.cos(q[i])}
-    of |= {"sin 2": lambda i: np.sin(2 * q[i]), "cos 2": lambda i: np.cos(2 * q[i]), "given": lambda i: given[i]}
+    of |= {"sin 2": lambda i: np.sin(2 * q[i]), "cos 2": lambda i: np.cos(2 * q[i])}
     for e in robot.elements:
         free = 0.0 if e.parameter is None else values[e.parameter]
         if e.basis is not None:
-            free = free * of[e.basis.function](e.basis.index)
+            free = free * of[e.basis.function](e.basis.joint)
         value = e.constant + e.sign * (free + (0.0 if e.joint is None else q[e.joint]))
         T = T @ (translation(e.axis, value) if e.axis < 3 else rotation(e.axis - 3, value))
     return T
@@ -210,16 +210,16 @@ def pose_with_coefficients(robot, values, q, given):
 def test_coefficients_times_functions_of_readings(convention):
     rng = np.random.default_rng(7)
     robot = with_coefficients(random_robot(convention, 4, rng), rng)
-    n, (q, given) = len(robot.parameters), (rng.uniform(-3, 3, (40, 4)), rng.normal(size=(40, 3)))
+    n, q = len(robot.parameters), rng.uniform(-3, 3, (40, 4))
     chain = build_chain(robot, {i: i for i in range(n)}).with_joint_columns()
-    poses = forward(chain, robot.trig(q, given))
+    poses = forward(chain, robot.trig(q))
     for i in (0, LANES - 1, 39):
-        T = pose_with_coefficients(robot, robot.nominal, q[i], given[i])
+        T = pose_with_coefficients(robot, robot.nominal, q[i])
         assert poses.rotation[i] == pytest.approx(T[:3, :3], abs=rounding(1.0))
         assert poses.position[i] == pytest.approx(T[:3, 3], abs=rounding(10.0))
 
         def formula(x, i=i, T=T):
-            there = pose_with_coefficients(robot, x[:n], x[n:], given[i])
+            there = pose_with_coefficients(robot, x[:n], x[n:])
             turn = Rotation.from_matrix(there[:3, :3] @ T[:3, :3].T).as_rotvec()
             return np.concatenate([turn, there[:3, 3]])
 
@@ -235,14 +235,9 @@ def test_coefficients_that_are_fixed_at_zero_do_nothing():
     off = more.with_values([*robot.nominal, *np.zeros(len(more.parameters) - len(robot.parameters))])
     q = rng.uniform(-3, 3, (3, 4))
     assert len(build_chain(off).axis) == len(build_chain(robot).axis)
-    assert np.array_equal(forward(build_chain(off), off.trig(q, np.zeros((3, 3)))).position, pose(robot, q).position)
+    assert np.array_equal(forward(build_chain(off), off.trig(q)).position, pose(robot, q).position)
 
 
-def test_bases_that_make_no_sense_are_refused():
+def test_a_basis_with_a_reading_is_refused():
     with pytest.raises(InputError, match="a basis with a constant or a reading"):
         Element(Axis.RZ, parameter=0, joint=1, basis=Basis("sin", 1))
-    rng = np.random.default_rng(9)
-    robot = with_coefficients(random_robot("dh", 2, rng), rng)
-    for given in (None, np.zeros((1, 3)), np.zeros((2, 1))):
-        with pytest.raises(InputError, match="given: "):
-            robot.trig(np.zeros((2, 2)), given)
