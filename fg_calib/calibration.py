@@ -670,10 +670,10 @@ def _posterior(robot: Robot, result: io.Result, place: str) -> TangentCovariance
 def _posterior_of_names(variables: Variables, values: Floats, covariance: Floats) -> TangentCovariance:
     """The covariance of the parameters in the tangent space; what has no variance counts as undetermined."""
     E, unknown = variables.tangent_derivative(values), np.isnan(np.diag(covariance))
-    loose = (E @ np.eye(len(covariance))[:, unknown]).T / variables.scales
-    loose /= np.linalg.norm(loose, axis=1, keepdims=True)
+    undetermined = (E @ np.eye(len(covariance))[:, unknown]).T / variables.scales
+    undetermined /= np.linalg.norm(undetermined, axis=1, keepdims=True)
     tangent = E @ np.where(unknown[:, None] | unknown, 0.0, covariance) @ E.T
-    return TangentCovariance(variables, values, tangent, loose, loose)
+    return TangentCovariance(variables, values, tangent, undetermined, undetermined)
 
 
 def _knowledge(robot: Robot, saved: io.Knowledge) -> Knowledge:

@@ -20,7 +20,7 @@ PRIVATE_SHARE = 1e-3
 
 
 class SeriesRows:
-    """The rows of a series at some parameters, and how they follow from errors of configurations.
+    """The rows of a block at some parameters, and how they follow from errors of configurations.
 
     Attributes:
         r: Residuals, shape (n, residual_dim).
@@ -30,8 +30,8 @@ class SeriesRows:
     """
 
     def __init__(self, problem, parameters, number):
-        self.problem, self.series = problem, problem.data.blocks[number]
-        s, data, state = self.series, problem.data, problem.state
+        self.problem, self.block = problem, problem.data.blocks[number]
+        s, data, state = self.block, problem.data, problem.state
         self.m, self.place = data.tables[s.table].measurements, data.places[s.table]
         at = problem.variables.at(parameters)
         self.chain = at.chains[s.table]
@@ -61,7 +61,7 @@ class SeriesRows:
 
     def _pairs(self):
         """Mean, slope and variance of lengths and angles under what noise there is along and across their vectors."""
-        s, m = self.series, self.m
+        s, m = self.block, self.m
         square, zero = (s.sigma * self.factors) ** 2, np.zeros(self.r.shape)
         of_joints = np.sum(self.sources["joints"] ** 2, axis=(2, 3))
         trace, of_poses, poses = zero.copy(), zero, None
@@ -112,21 +112,21 @@ class SeriesRows:
         return R @ Rotation.from_rotvec(h * np.eye(3)[k]).as_matrix(), p
 
     def _ends(self, poses):
-        return [array[self.series.ends] for array in poses]
+        return [array[self.block.ends] for array in poses]
 
     def _rows(self, ends):
         """Predicted minus measured by the kind's own formula in numpy, which has no compiled code."""
-        return self.series.kind.rows(Frames(*ends), self.series.data, self.points).residual
+        return self.block.kind.rows(Frames(*ends), self.block.data, self.points).residual
 
     def _sensitivity(self, move, n):
         """Derivative of all rows in moves of each end, shape (n, residual_dim, ends, n)."""
-        out = np.zeros((*self.r.shape, self.series.kind.ends, n))
+        out = np.zeros((*self.r.shape, self.block.kind.ends, n))
         still = self._ends(self._arm(self.q))
         for k in range(n):
             for sign in (1.0, -1.0):
                 for times, weight in enumerate(WEIGHTS, 1):
                     moved = self._ends(move(k, sign * times * STEP))
-                    for end in range(self.series.kind.ends):
+                    for end in range(self.block.kind.ends):
                         ends = [a.copy() for a in still]
                         for into, source in zip(ends, moved, strict=True):
                             into[:, end] = source[:, end]
@@ -145,7 +145,7 @@ class SeriesRows:
                     vector = p if isinstance(part, Distance) else (R0.inv() * Rotation.from_matrix(R)).as_rotvec()
                     change += sign * weight * vector / STEP
             total += sigma**2 * np.sum(change**2, axis=1)
-        return total[self.series.ends].sum(axis=1)
+        return total[self.block.ends].sum(axis=1)
 
     @staticmethod
     def _variance(G):
@@ -171,7 +171,7 @@ def dense(problem, parameters):
     n_configurations = problem.data.n_configurations
     reached = {}
     for rows in every:
-        ends = rows.place[rows.series.ends[rows.series.train]]
+        ends = rows.place[rows.block.ends[rows.block.train]]
         for name, G in rows.sources.items():
             if G.any():
                 reached[name] = reached.get(name, 0) + np.bincount(ends.ravel(), minlength=n_configurations)
@@ -179,19 +179,19 @@ def dense(problem, parameters):
     sharing = problem.options.pair_errors == "shared"
     A, private, loadings, used = [], [], {name: [] for name in names}, []
     for i, rows in enumerate(every):
-        train, residual_dim = rows.series.train, rows.series.kind.residual_dim
-        ends = rows.place[rows.series.ends]
+        train, residual_dim = rows.block.train, rows.block.kind.residual_dim
+        ends = rows.place[rows.block.ends]
         shared = [name for name in rows.sources if name in reached and (reached[name][ends[train]] > 1).any()]
         if problem.joints_estimated and "joints" not in shared:
             shared.append("joints")
         shared = [name for name in shared if sharing or (name == "joints" and problem.joints_estimated)]
         own = rows.own.copy()
-        if shared and is_pairs(rows.series.kind):
+        if shared and is_pairs(rows.block.kind):
             diagonal = np.einsum("nii->ni", own)
             least = PRIVATE_SHARE * np.einsum("nii->ni", rows.total)
-            if rows.series.formed:  # second-order terms of pairs that share a pose have correlations up to 1/4
-                of_pose = np.sum(rows.series.ends[train][:, :, None] == np.arange(len(rows.q)), axis=(0, 1))
-                fewest = of_pose[rows.series.ends].min(axis=1)
+            if rows.block.formed:  # second-order terms of pairs that share a pose have correlations up to 1/4
+                of_pose = np.sum(rows.block.ends[train][:, :, None] == np.arange(len(rows.q)), axis=(0, 1))
+                fewest = of_pose[rows.block.ends].min(axis=1)
                 least = np.maximum(least, diagonal * fewest[:, None] / 2.0)
             own += rows._diagonal(np.maximum(least - diagonal, 0.0))
         private_alone = [name for name in rows.sources if not sharing and name not in shared]
@@ -200,13 +200,13 @@ def dense(problem, parameters):
         if weights is not None:
             own += (1.0 / np.maximum(weights[i], 1e-12) - 1.0)[:, None, None] * rows.total
         A.append(np.concatenate([rows.J, rows.r[:, :, None]], axis=2)[train].reshape(len(train) * residual_dim, -1))
-        used.append(rows.series.used[train].ravel())
+        used.append(rows.block.used[train].ravel())
         private.append(own[train])
         for name, width in names.items():
             L = np.zeros((len(train), residual_dim, n_configurations, width))
             if name in rows.sources and name not in private_alone:
                 for k, measurement in enumerate(train):
-                    for end in range(rows.series.kind.ends):
+                    for end in range(rows.block.kind.ends):
                         L[k, :, ends[measurement, end]] += rows.sources[name][measurement, :, end]
             loadings[name].append(L.reshape(len(train) * residual_dim, n_configurations, width))
     used = np.concatenate(used)

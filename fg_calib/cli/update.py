@@ -28,7 +28,7 @@ def update(
     like: Like = None,
     as_json: Json = False,
 ) -> None:
-    """Add new rows to a calibration, from what it has learned: its own rows are not read again."""
+    """Add new rows to the information of a calibration: its own rows are not read again."""
     from fg_calib.calibration import Calibration
     from fg_calib.inputs import InputError
     from fg_calib.io import require_no_input, require_writable

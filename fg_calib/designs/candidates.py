@@ -319,7 +319,7 @@ def _find_references(problem: Problem, source: str) -> Integers:
     Raises:
         InputError: Pairs without one reference pose: what other pairs share is not one pose's.
     """
-    ends = [problem.data.places[s.table][s.ends[s.train, 0]] for s in problem.pair_series]
+    ends = [problem.data.places[s.table][s.ends[s.train, 0]] for s in problem.pair_blocks]
     if any(len(np.unique(first)) > 1 for first in ends):
         raise InputError(source, "pairs that are no star", "pairing star, or candidates that are no rows")
     return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *ends]))

@@ -102,7 +102,7 @@ def _derivatives(problem: Problem, pose_of: Integers, references: Integers) -> t
     """Derivatives of rows, with the errors of reference poses; in the errors of their own pose; and their pose."""
     rows, width = problem.rows, len(problem.rows.slots)
     J = rows.private(problem.variables.at(problem.start))[:, :-1]
-    which = np.concatenate([_poses_of(problem, part.series, part.block.residual_dim, pose_of) for part in rows.parts])
+    which = np.concatenate([_poses_of(problem, part.number, part.block.residual_dim, pose_of) for part in rows.parts])
     private, of_references = np.zeros((len(J), width)), np.zeros((len(J), len(references) * width))
     if width:
         L = rows.states.loadings.tocoo()
@@ -118,9 +118,9 @@ def _derivatives(problem: Problem, pose_of: Integers, references: Integers) -> t
     return np.hstack([J, of_references]), private, which
 
 
-def _poses_of(problem: Problem, series: int, residual_dim: int, pose_of: Integers) -> Integers:
-    """The pose of each row of a series; -1 of rows without a configuration."""
-    s = problem.data.blocks[series]
+def _poses_of(problem: Problem, number: int, residual_dim: int, pose_of: Integers) -> Integers:
+    """The pose of each row of a block; -1 of rows without a configuration."""
+    s = problem.data.blocks[number]
     if not s.kind.ends:
         return np.full(len(s.train) * residual_dim, -1)
     found: Integers = np.repeat(pose_of[problem.data.places[s.table][s.ends[s.train]]].max(axis=1), residual_dim)

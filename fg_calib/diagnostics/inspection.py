@@ -224,9 +224,9 @@ def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
     """The counts of a table, with the test rows that it states."""
     m = table.measurements
     copies, copy, repeats = find_copies(table)
-    series = [s for s in problem.data.blocks if s.table == number]
+    blocks = [s for s in problem.data.blocks if s.table == number]
     n_residuals = Counter[str]()
-    for s in series:
+    for s in blocks:
         for name, n in zip(s.kind.names, s.used[s.train].sum(axis=0).tolist(), strict=True):
             n_residuals[name.partition(".")[0]] += int(n)
     labels = {what: len(of.names) for what, of in m.labels.items()}
@@ -236,8 +236,8 @@ def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
         n_rows=m.n_configurations,
         n_configurations=len(np.unique(problem.data.places[number])),
         n_test=int(m.test.sum()),
-        n_pairs=len({k for s in series if s.kind.ends == 2 for k in s.number[s.train].tolist()}),
-        n_test_pairs=len({k for s in series if s.kind.ends == 2 for k in s.number[s.test].tolist()}),
+        n_pairs=len({k for s in blocks if s.kind.ends == 2 for k in s.number[s.train].tolist()}),
+        n_test_pairs=len({k for s in blocks if s.kind.ends == 2 for k in s.number[s.test].tolist()}),
         n_residuals=dict(n_residuals),
         labels=labels | ({} if m.groups is None else {"contact point": len(m.groups.names)}),
         n_copies=copies,

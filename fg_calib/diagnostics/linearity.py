@@ -84,8 +84,8 @@ def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:
     found = dict[str, float]()
     for here, plus, minus in zip(*(noises_at(problem, point) for point in points), strict=True):
         q = 0.5 * (plus.residual() + minus.residual()) - here.residual()
-        size = np.max(np.abs(q) / here.sigma * here.series.used, axis=1)
-        for ends, of in zip(problem.data.places[here.series.table][here.series.ends], size.tolist(), strict=True):
+        size = np.max(np.abs(q) / here.sigma * here.block.used, axis=1)
+        for ends, of in zip(problem.data.places[here.block.table][here.block.ends], size.tolist(), strict=True):
             found["-".join(problem.end_names[i + 1] for i in ends)] = of
     least = 0.5 * max(found.values(), default=0.0)
     return tuple(sorted((name for name in found if found[name] >= least), key=lambda name: -found[name]))
@@ -119,10 +119,10 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
     problem, at = solution.problem, solution.problem.variables.at(solution.parameters)
     prior = np.diag(problem.variables.prior_scales)
     n_rows, names, share, turned = 0, list[str](), 0.0, list[str]()
-    if not problem.pair_series:
+    if not problem.pair_blocks:
         return AmbiguousRows()
-    for noise in (noise for noise in solution.noises if len(noise.series.train)):
-        s = noise.series
+    for noise in (noise for noise in solution.noises if len(noise.block.train)):
+        s = noise.block
         if s.kind.ends != 2 or not set(s.kind.names) <= {"distance", "angle"}:
             continue
         rows = s.train[:: -(-len(s.train) // MAX_ROWS)]

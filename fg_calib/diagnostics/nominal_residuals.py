@@ -161,13 +161,13 @@ def residuals_at(
     """Residuals by kind at a parameter vector; rows of landmarks alone, which have none of the arm's errors, left out.
 
     Args:
-        problem: The problem; at most `3 * MAX_ROWS` rows of a series are looked at.
+        problem: The problem; at most `3 * MAX_ROWS` rows of a block are looked at.
         parameters: The parameter vector.
         robot: The robot with what is estimated of the arm, whose prior sigmas are usual ones where it has none.
         table: Number of the table that is asked for; all if None.
     """
-    series = [s for s in problem.data.blocks if table in (None, s.table) and len(s.train) and s.kind.ends]
-    some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in series)
+    blocks = [s for s in problem.data.blocks if table in (None, s.table) and len(s.train) and s.kind.ends]
+    some = tuple(s.select(s.train[evenly(len(s.train), 3 * MAX_ROWS)]) for s in blocks)
     variables = build_variables(robot, [t.unknown_frame for t in problem.data.tables])
     arm = {p.name: p for p in robot.parameters if 1 <= p.owner <= robot.n_joints}
     usual = {p.name: p.tolerance or USUAL.get(p.unit, p.scale) for p in arm.values()}
@@ -175,12 +175,12 @@ def residuals_at(
     values = np.concatenate([parameters[problem.variables.robot_span], parameters[problem.variables.frame_span]])
     found: list[TypicalResidual] = []
     for noise in noises_at(replace(problem, data=replace(problem.data, blocks=some)), parameters):
-        chain = variables.chains[noise.series.table].at(values)
+        chain = variables.chains[noise.block.table].at(values)
         J = residuals.linearise(noise.rows_at(slice(None)), chain)[1][:, :, : len(scale)] * scale
         squares, variance = noise.residual() ** 2, np.sum(J**2, axis=2) + noise.sigma**2
-        kinds, used = np.array([name.partition(".")[0] for name in noise.series.kind.names]), noise.series.used
+        kinds, used = np.array([name.partition(".")[0] for name in noise.block.kind.names]), noise.block.used
         for kind in dict.fromkeys(kinds.tolist()):
-            of, unit = used & (kinds == kind), noise.series.kind.units[kinds.tolist().index(kind)]
+            of, unit = used & (kinds == kind), noise.block.kind.units[kinds.tolist().index(kind)]
             rows = of.any(axis=1)
             if rows.any():
                 size, expected = (

@@ -412,7 +412,7 @@ def check_setup(case: Case, *, fits: bool) -> Iterator[Statement]:
 def check_optima(case: Case) -> Iterator[Statement]:
     """Check for other optima: the four parameters that differ most, in their prior sigmas, with both corrections."""
     robot = case.problem.robot
-    advice = "; measure positions, or pairs between which more joints move" if case.problem.pair_series else ""
+    advice = "; measure positions, or pairs between which more joints move" if case.problem.pair_blocks else ""
     for other in case.solution.others:
         both, span = (case.solution.parameters, other), case.problem.variables.robot_span
         here, there = (at[span] - robot.nominal for at in both)

@@ -10,7 +10,7 @@ from .build import (
     random_problem,
     true_problem,
 )
-from .error_states import PRIVATE_SHARE, State, WhitenedRows, WhitenedSeries, block_diagonal, whitener_of
+from .error_states import PRIVATE_SHARE, State, WhitenedBlock, WhitenedRows, block_diagonal, whitener_of
 from .factors import DistanceFactor, RotationAngleFactor
 from .knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
 from .noise_models import JOINT_NOISE, NoiseName, NoiseState, RowNoise, reach, whitening_of
@@ -27,7 +27,7 @@ from .problem import (
     Problem,
     correlation,
     directions,
-    felt,
+    estimate_sensitivity,
     joint_errors,
     mahalanobis_distances,
     named_triangle,
@@ -86,8 +86,8 @@ __all__ = [
     "ToleranceScale",
     "ToleranceScales",
     "Variables",
+    "WhitenedBlock",
     "WhitenedRows",
-    "WhitenedSeries",
     "block_diagonal",
     "build_problem",
     "build_variables",
@@ -98,7 +98,7 @@ __all__ = [
     "directions",
     "effect",
     "eliminate",
-    "felt",
+    "estimate_sensitivity",
     "first_independent",
     "frame_of",
     "joint_errors",

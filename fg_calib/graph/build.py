@@ -255,7 +255,7 @@ def random_problem(
 
 
 def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: Floats) -> None:
-    """Compare the derivatives of kinds of one's own with differences at some measurements, where they are started."""
+    """Compare the derivatives of custom kinds with differences at some measurements, where they are started."""
     at = variables.at(start)
     for s in (s for s in data.blocks if not is_ours(s.kind)):
         table = data.tables[s.table].measurements

@@ -182,19 +182,19 @@ class State(Brief):
 
 
 @dataclass(frozen=True)
-class WhitenedSeries(Brief):
-    """Train rows of one series, whitened by their private noise.
+class WhitenedBlock(Brief):
+    """Train rows of one block, whitened by their private noise.
 
     Attributes:
         block: The rows.
         table: Which table they are from.
-        series: Which series.
+        number: Number of its measurement block.
         nuisances: Nuisance coordinates of each measurement, shape (n, kind.n_nuisances).
     """
 
     block: Block
     table: int
-    series: int
+    number: int
     nuisances: Integers
 
     @property
@@ -202,7 +202,7 @@ class WhitenedSeries(Brief):
         """Number of scalar rows."""
         return self.block.n * self.block.residual_dim
 
-    def only(self, k: int) -> WhitenedSeries:
+    def only(self, k: int) -> WhitenedBlock:
         """One of its measurements."""
         one = slice(k, k + 1)
         return replace(self, block=residuals.rows_of(self.block, one), nuisances=self.nuisances[one])
@@ -240,7 +240,7 @@ class WhitenedRows(Brief):
     """All train rows, whitened by their private noise.
 
     Attributes:
-        parts: The rows of each series that has any, one after the other.
+        parts: The rows of each block that has any, one after the other.
         states: How they follow from error states.
         configurations: Configurations that have error states, in the order of these.
         slots: Slots of the errors of a configuration (see `noise_models`), in the order of the states.
@@ -249,7 +249,7 @@ class WhitenedRows(Brief):
         counted_as_private: Whether measurements share errors that count as private of each.
     """
 
-    parts: tuple[WhitenedSeries, ...]
+    parts: tuple[WhitenedBlock, ...]
     states: SchurComplement
     configurations: Integers
     slots: Integers
@@ -294,13 +294,13 @@ class WhitenedRows(Brief):
 def whitened_rows(
     noises: Sequence[RowNoise], *, sharing: bool, joints: bool, weights: Sequence[Floats] | None
 ) -> WhitenedRows:
-    """The train rows of series, whitened.
+    """The train rows of blocks, whitened.
 
     Args:
         noises: The rows and their noise.
         sharing: Whether measurements share the errors of their configurations, or each counts as having its own.
         joints: Whether errors of joint readings are states although only one measurement has them.
-        weights: Robust weight of each measurement of each series; None for 1.
+        weights: Robust weight of each measurement of each block; None for 1.
     """
     reached = reach(noises)
     width = noises[0].place.width if noises else 1
@@ -309,7 +309,7 @@ def whitened_rows(
     found = [
         _whiten(i, noise, shared, None if weights is None else weights[i])
         for i, noise in enumerate(noises)
-        if len(noise.series.train)
+        if len(noise.block.train)
     ]
     parts = tuple(part for part, _, _ in found)
     L = spare = Sparse((sum(part.n_rows for part in parts), 0))
@@ -345,12 +345,12 @@ def correlation_of(noises: Sequence[RowNoise], rows: WhitenedRows, J: Floats) ->
     """J^T (C - 1) J of rows that share errors but are whitened as if they did not, shape (n_columns, n_columns).
 
     Args:
-        noises: The rows of all series and their noise.
+        noises: The rows of all blocks and their noise.
         rows: The whitened train rows.
         J: Their derivatives, shape (n_rows, n_columns); C is the covariance of the whitened rows.
     """
-    each = [(noises[part.series], whitener_of(noises[part.series], part)) for part in rows.parts]
-    private = [block_diagonal(W @ noise.loading[noise.series.train]) for noise, W in each]
+    each = [(noises[part.number], whitener_of(noises[part.number], part)) for part in rows.parts]
+    private = [block_diagonal(W @ noise.loading[noise.block.train]) for noise, W in each]
     own = scipy.sparse.block_diag(private).T @ J
     common = all_errors(noises, rows).T @ J
     out: Floats = common.T @ common - own.T @ own
@@ -359,39 +359,39 @@ def correlation_of(noises: Sequence[RowNoise], rows: WhitenedRows, J: Floats) ->
 
 def all_errors(noises: Sequence[RowNoise], rows: WhitenedRows) -> Sparse:
     """How whitened rows follow from all errors, states or not, shape (n_rows, n_errors)."""
-    pairs = [(noises[part.series], part) for part in rows.parts]
-    return _stacked([noise.errors_at(noise.series.train, whitener_of(noise, part)) for noise, part in pairs])
+    pairs = [(noises[part.number], part) for part in rows.parts]
+    return _stacked([noise.errors_at(noise.block.train, whitener_of(noise, part)) for noise, part in pairs])
 
 
-def whitener_of(noise: RowNoise, part: WhitenedSeries) -> Floats:
+def whitener_of(noise: RowNoise, part: WhitenedBlock) -> Floats:
     """Matrices that whitened the train rows of a block, shape (n, residual_dim, residual_dim)."""
-    h, plain = part.block.residual_dim, noise.rows_at(noise.series.train)
+    h, plain = part.block.residual_dim, noise.rows_at(noise.block.train)
     out: Floats = unpack(part.block.whitening, h) @ np.linalg.inv(unpack(plain.whitening, h))
     return out
 
 
 def _whiten(
     number: int, noise: RowNoise, shared: Booleans, weights: Floats | None
-) -> tuple[WhitenedSeries, Sparse, Sparse]:
-    """The train rows of a series; how they follow from all errors that are states; and E of `WhitenedRows.spare`."""
-    series, train = noise.series, noise.series.train
-    n, h = len(train), series.kind.residual_dim
-    rows: Integers | slice = slice(None) if n == series.n else train
-    used, is_state = series.used[rows], shared[noise.columns[rows]]
+) -> tuple[WhitenedBlock, Sparse, Sparse]:
+    """The train rows of a block; how they follow from all errors that are states; and E of `WhitenedRows.spare`."""
+    block, train = noise.block, noise.block.train
+    n, h = len(train), block.kind.residual_dim
+    rows: Integers | slice = slice(None) if n == block.n else train
+    used, is_state = block.used[rows], shared[noise.columns[rows]]
     measured = residuals.rows_of(noise.as_measured, rows)
     data, whitening = np.empty(measured.data.shape), np.empty(measured.whitening.shape)
     carried = bool(is_state.any())
     W, artificial = np.empty((n * carried, h, h)), np.zeros((n * carried, h))
     if carried and noise.slope is not None:
         least = PRIVATE_SHARE * noise.sigma[rows] ** 2
-        if series.formed:  # see the module's head
-            n_pairs = np.bincount(series.ends[rows].ravel())[series.ends[rows]].min(axis=1, keepdims=True)
+        if block.formed:  # see the module's head
+            n_pairs = np.bincount(block.ends[rows].ravel())[block.ends[rows]].min(axis=1, keepdims=True)
             least = np.maximum(least, 0.5 * n_pairs * noise.variance[rows])
         artificial = np.maximum(least - noise.variance[rows], 0.0)
 
     def whiten(start: int, stop: int) -> None:
         span = slice(start, stop)
-        these = span if n == series.n else train[span]
+        these = span if n == block.n else train[span]
         private, plain = noise.private_at(these), noise.rows_at(these)
         own = np.where(is_state[span][:, None], 0.0, noise.loading[these])
         private = private + own @ np.swapaxes(own, 1, 2)
@@ -407,8 +407,8 @@ def _whiten(
 
     for _ in over_spans(whiten, n):
         pass
-    block = replace(measured, data=data, whitening=whitening)
-    part = WhitenedSeries(block, series.table, number, series.nuisances[train])
+    whitened = replace(measured, data=data, whitening=whitening)
+    part = WhitenedBlock(whitened, block.table, number, block.nuisances[train])
     if not carried:
         return part, Sparse((n * h, noise.place.n_errors)), Sparse((n * h, 0))
     E = W * np.sqrt(artificial)[:, None]

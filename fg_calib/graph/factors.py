@@ -21,7 +21,7 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import ArrayLike
 
-from fg_calib.graph.error_states import State, WhitenedRows, WhitenedSeries
+from fg_calib.graph.error_states import State, WhitenedBlock, WhitenedRows
 from fg_calib.graph.variables import Variable, Variables, prior_rows
 from fg_calib.inputs import CalibrationError, Floats, InputError, ProblemError, SolverError, as_floats, check_number
 from fg_calib.measurements import Block, Distance, Kind, RotationAngle, unpack
@@ -70,16 +70,16 @@ class MeasurementFactor(CheckedFactor):
 
     Args:
         variables: The problem's variables.
-        series: The measurement's whitened rows.
+        part: The measurement's whitened rows.
         errors: The error variables that it depends on, and the rows' derivatives in them, shape (n_rows, width) each.
-        k: Which measurement of the series.
+        k: Which measurement of them.
     """
 
     def __init__(
-        self, variables: Variables, series: WhitenedSeries, errors: Sequence[tuple[Variable, Floats]] = (), k: int = 0
+        self, variables: Variables, part: WhitenedBlock, errors: Sequence[tuple[Variable, Floats]] = (), k: int = 0
     ) -> None:
-        places, h = set(variables.coordinates[series.nuisances[k]].tolist()), series.block.residual_dim
-        ours = [*(variables.items if series.block.kind.ends else ())]
+        places, h = set(variables.coordinates[part.nuisances[k]].tolist()), part.block.residual_dim
+        ours = [*(variables.items if part.block.kind.ends else ())]
         ours += [v for v in variables.nuisance if places.intersection(v.parameters)]
         chosen = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v in ours)])
         G = np.hstack([np.zeros((h, 0)), *(loading for _, loading in errors)])
@@ -88,9 +88,7 @@ class MeasurementFactor(CheckedFactor):
         local = [replace(v, columns=slice(*ends[i : i + 2])) for i, v in enumerate([*ours, *shared])]
 
         def linearise(values: gtsam.Values) -> tuple[Floats, Floats]:
-            found = np.concatenate(list(series.linearise(variables.at(variables.parameters(values, ours)))))[k * h :][
-                :h
-            ]
+            found = np.concatenate(list(part.linearise(variables.at(variables.parameters(values, ours)))))[k * h :][:h]
             z = np.concatenate([np.zeros(0), *(values.atVector(v.key) for v in shared)])
             return found[:, -1] - G @ z, np.hstack([found[:, chosen], -G])
 
@@ -126,7 +124,7 @@ class RotationAngleFactor(MeasurementFactor):
 
 def _of_readings(
     kind: Kind, variables: Variables, ends: tuple[ArrayLike, ArrayLike], measured: tuple[str, float], sigma: float
-) -> WhitenedSeries:
+) -> WhitenedBlock:
     check_number(*measured)
     check_number("sigma", sigma, above=True)
     n = variables.robot.n_joints
@@ -134,7 +132,7 @@ def _of_readings(
     trig = variables.robot.trig(np.array(readings))
     data, whitening = np.array([[float(measured[1])]]), np.array([[1.0 / float(sigma)]])
     block = Block(kind, trig, np.array([[0, 1]]), data, whitening, np.zeros((1, 0)))
-    return WhitenedSeries(block, 0, 0, np.zeros((1, 0), dtype=np.int64))
+    return WhitenedBlock(block, 0, 0, np.zeros((1, 0), dtype=np.int64))
 
 
 def measurement_factors(
@@ -176,7 +174,7 @@ def _error(letter: str, number: int) -> Variable:
 
 
 def _pair_factors(
-    one: WhitenedSeries, variables: Variables, errors: list[tuple[Variable, Floats]], private: Floats, own: Variable
+    one: WhitenedBlock, variables: Variables, errors: list[tuple[Variable, Floats]], private: Floats, own: Variable
 ) -> tuple[list[MeasurementFactor], list[tuple[Variable, Floats]]]:
     """A factor of each row of a pair that is in use, and the estimate of the error `own` where they have it in common.
 

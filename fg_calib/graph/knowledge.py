@@ -7,7 +7,7 @@ variables. What the rows depended on besides, such as measurement frames, is eli
 Growth: where x may have wandered since by g with 1 sigma G, `|z + R (s - G h)|^2 + |h|^2` with h eliminated; where G is
 unlimited h has no row of its own.
 
-What rows determine at all is asked at the nominal arm: there lost directions are exact. So they are kept as
+What rows determine at all is asked at the nominal arm: there undetermined directions are exact. So they are kept as
 linearised there, too (`nominal`), without what tolerances say.
 """
 

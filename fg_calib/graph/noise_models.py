@@ -45,7 +45,7 @@ class NoiseState:
     """Estimated noise of the measurements on the way to a solution.
 
     Attributes:
-        weights: Robust weight of each measurement of each series, in [0, 1]; None for 1.
+        weights: Robust weight of each measurement of each block, in [0, 1]; None for 1.
         factors: Factors on the specified sigmas, by table and kind those of the measurements (or of the measured poses
             that pairs were formed from), and those of the joint readings; 1 where none is given.
     """
@@ -80,12 +80,12 @@ class TableState:
 
 
 class RowNoise:
-    """The rows of a series and their noise: to second order of lengths and angles of pairs, else to first order.
+    """The rows of a block and their noise: to second order of lengths and angles of pairs, else to first order.
 
     Args:
-        series: The series.
+        block: The block.
         place: Its table at the linearisation point.
-        state: What has been learned of the noise.
+        state: Estimated noise.
 
     Attributes:
         factors: Factor on the specified sigma of each row's own kind, shape (residual_dim,).
@@ -97,20 +97,20 @@ class RowNoise:
         slope: Derivative of each row's mean in what it is without noise, shape (n, residual_dim); None for 1.
     """
 
-    def __init__(self, series: MeasurementBlock, place: TableState, state: NoiseState) -> None:
-        self.series, self.place = series, place
-        families = [name.partition(".")[0] for name in series.kind.names]
-        self.factors: Floats = np.array([state.factors.get((series.table, family), 1.0) for family in families])
+    def __init__(self, block: MeasurementBlock, place: TableState, state: NoiseState) -> None:
+        self.block, self.place = block, place
+        families = [name.partition(".")[0] for name in block.kind.names]
+        self.factors: Floats = np.array([state.factors.get((block.table, family), 1.0) for family in families])
         self._sigma_joint = place.measurements.sigma_joint * state.factors.get(JOINT_NOISE, 1.0)
-        self.variance: Floats = (series.sigma * self.factors) ** 2
-        self._of_pairs = [_MOMENTS[part.code] for part in series.kind.parts if part.code in _MOMENTS]
+        self.variance: Floats = (block.sigma * self.factors) ** 2
+        self._of_pairs = [_MOMENTS[part.code] for part in block.kind.parts if part.code in _MOMENTS]
         self.excess: Floats = np.broadcast_to(0.0, self.variance.shape)
         self.slope: Floats | None = None
-        self.columns, self.loading = np.zeros((series.n, 0), np.int64), np.zeros((*self.variance.shape, 0))
-        if series.kind.ends and np.any(self._sigma_joint > 0.0):
+        self.columns, self.loading = np.zeros((block.n, 0), np.int64), np.zeros((*self.variance.shape, 0))
+        if block.kind.ends and np.any(self._sigma_joint > 0.0):
             self._add_errors(self._joint_loading(), 0)
         self.n_of_joints = self.columns.shape[1]
-        if series.formed:
+        if block.formed:
             self._add_errors(self._pose_loading(), place.chain.n_joints + POSE_SLOTS * place.number)
         if self._of_pairs:
             self._take_moments()
@@ -118,7 +118,7 @@ class RowNoise:
     @cached_property
     def as_measured(self) -> Block:
         """All rows as they were measured, to first order, not whitened."""
-        s, p = self.series, self.place
+        s, p = self.block, self.place
         unit = residuals.unit_whitening(s.n, s.kind.residual_dim)
         return Block(s.kind, p.trig, s.ends, s.data, unit, p.coordinates[s.nuisances], s.source)
 
@@ -127,7 +127,7 @@ class RowNoise:
         plain = residuals.rows_of(self.as_measured, rows)
         if self.slope is None:
             return plain
-        slope, h = np.maximum(self.slope[rows], MIN_SLOPE), self.series.kind.residual_dim
+        slope, h = np.maximum(self.slope[rows], MIN_SLOPE), self.block.kind.residual_dim
         whitening = np.zeros(plain.whitening.shape)
         whitening[:, np.cumsum(np.arange(1, 1 + h)) - 1] = slope
         data = plain.data + self._off[rows] * (1.0 - 1.0 / slope) - self.excess[rows] / slope
@@ -135,10 +135,10 @@ class RowNoise:
 
     def private_at(self, rows: Integers | slice) -> Floats:
         """Covariance of the private noise of some measurements, shape (m, residual_dim, residual_dim)."""
-        if self.series.covariance is not None:
-            covariance: Floats = self.series.covariance[rows] * np.outer(self.factors, self.factors)
+        if self.block.covariance is not None:
+            covariance: Floats = self.block.covariance[rows] * np.outer(self.factors, self.factors)
             return covariance
-        out: Floats = self.variance[rows][:, :, None] * np.eye(self.series.kind.residual_dim)
+        out: Floats = self.variance[rows][:, :, None] * np.eye(self.block.kind.residual_dim)
         return out
 
     def total_at(self, rows: Integers | slice) -> Floats:
@@ -163,7 +163,7 @@ class RowNoise:
 
         Both are 0 for measurements that take no part.
         """
-        used = self.series.used
+        used = self.block.used
         r = np.where(used, self.residual(), 0.0)
         W = whitening_of(self.total_at(slice(None)), used)
         return np.linalg.norm(W @ r[:, :, None], axis=(1, 2)), used.sum(axis=1)
@@ -192,12 +192,12 @@ class RowNoise:
     def _add_errors(self, loading: Floats, first: int) -> None:
         """Add errors, loading of shape (n, residual_dim, ends, w), in the slots from the first on."""
         n, h, ends, w = loading.shape
-        columns = self.place.configurations[self.series.ends][:, :, None] * self.place.width + first + np.arange(w)
+        columns = self.place.configurations[self.block.ends][:, :, None] * self.place.width + first + np.arange(w)
         self.columns = np.hstack([self.columns, columns.reshape(n, ends * w)])
         self.loading = np.concatenate([self.loading, loading.reshape(n, h, ends * w)], axis=2)
 
     def _joint_loading(self) -> Floats:
-        s, chain = self.series, self.place.chain.without_columns().with_joint_columns()
+        s, chain = self.block, self.place.chain.without_columns().with_joint_columns()
         loading = np.empty((s.n, s.kind.residual_dim, s.kind.ends, chain.n_joints))
 
         def load(rows: slice) -> None:
@@ -212,7 +212,7 @@ class RowNoise:
 
         Directions are those predicted: those of measured poses would depend on the errors whose effect they give.
         """
-        m, s = self.place.measurements, self.series
+        m, s = self.place.measurements, self.block
         poses = forward(self.place.chain.without_columns(), self.place.trig)
         p, R, (a, b) = poses.position, poses.rotation, s.ends.T
         axes = rotation_angle(np.swapaxes(R[a], 1, 2) @ R[b])[1]
@@ -235,7 +235,7 @@ class RowNoise:
 
     def _take_moments(self) -> None:
         """Bias, slope and variance of distances and angles of pairs, to second order."""
-        s, trace, off = self.series, self._traces(), self._off
+        s, trace, off = self.block, self._traces(), self._off
         first, private = self.loading, np.zeros_like(self.variance) if s.formed else np.nan_to_num(self.variance)
         self.excess, slope, self.variance = (np.empty(self.variance.shape) for _ in range(3))
         self.loading, self.slope = np.empty(first.shape), slope
@@ -254,7 +254,7 @@ class RowNoise:
 
     def _traces(self) -> Floats:
         """Variance of position and orientation at each configuration by shared errors, shape (n_configurations, 2)."""
-        s, m = self.series, self.place.measurements
+        s, m = self.block, self.place.measurements
         trace = np.zeros((len(self.place.trig), 2))
         if self.n_of_joints:
             J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
@@ -271,20 +271,20 @@ def reach(noises: Sequence[RowNoise], *, test: bool = False) -> Integers:
     """Number of train (or test) measurements that each error reaches, shape (n_errors,)."""
     total = np.zeros(noises[0].place.n_errors if noises else 0, dtype=np.int64)
     for noise in noises:
-        rows = np.flatnonzero(noise.series.test) if test else noise.series.train
+        rows = np.flatnonzero(noise.block.test) if test else noise.block.train
         present = noise.loading[rows].any(axis=1)
         total += np.bincount(noise.columns[rows][present], minlength=len(total))
     return total
 
 
-def same_everywhere(series: MeasurementBlock, sigma_joint: Floats) -> bool:
+def same_everywhere(block: MeasurementBlock, sigma_joint: Floats) -> bool:
     """Whether the noise is the same at all parameters: noise of joint readings, and moments of pairs, are not."""
-    return not _has_moments(series) and not (series.kind.ends and np.any(sigma_joint > 0.0))
+    return not _has_moments(block) and not (block.kind.ends and np.any(sigma_joint > 0.0))
 
 
-def _has_moments(series: MeasurementBlock) -> bool:
+def _has_moments(block: MeasurementBlock) -> bool:
     """Whether all its rows are distances and angles of pairs."""
-    return all(part.code in _MOMENTS for part in series.kind.parts)
+    return all(part.code in _MOMENTS for part in block.kind.parts)
 
 
 def whitening_of(covariance: Floats, used: Booleans) -> Floats:

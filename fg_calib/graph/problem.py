@@ -1,4 +1,4 @@
-"""The calibration problem: measurements gathered in series, whitened, with a start, and its GTSAM graph.
+"""The calibration problem: measurements gathered in blocks, whitened, with a start, and its GTSAM graph.
 
 `build_problem` makes it, `solve` solves it; in between it can be looked at: the graph, the initial values, which rows
 take part and why the others do not.
@@ -43,7 +43,7 @@ class Problem(FrozenArrays):
         options: What is estimated from what.
         variables: The GTSAM variables and their columns.
         start: Initial parameter vector (see `Variables`).
-        state: What has been learned of the measurements' noise.
+        state: Estimated noise.
         rows: The whitened train rows.
         whole: The problem with everything estimated, where this one leaves parameters out to fix the gauge.
         added: Factors that a user added to `graph`.
@@ -152,7 +152,7 @@ class Problem(FrozenArrays):
 
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
-        """The rows of each series and their noise at `start`: of a million pairs as large as everything else."""
+        """The rows of each block and their noise at `start`: of a million pairs as large as everything else."""
         return noises_at(self, self.start)
 
     @property
@@ -183,8 +183,8 @@ class Problem(FrozenArrays):
         return [by_name[name] for name in names]
 
     @property
-    def pair_series(self) -> tuple[MeasurementBlock, ...]:
-        """Series of pairs of configurations."""
+    def pair_blocks(self) -> tuple[MeasurementBlock, ...]:
+        """Blocks of pairs of configurations."""
         return tuple(s for s in self.data.blocks if s.kind.ends == 2)
 
     @property
@@ -195,8 +195,8 @@ class Problem(FrozenArrays):
     @property
     def n_pairs(self) -> int:
         """Train pairs that give at least one row."""
-        numbers = {s.table: list[Integers]() for s in self.pair_series}
-        for s in self.pair_series:
+        numbers = {s.table: list[Integers]() for s in self.pair_blocks}
+        for s in self.pair_blocks:
             numbers[s.table].append(s.number[s.train])
         return sum(int(np.sum(np.bincount(np.concatenate(each)) > 0)) for each in numbers.values())
 
@@ -273,7 +273,7 @@ def with_factors(problem: Problem, start: Floats, state: NoiseState | None = Non
     Args:
         problem: The problem, of which the rows are made anew.
         start: The parameter vector.
-        state: What has been learned of the noise; None for what the problem has.
+        state: Estimated noise; None for what the problem has.
         changes: What else of the problem is to change.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
@@ -302,7 +302,7 @@ def with_user_factors(problem: Problem) -> Problem:
 
 
 def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> tuple[RowNoise, ...]:
-    """The rows of each series and their noise at a parameter vector.
+    """The rows of each block and their noise at a parameter vector.
 
     Args:
         problem: The problem.
@@ -378,7 +378,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
     Args:
         problem: The problem.
         parameters: The parameter vector.
-        state: What has been learned of the noise; None for what the problem has.
+        state: Estimated noise; None for what the problem has.
     """
     same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
     if (state is None or state is problem.state) and same:
@@ -393,17 +393,17 @@ def subsampled(problem: Problem, share: float) -> Problem | None:
 
     Args:
         problem: The problem.
-        share: Which share of each series.
+        share: Which share of each block.
 
     Returns:
         None where single rows count for more than others do: where they have robust weights, or depend on landmarks.
     """
     if problem.variables.nuisance or problem.options.loss != "none" or problem.state.weights is not None:
         return None
-    rng, series = np.random.default_rng(0), []
+    rng, blocks = np.random.default_rng(0), []
     for s in problem.data.blocks:
-        series.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
-    return with_factors(replace(problem, data=replace(problem.data, blocks=tuple(series))), problem.start)
+        blocks.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
+    return with_factors(replace(problem, data=replace(problem.data, blocks=tuple(blocks))), problem.start)
 
 
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:
@@ -484,8 +484,8 @@ def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     return named_rows(problem.variables, parameters, problem.linearize(parameters).left.A)
 
 
-def felt(problem: Problem, parameters: Floats, wanted: Integers) -> Floats:
-    """M: the estimate is off by `-K M e` because of errors e of configurations, K its covariance.
+def estimate_sensitivity(problem: Problem, parameters: Floats, wanted: Integers) -> Floats:
+    """Sensitivity M of the estimate to errors e of configurations: dx = -K M e, K its covariance.
 
     Args:
         problem: The problem.

@@ -197,7 +197,7 @@ class Solution(FrozenArrays):
 
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
-        """The rows of each series and their noise at the estimate."""
+        """The rows of each block and their noise at the estimate."""
         return noises_at(self.problem, self.parameters)
 
 

@@ -7,7 +7,7 @@
 | `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
 | `X(t)` | world_T_base of table t as a Pose3, where its measurement frame is unknown |
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
-| `N(i)` | an unknown of a kind of measurement of one's own, a vector |
+| `N(i)` | an unknown of a custom kind of measurement, a vector |
 
 The last two, and variables that a user adds to the graph, are *nuisance* variables: they are estimated too, but not
 what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
@@ -46,7 +46,7 @@ class Variable:
     Attributes:
         key: GTSAM's key.
         kind: A vector of parameters, the pose of tool, base or measurement frame, an unknown of the measurements such
-            as a touched point, or a vector or pose that a user added.
+            as a contact point, or a vector or pose that a user added.
         parameters: Indices into the parameter vector of `Variables.parameters`, in the variable's own order;
             for poses in the order of `FRAME_KINDS`.
         columns: Its columns in a Jacobian.

@@ -66,7 +66,7 @@ class Brief:
 
 
 def brief(of: object, names: Iterable[str]) -> str:
-    """`Series(kind=Distance, ends=int64 (12, 2), ...)`, a line each where it is long.
+    """`MeasurementBlock(kind=Distance, ends=int64 (12, 2), ...)`, a line each where it is long.
 
     Args:
         of: An object.

@@ -64,7 +64,7 @@ def read_arrays(
 
     Args:
         readings: Joint readings q, shape (n, n_joints), [rad] (prismatic: [m]).
-        pairs: Between configurations or touched points, arrays of shape (n_pairs,), or a frame of polars or pandas:
+        pairs: Between configurations or contact points, arrays of shape (n_pairs,), or a frame of polars or pandas:
             `a` and `b` (ids or groups; row numbers where none of these is a number); `distance`, `angle` (nan: not
             measured), `sigma_...` each, `test`.
         sigma_joint: 1 sigma of the readings: one for all, or one a joint.

@@ -144,8 +144,8 @@ class Posterior(Section):
 
     variables: Annotated[dict[str, tuple[str, ...]], BeforeValidator(_columns_by_variable)]
     covariance: Floats = of("tangent")
-    undetermined: Floats = of("loose")
-    undetermined_at_nominal: Floats = of("loose_at_nominal")
+    undetermined: Floats
+    undetermined_at_nominal: Floats
 
 
 class Knowledge(Section):
@@ -316,7 +316,7 @@ class Result(Section):
             model=" + ".join(dict.fromkeys(table.model or "own" for table in data.tables)),
             frame="unknown" if frames else data.tables[0].frame,
             pairing=_pairing(problem),
-            pair_errors=problem.options.pair_errors if problem.pair_series else None,
+            pair_errors=problem.options.pair_errors if problem.pair_blocks else None,
             tables=tuple((label, in_words(table)) for label, table in zip(data.labels, data.tables, strict=True)),
             n_unknowns=len(problem.variables.all_scales),
             goodness={key_of(kind, goodness.kinds): kind for kind in goodness.kinds},

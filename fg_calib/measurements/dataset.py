@@ -49,7 +49,7 @@ class Noise:
         joint: Of the joint readings: one figure for all joints or one a joint, [rad] (prismatic: [m]).
         distance: Of a directly measured distance, also to an anchor or a plane, [m].
         angle: Of a directly measured rotation angle, [rad].
-        point: Of a touched point, per axis, [m].
+        point: Of a contact point, per axis, [m].
         pixel: Of a point's image, per axis, [px].
         more: Of columns that one instrument alone has, by name.
     """

@@ -3,7 +3,7 @@
 A kind gives, besides its residual, *wrench rows* D: its derivative in the tool frame of each end, in a turn w about the
 base's axes through the tool point and in a shift dp of that point, as in `kinematics.Poses.jacobian`. Whatever moves
 the frame, a parameter, a joint, a frame before or behind the arm, has a (w, dp), and the derivative in it is
-`D . (w, dp)`, summed over the ends. Unknowns besides the arm, *nuisances* such as a touched point, have columns N.
+`D . (w, dp)`, summed over the ends. Unknowns besides the arm, *nuisances* such as a contact point, have columns N.
 """
 
 from __future__ import annotations

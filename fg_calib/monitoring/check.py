@@ -1,9 +1,9 @@
 """Whether a calibration is still good: new rows against the calibrated arm, and what changed if it is not.
 
 The rows say no more than noise and the calibration's own uncertainty make of them, or they do not: by chi-square, and
-by what single changes explain of it (see `hypotheses`), which sees a slip of one joint long before chi-square of many
-rows does. Where limits are set they decide: an arm within them is good although its rows show a change, as long as that
-change stays within them everywhere.
+by what single changes explain of it (see `hypotheses`), which sees an offset change of one joint long before
+chi-square of many rows does. Where limits are set they decide: an arm within them is good although its rows show a
+change, as long as that change stays within them everywhere.
 
 Rows of one configuration that are gross errors are named and left out of the judgement; noise that is specified too
 small is no change of the arm.
@@ -36,7 +36,7 @@ MOST_GROSS = 0.1
 """Part of the configurations that gross errors may be in: more are none."""
 
 POWER = 0.9
-"""Probability with which a slip is to be found that is called detectable."""
+"""Probability with which a detectable joint offset change is found."""
 
 ALSO_SHOWN = 3
 """Changes that the rows exclude and that are shown with the likely ones."""
@@ -92,7 +92,7 @@ class Check:
         explanations: What changed, the best first; none where nothing is certain.
         gross_rows: Configurations whose rows are gross errors, left out of all that is said here.
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.
-        detectable: Of each joint's zero the slip that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
+        detectable: Joint offset changes that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
             None where they show none at all.
         advice: What to measure to distinguish the two likeliest changes; None where there is nothing to.
     """
@@ -207,7 +207,7 @@ def _unless_misread(found: Check, at: Linear) -> Check:
 
 
 def _detectable(calibrated: Calibrated, found: Sequence[HypothesisTest]) -> dict[str, float | None]:
-    """The slip of each joint's zero that is found with a probability of `POWER`."""
+    """The offset change of each joint that is found with a probability of `POWER`."""
     least = np.sqrt(hypotheses.quantile(hypotheses.CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
     sizes = {f.hypothesis.names[0]: float(least * f.sigma[0]) for f in found if f.hypothesis.kind == "zero"}
     names = hypotheses.zero_names(calibrated.robot)

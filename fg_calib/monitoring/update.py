@@ -1,4 +1,4 @@
-"""A calibration with new rows added to what it has learned, of which the old rows are no longer needed.
+"""A calibration with new rows added to its information: the old rows are no longer needed.
 
 What the old rows say stands as they were linearised at the old estimate (see `graph.knowledge`), so that new and old
 together are as a solution of all rows would have them, but for what is not linear between the old estimate and the new.

@@ -53,7 +53,7 @@ class RelativeGroup:
     @computed_field  # type: ignore[prop-decorator]
     @property
     def lost(self) -> int:
-        """Number of directions that are lost."""
+        """Number of undetermined directions."""
         return len(self.relations)
 
     def combinations(self, kept: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -145,7 +145,7 @@ class Observability(FrozenArrays):
 
     @property
     def lost(self) -> tuple[dict[str, float], ...]:
-        """Every lost direction by name: ineffective parameters alone, then the relations of the groups."""
+        """Every undetermined direction by name: ineffective parameters alone, then the relations of the groups."""
         alone = tuple({name: 1.0} for name in self.named("ineffective"))
         return alone + tuple(relation for group in self.relative for relation in group.relations)
 

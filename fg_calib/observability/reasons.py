@@ -171,7 +171,7 @@ class LostDirection:
 
 @single_threaded
 def explain(problem: Problem, parameters: Floats, observability: Observability) -> tuple[LostDirection, ...]:
-    """The reason for every lost direction of an observability found for a problem at a parameter vector."""
+    """The reason for every undetermined direction of an observability found for a problem at a parameter vector."""
     names, lost = observability.names, observability.lost
     if not lost:
         return ()

@@ -399,7 +399,7 @@ def summary(result: Result) -> list[str]:
 
 def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
     """Notes for a reader of the report, a sentence each."""
-    problem, weights, series = solution.problem, solution.problem.state.weights, solution.problem.data.blocks
+    problem, weights, blocks = solution.problem, solution.problem.state.weights, solution.problem.data.blocks
     for reason, count in problem.n_excluded.items():
         if count:
             yield f"{count} train rows are excluded: {reason.replace('_', ' ')}"
@@ -415,8 +415,8 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
         yield f"{formed} and counted as independent: with many more pairs than poses the sigmas are too small"
     yield from _noise_notes(solution, assessed)
     if weights is not None:
-        n = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(series, weights, strict=True))
-        lost = f"{n} of {sum(len(s.train) for s in series)} measurements lost more than half their weight"
+        n = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(blocks, weights, strict=True))
+        lost = f"{n} of {sum(len(s.train) for s in blocks)} measurements lost more than half their weight"
         yield f"loss {problem.options.loss}: {lost} and do not count in chi-square"
     yield from _undetermined(solution, assessed)
     if not assessed.fit.residuals.split.any():

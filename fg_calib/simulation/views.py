@@ -134,7 +134,7 @@ def _draw(robot: Robot, of: Configurations, generator: np.random.Generator, plac
 
 def _views(robot: Robot, views: BoardViews, generator: np.random.Generator, place: str) -> Draw:
     """Views of a board: the first that is drawn is A."""
-    near: Floats | None = None  # what self-motion is held to
+    near: Floats | None = None  # the configuration that self-motion stays near
 
     def draw(k: int, asked: int) -> tuple[Floats, Words]:
         nonlocal near

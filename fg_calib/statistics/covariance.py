@@ -39,16 +39,16 @@ class TangentCovariance(FrozenArrays):
         variables: The variables; the columns are theirs.
         parameters: The estimate (see `Variables`).
         tangent: Covariance of the determined part, by the noise that rows are weighted by, shape (n_columns,) * 2.
-        loose: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
-            (n_loose, n_columns).
-        loose_at_nominal: The same at the nominal parameters.
+        undetermined: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
+            (n_undetermined, n_columns).
+        undetermined_at_nominal: The same at the nominal parameters.
     """
 
     variables: graph.Variables
     parameters: Floats
     tangent: Floats
-    loose: Floats
-    loose_at_nominal: Floats
+    undetermined: Floats
+    undetermined_at_nominal: Floats
 
     def covariance(self, rows: Floats) -> Floats:
         """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
@@ -71,7 +71,7 @@ class TangentCovariance(FrozenArrays):
         scaled = rows * self.variables.scales
         with np.errstate(invalid="ignore"):
             size = np.linalg.norm(scaled, axis=1)
-            shares = [np.linalg.norm(scaled @ loose.T, axis=1) for loose in (self.loose, self.loose_at_nominal)]
+            shares = [np.linalg.norm(scaled @ D.T, axis=1) for D in (self.undetermined, self.undetermined_at_nominal)]
             found: NDArray[np.bool_] = (shares[0] > graph.SUPPORT_TOLERANCE * size) & (
                 shares[1] > graph.SUPPORT_TOLERANCE * size
             )
@@ -138,8 +138,8 @@ def spread_of(solution: graph.Solution) -> Spread:
     if solution.before is not solution.parameters:
         nominal = problem.linearize(solution.before, with_loss=True)
     rank, half, scales = system.rank, system.root, variables.prior_scales
-    loose, loose_at_nominal = system.directions[rank:], nominal.directions[nominal.rank :]
-    held = held_frames(loose, loose_at_nominal, scales, variables.n_robot_columns)
+    undetermined, undetermined_at_nominal = system.directions[rank:], nominal.directions[nominal.rank :]
+    held = held_frames(undetermined, undetermined_at_nominal, scales, variables.n_robot_columns)
     root = np.hstack([half, held])
     added = graph.correlation(problem, solution.parameters)
     middle = np.zeros((rank, rank)) if added is None else half.T @ added @ half
@@ -149,14 +149,14 @@ def spread_of(solution: graph.Solution) -> Spread:
         root=root,
         tangent=root @ root.T,
         actual=half @ (np.eye(rank) + middle) @ half.T + held @ held.T,
-        loose=_orthonormal(loose, variables.scales),
-        loose_at_nominal=_orthonormal(loose_at_nominal, variables.scales),
+        undetermined=_orthonormal(undetermined, variables.scales),
+        undetermined_at_nominal=_orthonormal(undetermined_at_nominal, variables.scales),
         rank=rank,
         excess=float(np.trace(middle)),
     )
 
 
-def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
+def held_frames(undetermined: Floats, undetermined_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
     """Errors of frames that nothing determines, with what follows them; shape (n_columns, k).
 
     No nominal value says where frames are: they stay where they were started. Where nothing at nominal determines one
@@ -164,12 +164,12 @@ def held_frames(loose: Floats, loose_at_nominal: Floats, scales: Floats, n_robot
     corrected make other parameters depend on it. It may be off by what is the least that counts as undetermined.
 
     Args:
-        loose: Undetermined directions at the estimate, shape (n, n_columns), orthonormal in units of `scales`.
-        loose_at_nominal: The same at the nominal parameters.
+        undetermined: Undetermined directions at the estimate, shape (n, n_columns), orthonormal in units of `scales`.
+        undetermined_at_nominal: The same at the nominal parameters.
         scales: Of the columns, shape (n_columns,).
         n_robot: How many columns, the first ones, are the robot's.
     """
-    at_nominal, here = loose_at_nominal / scales, loose / scales
+    at_nominal, here = undetermined_at_nominal / scales, undetermined / scales
     U, s, _ = np.linalg.svd(at_nominal[:, :n_robot])
     of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= graph.SUPPORT_TOLERANCE].T @ at_nominal
     turned: Floats = of_frames @ here.T @ here
@@ -187,8 +187,8 @@ def covariance_of_rows(variables: graph.Variables, parameters: Floats, rows: Flo
     r, J = graph.prior_rows(variables, parameters)
     priors, square_root = np.column_stack([J, r]), np.pad(rows, ((0, 0), (0, 1)))
     system = graph.NormalSystem(square_root, variables.n_columns, variables.prior_scales, priors)
-    loose = _orthonormal(system.directions[system.rank :], variables.scales)
-    return TangentCovariance(variables, parameters, system.covariance, loose, loose)
+    undetermined = _orthonormal(system.directions[system.rank :], variables.scales)
+    return TangentCovariance(variables, parameters, system.covariance, undetermined, undetermined)
 
 
 def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
@@ -211,7 +211,7 @@ def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
     M_nominal, errors_nominal = _errors(problem, solution.before)
     of_left_out = errors[:, known] * np.array([t for t in tolerances if t is not None])
 
-    def loose(own: Floats, M: Floats, errors: Floats) -> Floats:
+    def moved(own: Floats, M: Floats, errors: Floats) -> Floats:
         return _orthonormal(np.vstack([(own * own_scales) @ M.T, errors[:, ~known].T]), variables.scales)
 
     return replace(
@@ -219,8 +219,8 @@ def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
         variables=variables,
         tangent=M @ spread.tangent @ M.T + of_left_out @ of_left_out.T,
         actual=M @ spread.actual @ M.T + of_left_out @ of_left_out.T,
-        loose=loose(spread.loose, M, errors),
-        loose_at_nominal=loose(spread.loose_at_nominal, M_nominal, errors_nominal),
+        undetermined=moved(spread.undetermined, M, errors),
+        undetermined_at_nominal=moved(spread.undetermined_at_nominal, M_nominal, errors_nominal),
     )
 
 

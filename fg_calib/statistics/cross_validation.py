@@ -128,7 +128,7 @@ def cross_validate(
     check_number("folds", n, least=2, whole=True)
     for table in job.tables:
         if table.own:
-            raise InputError("folds", f"measurements of one's own in {table.measurements.source}", "tables without")
+            raise InputError("folds", f"custom measurements in {table.measurements.source}", "tables without")
     tables = _train_tables(job.tables)
     if not tables:
         raise InputError("folds", "test rows alone", "rows to calibrate with, and to hold out")

@@ -71,12 +71,12 @@ class FrameEstimate(FrozenArrays):
 
 @dataclass(frozen=True)
 class LandmarkEstimate(FrozenArrays):
-    """A touched point, a target, an anchor, a plane, a board or an instrument's offset.
+    """A contact point, a target, an anchor, a plane, a board or an instrument's offset.
 
     Attributes:
         name: Its name.
         n: Train rows that it takes part in.
-        xyz: Position: of a touched point or an anchor in the base frame, of a target in the tool frame, [m]; of a
+        xyz: Position: of a contact point or an anchor in the base frame, of a target in the tool frame, [m]; of a
             plane its unit normal in the base frame, then its distance from the base, [m]; of a board its rotation
             vector, [rad], and position in the base frame, [m]; of an offset what the instrument adds, [m]. Of a group
             without train rows the mean of the predicted tool points.
@@ -138,7 +138,7 @@ class Estimates:
     Attributes:
         parameters: Every parameter of the robot.
         frames: Every measurement frame that was estimated, table by table.
-        landmarks: Touched points, targets, anchors, planes, boards and offsets.
+        landmarks: Contact points, targets, anchors, planes, boards and offsets.
         joint_errors: Estimated errors of the joint readings; None where these were not estimated.
     """
 

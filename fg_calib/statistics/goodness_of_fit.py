@@ -77,7 +77,7 @@ class KindFit:
     """The fitted rows of one kind of noise.
 
     Attributes:
-        kind: `distance`, `angle`, `orientation`, `position`, `point`, or that of a kind of one's own.
+        kind: `distance`, `angle`, `orientation`, `position`, `point`, or that of a custom kind.
         unit: `m`, `rad` or `px`.
         n: Number of scalar rows.
         specified_sigma_rms: Root mean square of their specified sigmas.
@@ -393,10 +393,10 @@ class RowStatistics:
         self.leverage: Floats = np.full(table.n, np.nan)
         kept, asked, T = [model.errors(0, np.zeros(0, dtype=np.int64))], keep | table.test, model.of_all(tangent)
         for number, noise in enumerate(self.solution.noises):
-            measured, last = noise.series.measured, table.rows_of(number).start
+            measured, last = noise.block.measured, table.rows_of(number).start
             step = _CHUNK if model.is_plain(number) else _CHUNK_WITH_STATES
-            for start in range(0, noise.series.n, step):
-                chunk = np.arange(start, min(start + step, noise.series.n))
+            for start in range(0, noise.block.n, step):
+                chunk = np.arange(start, min(start + step, noise.block.n))
                 first, last = last, last + int(np.sum(measured[chunk]))
                 rows = slice(first, last)
                 if model.is_plain(number) and not asked[rows].any():
@@ -496,7 +496,7 @@ class RowStatistics:
         for number, noise in enumerate(
             noises_at(problem, self.solution.parameters) if self.solution.problem.state.factors else ()
         ):
-            variance[self.table.rows_of(number)] = noise.sigma[noise.series.measured] ** 2
+            variance[self.table.rows_of(number)] = noise.sigma[noise.block.measured] ** 2
         return variance
 
     def _predict(self, test: Integers, squares: Floats) -> JudgedRows:
@@ -612,8 +612,8 @@ def _weighted_chi2(solution: Solution) -> tuple[float, int, float]:
         return chi2, problem.n_independent, 1.0
     n_rows = n_kept = expected = 0.0
     distances = mahalanobis_distances(problem, solution.parameters)
-    for series, w, (e, residual_dim) in zip(problem.data.blocks, weights, distances, strict=True):
-        train, outlier = (residual_dim > 0) & ~series.test, w < OUTLIER_WEIGHT
+    for block, w, (e, residual_dim) in zip(problem.data.blocks, weights, distances, strict=True):
+        train, outlier = (residual_dim > 0) & ~block.test, w < OUTLIER_WEIGHT
         chi2 -= float(np.sum(w[train & outlier] * e[train & outlier] ** 2))
         kept = float(residual_dim[train & ~outlier].sum())
         n_rows, n_kept = n_rows + float(residual_dim[train].sum()), n_kept + kept

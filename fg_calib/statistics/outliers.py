@@ -111,7 +111,7 @@ def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem
     data, blocks = solution.problem.data, []
     for number, s in enumerate(data.blocks):
         test = s.test.copy()
-        test[table.measurement[out & (table.series == number)]] = True
+        test[table.measurement[out & (table.block == number)]] = True
         blocks.append(replace(s, test=test))
     return with_factors(solution.problem, solution.before, data=replace(data, blocks=tuple(blocks)))
 

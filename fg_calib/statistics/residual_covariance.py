@@ -15,7 +15,7 @@ import scipy.sparse
 from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
-from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, felt, reach
+from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, estimate_sensitivity, reach
 from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
@@ -33,8 +33,8 @@ class ResidualCovariance:
     Attributes:
         d: Diagonal of D, the variance of private noise, shape (n,).
         L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
-        P: Derivatives in core and landmarks. Where fitted and predicted rows share errors, then also `L F^T`, F what
-            the fit made of those errors (see `graph.felt`). Shape (n, k).
+        P: Derivatives in core and landmarks. Where fitted and predicted rows share errors, then also `L F^T`, F the
+            estimate's sensitivity to those errors (see `graph.estimate_sensitivity`). Shape (n, k).
         M: Symmetric, shape (k, k).
     """
 
@@ -69,10 +69,10 @@ class ResidualCovariance:
 
         Args:
             K: Minus their covariance of fitted rows, their covariance of predicted ones (see `RowModel.of_all`).
-            T: The covariance by the noise that rows are weighted by, where the estimate felt errors of these rows.
+            T: Covariance by the noise that rows are weighted by, if the estimate depends on errors of these rows.
         """
-        felt_, n = np.zeros_like(K) if T is None else -T, self.P.shape[1]
-        return replace(self, M=np.block([[K, felt_], [felt_, np.zeros_like(K)]])[:n, :n])
+        cross, n = np.zeros_like(K) if T is None else -T, self.P.shape[1]
+        return replace(self, M=np.block([[K, cross], [cross, np.zeros_like(K)]])[:n, :n])
 
     def split(self) -> ResidualCovariance:
         """Move errors of more than one in `FEW` rows into the columns of P."""
@@ -133,24 +133,22 @@ class RowModel:
         self._follow = np.vstack([np.eye(v.n_columns), left.follow])
         self._alone = np.vstack([np.zeros((v.n_columns, left.rank)), left.inverse])
         self._common = np.flatnonzero((reach(noises) > 0) & (reach(noises, test=True) > 0))
-        self._felt = felt(problem, parameters, self._common)
+        self._sensitivity = estimate_sensitivity(problem, parameters, self._common)
         known = np.repeat(np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes)
         self._nowhere: Booleans = (self._at.columns < 0) & ~known
-        alone = [
-            np.flatnonzero(self._nowhere[n.series.nuisances].any(axis=1) & n.series.kind.is_contact) for n in noises
-        ]
-        counts = [len(rows) * noise.series.kind.residual_dim for rows, noise in zip(alone, noises, strict=True)]
+        alone = [np.flatnonzero(self._nowhere[n.block.nuisances].any(axis=1) & n.block.kind.is_contact) for n in noises]
+        counts = [len(rows) * noise.block.kind.residual_dim for rows, noise in zip(alone, noises, strict=True)]
         n_errors = max((noise.place.n_errors for noise in noises), default=0)
         self._of_alone, self._first = alone, n_errors + np.cumsum([0, *counts])
 
     def is_plain(self, number: int) -> bool:
         """Whether rows of a block follow from the core and private noise alone."""
         noise = self._noises[number]
-        return not (noise.loading.shape[2] or noise.series.nuisances.shape[1])
+        return not (noise.loading.shape[2] or noise.block.nuisances.shape[1])
 
     def chain(self, number: int) -> Chain:
         """The chain of a block at the estimate."""
-        return self._at.chains[self._noises[number].series.table]
+        return self._at.chains[self._noises[number].block.table]
 
     def of_core(self, covariance: ResidualCovariance) -> Floats:
         """Derivatives of rows in the core, landmarks following it, shape (n, n_columns)."""
@@ -175,7 +173,7 @@ class RowModel:
             kept = np.where(np.isin(np.arange(len(d)), mine), 0.0, 1.0)
             put = Sparse((np.ones(len(mine)), (mine, np.arange(len(mine)))), shape=(len(d), len(mine)))
             d, L = d * kept, Sparse(scipy.sparse.diags_array(kept) @ L + put @ others)
-        P = np.hstack([P, L[:, self._common] @ self._felt.T]) if len(self._common) else P
+        P = np.hstack([P, L[:, self._common] @ self._sensitivity.T]) if len(self._common) else P
         return ResidualCovariance(d, L, P, np.zeros((0, 0)))
 
     def _about_means(self, number: int, alone: Integers, at: Integers) -> tuple[Floats, Sparse]:
@@ -185,7 +183,7 @@ class RowModel:
         row, column = np.arange(len(private)), self._first[number] + np.arange(len(private))
         own = Sparse((private, (row, column)), shape=(len(private), int(self._first[-1])))
         L = Sparse((L.data, L.indices, L.indptr), shape=own.shape) + own
-        coordinate = self._noises[number].series.nuisances[alone].ravel()
+        coordinate = self._noises[number].block.nuisances[alone].ravel()
         same = (coordinate[at][:, None] == coordinate).astype(np.float64)
         W = (at[:, None] == row) - same / same.sum(axis=1, keepdims=True)
         return W @ P, Sparse(Sparse(W) @ L)
@@ -193,13 +191,13 @@ class RowModel:
     def _derivatives(self, number: int, rows: Integers) -> tuple[Floats, Sparse]:
         """Derivatives of some measurements' rows in core and landmarks, and in errors."""
         noise, at = self._noises[number], self._at
-        J, nuisances = residuals.linearise(noise.rows_at(rows), self.chain(number))[1], noise.series.nuisances[rows]
+        J, nuisances = residuals.linearise(noise.rows_at(rows), self.chain(number))[1], noise.block.nuisances[rows]
         P = np.zeros((*J.shape[:2], at.n_columns + at.n_nuisance))
         P[:, :, : at.n_columns] = J[:, :, : at.n_columns]
         for k, column in enumerate(at.columns[nuisances].T):
             found = np.flatnonzero(column >= 0)
             P[found, :, column[found]] = J[found, :, at.n_columns + k]
-        if not noise.series.kind.is_contact:
+        if not noise.block.kind.is_contact:
             P[self._nowhere[nuisances].any(axis=1)] = np.nan
         return P.reshape(P.shape[0] * P.shape[1], P.shape[2]), noise.errors_at(rows)
 

@@ -99,14 +99,14 @@ class ResidualTable(FrozenArrays):
     Attributes:
         kinds: What rows are of, by code.
         kind_code: Of each row, shape (n,).
-        series: Which of the problem's series each row is of, shape (n,).
-        measurement: Number of each row's measurement in its series, shape (n,).
+        block: Which of the problem's blocks each row is of, shape (n,).
+        measurement: Number of each row's measurement in its block, shape (n,).
         row: Which of the measurement's rows it is, shape (n,).
         a: The (first) configuration, in `names`, or the (first) landmark where there is none, shape (n,).
         b: The second, -1 where there is none, shape (n,).
         names: Name of each configuration, then of each landmark.
         label_code: What each row is of by name, in `labels`; 0 where its table does not say, shape (n,).
-        labels: Names of targets, anchors, planes, boards, corners and touched points by code; the first is empty.
+        labels: Names of targets, anchors, planes, boards, corners and contact points by code; the first is empty.
         table_row: Row of its table that each row is from, counted from 0; -1 where it is of a pair, shape (n,).
         test: Predicted only, shape (n,).
         reason_code: Why a row takes no part, in `reasons`; 0 where it does, shape (n,).
@@ -124,7 +124,7 @@ class ResidualTable(FrozenArrays):
 
     kinds: tuple[RowKind, ...]
     kind_code: Codes
-    series: Codes
+    block: Codes
     measurement: Indices
     row: Codes
     a: Indices
@@ -191,7 +191,7 @@ class ResidualTable(FrozenArrays):
     @property
     def measurement_number(self) -> Integers:
         """A number for the measurement of each row, the same for all its rows, shape (n,)."""
-        number: Integers = self.series.astype(np.int64) * 2**32 + self.measurement
+        number: Integers = self.block.astype(np.int64) * 2**32 + self.measurement
         return number
 
     @cached_property
@@ -271,8 +271,8 @@ class ResidualTable(FrozenArrays):
         return tuple(found)
 
     def rows_of(self, number: int) -> slice:
-        """The rows of a series: those that were measured, one measurement's after the other."""
-        first, last = np.searchsorted(self.series, np.array([number, number + 1], dtype=self.series.dtype)).tolist()
+        """The rows of a block: those that were measured, one measurement's after the other."""
+        first, last = np.searchsorted(self.block, np.array([number, number + 1], dtype=self.block.dtype)).tolist()
         return slice(first, last)
 
     def without(self, unknown: Booleans) -> ResidualTable:
@@ -302,7 +302,7 @@ def residual_table(solution: Solution) -> ResidualTable:
         columns.append(
             {
                 "kind_code": codes[k],
-                "series": np.full(len(m), number, dtype=np.int16),
+                "block": np.full(len(m), number, dtype=np.int16),
                 "measurement": m.astype(np.int32),
                 "row": k.astype(np.int16),
                 "a": a[m],
@@ -354,16 +354,16 @@ def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:
     return np.array([*known, 0], dtype=np.int32)[of.index]  # -1, no name, is the last
 
 
-def _table_rows(series: MeasurementBlock, part: Integers | None) -> Indices:
+def _table_rows(block: MeasurementBlock, part: Integers | None) -> Indices:
     """Row of its table that each measurement is from, -1 where it is from none or two.
 
     Args:
-        series: The measurements.
+        block: The measurements.
         part: Which rows of a table theirs is made of; all if None.
     """
-    if series.kind.ends != 1:
-        return np.full(series.n, -1, dtype=np.int32)
-    rows = series.ends[:, 0]
+    if block.kind.ends != 1:
+        return np.full(block.n, -1, dtype=np.int32)
+    rows = block.ends[:, 0]
     return (rows if part is None else part[rows]).astype(np.int32)
 
 

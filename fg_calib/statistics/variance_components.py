@@ -94,7 +94,7 @@ class NoiseComponents:
 
 def has_joint_noise(problem: graph.Problem) -> bool:
     """Whether the noise of joint readings reaches any fitted row."""
-    return any(bool(np.any(noise.loading[noise.series.train][:, :, : noise.n_of_joints])) for noise in problem.noises)
+    return any(bool(np.any(noise.loading[noise.block.train][:, :, : noise.n_of_joints])) for noise in problem.noises)
 
 
 def noise_components(solution: graph.Solution) -> NoiseComponents:
@@ -119,14 +119,14 @@ def noise_components(solution: graph.Solution) -> NoiseComponents:
 
 def _origins(problem: graph.Problem) -> tuple[graph.NoiseName, ...]:
     """Tables and kinds of the fitted rows, then the joint readings."""
-    fitted = [noise for noise in problem.noises if noise.series.used[noise.series.train].any()]
-    kinds = dict.fromkeys((noise.series.table, family) for noise in fitted for family in _families(noise))
+    fitted = [noise for noise in problem.noises if noise.block.used[noise.block.train].any()]
+    kinds = dict.fromkeys((noise.block.table, family) for noise in fitted for family in _families(noise))
     return (*kinds, graph.JOINT_NOISE) if has_joint_noise(problem) else tuple(kinds)
 
 
 def _families(noise: graph.RowNoise) -> list[str]:
     """The kind of noise of each row of a measurement."""
-    return [name.partition(".")[0] for name in noise.series.kind.names]
+    return [name.partition(".")[0] for name in noise.block.kind.names]
 
 
 def _robust_weights(problem: graph.Problem) -> Floats:
@@ -134,7 +134,7 @@ def _robust_weights(problem: graph.Problem) -> Floats:
     given, out = problem.state.weights, np.ones(problem.rows.states.loadings.shape[0])
     if given is None:
         return out
-    parts = [(given[p.series][problem.noises[p.series].series.train], p.block.residual_dim) for p in problem.rows.parts]
+    parts = [(given[p.number][problem.noises[p.number].block.train], p.block.residual_dim) for p in problem.rows.parts]
     return np.concatenate([np.repeat(np.maximum(w, 1e-12), h) for w, h in parts])
 
 
@@ -145,10 +145,10 @@ def _root(problem: graph.Problem, name: graph.NoiseName) -> Sparse:
     """
     private, common = [], []
     for part in problem.rows.parts:
-        noise = problem.noises[part.series]
-        train, W = noise.series.train, graph.whitener_of(noise, part)
+        noise = problem.noises[part.number]
+        train, W = noise.block.train, graph.whitener_of(noise, part)
         of_joints = np.arange(noise.loading.shape[2]) < noise.n_of_joints
-        mine = np.array([(noise.series.table, family) == name for family in _families(noise)])
+        mine = np.array([(noise.block.table, family) == name for family in _families(noise)])
         origin = of_joints[None] if name == graph.JOINT_NOISE else mine[:, None] & ~of_joints
         is_state = problem.rows.shared[noise.columns[train]][:, None]
         alone = W @ np.where(origin & ~is_state, noise.loading[train], 0.0)

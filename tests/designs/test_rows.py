@@ -111,8 +111,8 @@ def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     """An image says of a tool frame what a pose says; of two boards in sight twice that."""
     pool = pool_with(*KINDS[kind])
     data = pool.problem.data
-    (series,) = data.blocks
-    most = np.bincount(data.places[series.table][series.ends[series.train]].ravel()).max()
+    (block,) = data.blocks
+    most = np.bincount(data.places[block.table][block.ends[block.train]].ravel()).max()
     assert most >= len(GRID) / 2
     boards = len(pool.problem.data.landmarks.names) or 1
     assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most

@@ -158,7 +158,7 @@ def test_contacts_that_a_model_cannot_use_or_without_sigmas_are_refused():
     for model in ("pose", "rotation"):
         said = f"poses.csv: group with model {model}, expected model distance or distance-rotation"
         assert refused(robot, m, model=model) == said
-    said = "poses.csv: no sigma for touched points, expected noise.point or a column sigma_point"
+    said = "poses.csv: no sigma for contact points, expected noise.point or a column sigma_point"
     assert refused(robot, replace(m, sigmas={}), model="distance") == said
     said = "pairs.csv: no sigma for distance, expected noise.distance or a column sigma_distance"
     assert refused(robot, replace(m, groups=replace(m.groups, pairs=pairs)), model="distance") == said
@@ -258,9 +258,9 @@ def test_a_length_of_zero_is_contact_unless_the_instrument_adds_an_offset():
     length[[4, 7]] = 0.0
     for offset, kinds in ((True, {"AnchorDistance": 40}), (False, {"AnchorDistance": 38, "AnchorContact": 2})):
         m = table.measurements.with_values({"distance": length})
-        series = build_problem(robot, replace(table, measurements=m, offset=offset)).data.blocks
-        assert {type(s.kind).__name__: s.n for s in series} == kinds
-    assert [[s.of.names[i] for i in s.of.index[:3]] for s in series] == [["a0", "a1", "a2"], ["a1", "a1"]]
+        blocks = build_problem(robot, replace(table, measurements=m, offset=offset)).data.blocks
+        assert {type(s.kind).__name__: s.n for s in blocks} == kinds
+    assert [[s.of.names[i] for i in s.of.index[:3]] for s in blocks] == [["a0", "a1", "a2"], ["a1", "a1"]]
 
 
 def test_what_an_instruments_model_lacks_is_named():

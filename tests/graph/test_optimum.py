@@ -251,7 +251,7 @@ def test_the_graph_has_one_factor_a_measurement_and_the_same_optimum_and_margina
     factors = [graph.at(i) for i in range(graph.size())]
     for kind, of in ((DistanceFactor, "distance"), (RotationAngleFactor, "angle")):
         wanted = sum(
-            int(s.used[s.train, s.kind.names.index(of)].sum()) for s in problem.pair_series if of in s.kind.names
+            int(s.used[s.train, s.kind.names.index(of)].sum()) for s in problem.pair_blocks if of in s.kind.names
         )
         assert sum(isinstance(factor, kind) for factor in factors) == wanted
     parameters = gtsam.LevenbergMarquardtParams()

@@ -22,13 +22,13 @@ CASES = {
     "pose in an unknown frame": {"model": "pose", "frame": "unknown"},
     "star by a robust loss": {"model": "distance-rotation", "loss": "huber"},
     "kept parameters": {"model": "distance-rotation", "gauge": "keep"},
-    "joint values of touched points": {"model": "distance", "encoder": "estimated"},
+    "joint values of contact points": {"model": "distance", "encoder": "estimated"},
 }
 
 
 def problem(name):
     rng = np.random.default_rng(5)
-    if "touched points" in name:
+    if "contact points" in name:
         robot = small_arm(TOLERANCE, estimate=TOOL_POINT)
         true = true_robot(robot, rng)
         m = touch(true, corners(true, 2, rng), 10, rng, distances=[(0, 1, 1e-4)])

@@ -62,9 +62,9 @@ def test_angles_near_0_and_180_degrees_have_the_moments_of_drawn_ones():
     s, off = 1e-3, np.array([0.0, 1.0, 2.0, 30.0, 30.0, 2.0, 1.0])
     angles = np.where(np.arange(7) < 4, s * np.maximum(off, 1e-9), np.pi - s * off)
     problem = build_problem(planar_robot(), planar_pairs(angles, sigma=(1e-5, s)), model="rotation")
-    (series,), (noise,) = problem.data.blocks, problem.noises
-    assert series.kind.names == ("angle",)
-    assert series.used.all()
+    (block,), (noise,) = problem.data.blocks, problem.noises
+    assert block.kind.names == ("angle",)
+    assert block.used.all()
     assert problem.n_excluded == {"same_configuration": 0}
     z = np.random.default_rng(0).normal(size=(200_000, 1))
     seen = np.abs(off + z)  # from 0 or pi, in sigma; 0.0016 and 0.0022 are 1 sigma of the mean's and sd's errors

@@ -113,7 +113,7 @@ def test_weights_are_those_of_the_residuals_at_the_estimate(loss, model, encoder
     rows = SeriesRows(replace(problem, state=replace(problem.state, weights=None)), solution.parameters, 0)
     e = np.sqrt(np.einsum("nh,nh->n", rows.r, np.linalg.solve(rows.total, rows.r[:, :, None])[:, :, 0]))
     h, (found,) = rows.r.shape[1], solution.problem.state.weights
-    train = rows.series.train
+    train = rows.block.train
     assert found[train] == pytest.approx(weight(loss, e[train], tuning(loss, h)), abs=1e-3)
     assert model != "pose" or np.max(found[wrong]) < 0.6
     if encoder == "propagated":

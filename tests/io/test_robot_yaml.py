@@ -100,7 +100,7 @@ def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, convent
 
 
 def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
-    """Elements of one's own would be lost without a word, and a result saved with them could not be loaded."""
+    """Custom elements would be lost without a word, and a result saved with them could not be loaded."""
     robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 2)
     more = replace(robot, elements=(*robot.elements, Element(Axis.TX, 0.1)))
     another = RobotBuilder("arm", "dh")

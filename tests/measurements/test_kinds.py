@@ -1,4 +1,4 @@
-"""Each kind of measurement: derivatives by central differences, compiled twins against numpy, a kind of one's own."""
+"""Each kind of measurement: derivatives by central differences, compiled twins against numpy, a custom kind."""
 
 from dataclasses import replace
 

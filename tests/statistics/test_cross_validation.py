@@ -38,7 +38,7 @@ def job_of(robot, *tables, **options):
 
 @pytest.mark.slow
 def test_every_configuration_is_predicted_once_by_the_others():
-    """Against calibrations of one's own, fold by fold."""
+    """Against separate calibrations, fold by fold."""
     robot, m = poses(n_test=7)
     found = cross_validate(job_of(robot, m), 4)
     assert found.fold.shape == (40,)  # test rows take no part
@@ -162,7 +162,7 @@ def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
 def test_measurements_of_ones_own_are_refused():
     robot, m = poses()
     own = CustomMeasurements(Position(), data=m.position, sigma=1e-3)
-    with pytest.raises(InputError, match="folds: measurements of one's own"):
+    with pytest.raises(InputError, match="folds: custom measurements"):
         cross_validate(job_of(robot, Table(m, "pose", own=(own,))), 5)
 
 

@@ -248,7 +248,7 @@ def contact_blocks(table: Table, number: int, landmarks: Landmarks) -> list[Meas
     place = landmarks.add([Landmark(POINT, name, np.full(3, np.nan)) for name in groups.names], m.source)
     if len(rows):
         if (sigma := m.sigma("point")) is None or not np.isfinite(sigma[rows]).all():
-            raise ProblemError(m.source, "no sigma for touched points", "noise.point or a column sigma_point")
+            raise ProblemError(m.source, "no sigma for contact points", "noise.point or a column sigma_point")
         touched = groups.index[rows]
         fields: dict[str, Any] = {"nuisances": place[touched], "of": Labels(groups.names, touched), "source": m.source}
         arrays = rows, np.zeros((len(rows), 0)), sigma[rows, None]
