@@ -42,7 +42,7 @@ _ID = re.compile(r"^(?:(\S+) (?:\S+ )?)?p(\d+)$")
 """How a simulation names a configuration: the instrument whose own it is, if any, and its number."""
 
 MEASURED: Mapping[Model, Model] = {"distance": "position", "rotation": "orientation", "distance-rotation": "pose"}
-"""What is measured for pairs of each model to be formed.
+"""Model to measure for pairs of each model to be formed.
 
 All distances between points determine them but for one motion `x -> U x + t`; all angles of `R_a^T R_b` determine the
 rotations but for `R -> U' R V`. Positions in an unknown frame hold as much as the former. Poses in an unknown frame
@@ -119,7 +119,7 @@ class Pool(Brief):
         return [table if _has_rows(table) else select_rows(table, {}) for table in found]
 
     def posterior(self, poses: Integers, pairing: Pairing | None = None) -> Posterior:
-        """What is known with some poses measured after what was, as a calibration would report it.
+        """Posterior with some poses measured after the earlier ones, as a calibration would report it.
 
         Args:
             poses: The poses, given ones included.

@@ -211,7 +211,7 @@ def _check_readings(name: str, given: object, robot: Robot) -> Floats | None:
     """Check configurations from outside.
 
     Raises:
-        InputError: They are no readings of the arm's joints, or none.
+        InputError: The array holds no readings of the arm's joints, or none.
     """
     if given is None:
         return None

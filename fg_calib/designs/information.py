@@ -259,7 +259,7 @@ class Task(FrozenArrays):
 
 @dataclass(frozen=True)
 class Posterior(Brief):
-    """What is known after some rows were measured.
+    """Posterior of the arm after some rows were measured.
 
     Attributes:
         problem: Their problem, at its start.
@@ -285,7 +285,7 @@ class Posterior(Brief):
 
     @cached_property
     def observability(self) -> Observability:
-        """What the rows, without priors, determine of the arm."""
+        """Observability of the arm by the rows, without priors."""
         p, v = self.problem, self.problem.variables
         left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_robot_columns)
         return observability_of_rows(

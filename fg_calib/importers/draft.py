@@ -25,7 +25,7 @@ _ENDINGS = {
     **dict.fromkeys((".urdf", ".xacro"), "robot"),
     **dict.fromkeys((".yaml", ".yml"), "yaml"),
 }
-"""What files hold, by their ending."""
+"""Content of files by their ending."""
 
 _UNIT = r"um|mm|cm|m|inch|in|mrad|rad|radians|degrees|deg|°|px"
 _HEADER = re.compile(rf"^(?P<name>.*?\S)(?:\s*[\[(]\s*(?P<bracket>{_UNIT})\s*[\])]|[_\s](?P<suffix>{_UNIT}))$", re.I)
@@ -121,10 +121,10 @@ class _Recognised:
 
 
 def _recognise(path: Path, robot: Robot) -> _Recognised:
-    """What a table holds.
+    """Recognise the content of a table.
 
     Raises:
-        InputError: It cannot be read, is neither of configurations nor of pairs, or mixes units.
+        InputError: The table cannot be read, is neither of configurations nor of pairs, or mixes units.
     """
     table = Table.read(path, "table")
     headers = [_HEADER.match(column) for column in table.columns]

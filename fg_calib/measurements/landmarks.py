@@ -29,7 +29,7 @@ class LandmarkKind:
         column: Of a table, whose names they have; that called like the kind if empty.
         away: How far they stand from the middle of the tool points where nothing is measured yet, in their reach.
         is_constant: Whether its coordinates are never estimated.
-        n_configurations: That must be left to say where one is, in cross-validation.
+        n_configurations: Configurations that must remain to determine one, in cross-validation.
         must_be_fitted: Whether a train row must say where one is, unless the job does.
         stays: Whether it is where it was at the next calibration: a target on the tool, say.
         is_one: Whether a table has one at most, whose name says enough.
@@ -144,7 +144,7 @@ class Landmarks:
 
     @property
     def start(self) -> Floats:
-        """Where all are started, shape (n_coordinates,); nan where the measurements are to say it."""
+        """Start of all coordinates, shape (n_coordinates,); nan where the measurements are to say it."""
         return np.concatenate([np.zeros(0), *(item.start for item in self.items)])
 
     @property
@@ -206,7 +206,7 @@ class Landmarks:
             self.items[i] = replace(self.items[i], start=place)
 
     def with_starts(self, starts: Mapping[int, Floats]) -> Landmarks:
-        """The same with other starts of some, wherever a table says that they are.
+        """Copy with other starts of some, wherever a table says that they are.
 
         Args:
             starts: Coordinates by the landmark's number.

@@ -67,7 +67,7 @@ class Chain(Brief):
     joint_columns: bool = False
 
     def at(self, parameters: Floats) -> Chain:
-        """Set parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
+        """Copy with parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
 
         The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
         """
@@ -81,11 +81,11 @@ class Chain(Brief):
         return out
 
     def without_columns(self) -> Chain:
-        """Drop the derivatives."""
+        """Copy without derivatives."""
         return replace(self, column=np.full_like(self.column, -1), n_columns=0, joint_columns=False)
 
     def with_joint_columns(self) -> Chain:
-        """Add the derivatives in the joints."""
+        """Copy with the derivatives in the joints too."""
         return replace(self, joint_columns=True)
 
     @cached_property

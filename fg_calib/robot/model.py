@@ -48,7 +48,7 @@ _log = logging.getLogger(__name__)
 
 
 class Axis(IntEnum):
-    """What an elementary transform does: translate along (T) or rotate about (R) one axis."""
+    """Elementary transform: translation along (T) or rotation about (R) one axis."""
 
     TX = 0
     TY = 1
@@ -77,7 +77,7 @@ SCALES: Mapping[str, Scale] = {
 
 
 class ParameterKind(NamedTuple):
-    """What a kind of parameter is: its SI unit, a key of `SCALES`, and the elementary transform that it is a value of.
+    """Kind of parameter: its SI unit, a key of `SCALES`, and the elementary transform that it is a value of.
 
     A joint's effect, such as a gain, acts along the joint's own axis.
     """
@@ -125,7 +125,7 @@ MOST_LIMIT = 16.0 * np.pi
 """How far a joint of limited range turns at most, [rad]: limits beyond that are warned of as probably in deg."""
 
 IN_RAD = "angles in rad, two turns at most"
-"""What is expected instead."""
+"""Expected size of angles instead."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class Parameter:
 
     @property
     def unit(self) -> str:
-        """Its SI unit: `m`, `rad`, or another of `SCALES`."""
+        """SI unit: `m`, `rad`, or another of `SCALES`."""
         return PARAMETER_KINDS[self.kind].unit
 
     def preference(self, prefer: Sequence[str]) -> int:
@@ -342,7 +342,7 @@ class Robot:
 
     @cached_property
     def bases(self) -> tuple[Basis, ...]:
-        """What the elements' coefficients are multiplied by, each once."""
+        """Functions that the elements' coefficients are multiplied by, each once."""
         return tuple(dict.fromkeys(e.basis for e in self.elements if e.basis is not None))
 
     def trig(self, readings: Floats) -> Floats:
@@ -422,7 +422,7 @@ class Robot:
 
     @checked
     def with_estimated(self, names: Iterable[str]) -> Robot:
-        """The same robot with just the parameters called `names` estimated.
+        """Copy with just the parameters called `names` estimated.
 
         Raises:
             InputError: There is no such parameter.
@@ -434,7 +434,7 @@ class Robot:
 
     @checked
     def with_values(self, values: Floats | Sequence[float]) -> Robot:
-        """The same robot with other nominal values, shape (n_parameters,), [m] or [rad].
+        """Copy with other nominal values, shape (n_parameters,), [m] or [rad].
 
         Raises:
             InputError: There are more or fewer values than parameters.
@@ -611,7 +611,7 @@ def frame_values(name: str, given: Mapping[str, float] | ArrayLike | None) -> di
         given: A mapping, or of shape (3,), (6,) or (4, 4), [m] and [rad].
 
     Raises:
-        InputError: It is something else.
+        InputError: The frame is given as something else.
     """
     if given is None:
         return {}
