@@ -74,7 +74,7 @@ class Assessment(FrozenArrays):
         """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
 
         Args:
-            others: Those measurements, by table and kind of noise.
+            others: Held-out measurements, by table and kind of noise.
             solution: What was assessed.
         """
         tested = self.fit.residuals.held_out(solution.problem.data.labels)
@@ -144,7 +144,7 @@ def _figures(function: Callable[[Robot], ArrayLike], robot: Robot) -> Floats:
     """The value of a function of a robot that a user gave, shape (n,).
 
     Raises:
-        InputError: It raised something, or its value is no figures.
+        InputError: The function raised something, or its value is no number.
     """
     try:
         value = function(robot)

@@ -396,7 +396,7 @@ class Calibration:
         """New rows, understood as the calibration's own, and SHA-256 of the files that they are from.
 
         Raises:
-            InputError: They are of another robot, or cannot be read.
+            InputError: The rows are of another robot, or cannot be read.
         """
         options, robot = replace(self.result.options, folds=None), self.posterior.variables.robot
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
@@ -649,7 +649,7 @@ def _posterior(robot: Robot, result: io.Result, place: str) -> TangentCovariance
     """The saved covariance, of a nominal robot.
 
     Raises:
-        InputError: It is that of another robot.
+        InputError: The covariance is that of another robot.
     """
     poses = [np.zeros(6)] if not result.frames else []
     for frame in result.frames.values():
@@ -680,7 +680,7 @@ def _knowledge(robot: Robot, saved: io.Knowledge) -> Knowledge:
     """The information of the rows of a saved result.
 
     Raises:
-        InputError: It is that of another robot.
+        InputError: The information is that of another robot.
     """
     nominal = None if saved.nominal is None else _knowledge(robot, saved.nominal)
     fields = {name: getattr(saved, name) for name in ("unknowns", "at", "rows", "right", "views")}
@@ -696,7 +696,7 @@ def _date_and_days(given: str | None, before: str) -> tuple[str, float | None]:
     """A date, now if None, and the days to it from the date before; None where that is not known.
 
     Raises:
-        InputError: It is no date, or a day or more before the other.
+        InputError: The text is no date, or the date is a day or more before the other.
     """
     text = given or datetime.now(UTC).isoformat(timespec="seconds")
     try:

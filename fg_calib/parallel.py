@@ -142,7 +142,7 @@ def require_polars(place: str) -> None:
         place: What is read or written, for messages.
 
     Raises:
-        InputError: It does not.
+        InputError: Polars does not work here.
     """
     if _forked_from_polars:
         found = "polars does not work in a fork of a process that has loaded it"
@@ -245,7 +245,7 @@ def local_processes(n_workers: int) -> ProcessPoolExecutor:
         n_workers: Number of processes.
 
     Raises:
-        InputError: It is no number from 1 to 1000.
+        InputError: The number of processes is no number from 1 to 1000.
     """
     check_number("workers", n_workers, above=True, whole=True, most=MOST)
     share = max(1, processors() // n_workers)

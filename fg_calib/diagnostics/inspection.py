@@ -84,7 +84,7 @@ class TableSurvey:
         labels: How many stations, targets, anchors, planes, boards or contact points it names, by what they are.
         n_copies: Rows, or measured pairs, that are the same as one before them in every value.
         copy: Two that are the same; empty without.
-        n_repeats: Those at the readings of one before them, with other values: they show the noise.
+        n_repeats: Rows at the readings of an earlier one, with other values: they show the noise.
         n_leaked: Test rows at, or within `NEAR` of, a configuration of train rows.
     """
 

@@ -80,7 +80,7 @@ class Export:
         """Write the file, whole or not at all.
 
         Raises:
-            InputError: It is there already, or cannot be written.
+            InputError: The file is there already, or cannot be written.
         """
         path = Path(path)
         require_absent(path.parent, [path.name])

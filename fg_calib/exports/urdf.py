@@ -150,7 +150,7 @@ def ur_kinematics(robot: Robot, base: UrBase) -> tuple[dict[str, dict[str, float
         base: Which frame of ur_description its base is.
 
     Raises:
-        InputError: It has not six joints that turn.
+        InputError: The arm has not six revolute joints.
     """
     slides = sum(joint.prismatic for joint in robot.joints)
     if robot.n_joints != len(UR_LINKS) or slides:

@@ -177,7 +177,7 @@ class State(Brief):
     n_nuisance: int
 
     def without_columns(self) -> State:
-        """This state without derivatives."""
+        """Copy without derivatives."""
         return replace(self, chains=tuple(chain.without_columns() for chain in self.chains), n_columns=0, n_nuisance=0)
 
 

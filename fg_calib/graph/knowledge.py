@@ -159,7 +159,7 @@ class Knowledge(FrozenArrays):
         """The step from where the rows were linearised to a parameter vector, and its derivative.
 
         Args:
-            variables: Those of a problem of the same arm.
+            variables: Variables of a problem of the same arm.
             unknowns: The problem's unknowns; those of the knowledge's that are none of them stay where they were.
             parameters: The problem's parameter vector.
 

@@ -239,7 +239,7 @@ class Variables(Brief):
         return out
 
     def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
-        """Add the measurements' estimated unknowns as nuisance variables."""
+        """Copy with the measurements' estimated unknowns as nuisance variables."""
         column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
         coordinates, more, taken = list[int](), list[Variable](), {v.symbol for v in self.items}
         for index, (item, size) in enumerate(zip(unknowns.items, unknowns.sizes, strict=True)):

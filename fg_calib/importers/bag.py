@@ -445,7 +445,7 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
         robot: Whose joints they are of.
 
     Raises:
-        InputError: It cannot be written, or is another file.
+        InputError: The table cannot be written, or is another file.
     """
     path = Path(path)
     require_own_csv(path, TABLE_BEGINNING)

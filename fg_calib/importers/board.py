@@ -135,7 +135,7 @@ def load_opencv() -> Any:
     """The module `cv2`.
 
     Raises:
-        InputError: It is not installed.
+        InputError: OpenCV is not installed.
     """
     try:
         import cv2

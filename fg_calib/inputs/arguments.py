@@ -170,7 +170,7 @@ def check(key: str, value: object, possible: Any) -> Any:
         possible: A `Literal`, or the values themselves.
 
     Raises:
-        InputError: It is none of them.
+        InputError: The option is not one of those possible.
     """
     options = get_args(possible) or tuple(possible)
     if not isinstance(value, str) or value not in options:
@@ -198,7 +198,7 @@ def check_number(
         most: The largest number possible.
 
     Raises:
-        InputError: It is no number, nan, or not of this kind and size.
+        InputError: The option is no number, nan, or not of this kind and size.
     """
     try:
         x = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
@@ -220,11 +220,11 @@ def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str 
     Args:
         key: The list's name, for the message.
         names: The names given.
-        known: Those possible.
+        known: Possible names.
         what: What they are names of.
 
     Raises:
-        InputError: It is one word instead of a list, or a name is not known.
+        InputError: The list is one word, or a name is not known.
     """
     if isinstance(names, str) or not isinstance(names, Iterable) or not getattr(names, "ndim", 1):
         raise InputError(key, f"found {shown(names)}", "a list of names")
@@ -254,7 +254,7 @@ def listed(key: str, names: Iterable[Any], expected: str = "a list of names") ->
     """Names as a tuple: an iterator would be empty the second time.
 
     Raises:
-        InputError: They cannot be iterated over.
+        InputError: The names cannot be iterated over.
     """
     if isinstance(names, str):
         return (names,)

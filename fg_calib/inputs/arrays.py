@@ -70,7 +70,7 @@ def brief(of: object, names: Iterable[str]) -> str:
 
     Args:
         of: An object.
-        names: Those of its attributes that are shown.
+        names: Attributes to show.
     """
     parts = [f"{name}={_in_brief(getattr(of, name))}" for name in names]
     line = f"{type(of).__name__}({', '.join(parts)})"
@@ -139,7 +139,7 @@ def as_floats(name: str, given: object, shape: str, *, missing: bool = False) ->
         missing: Whether nan, or None, may stand for what is missing.
 
     Raises:
-        InputError: They are no numbers, of another shape, or not finite.
+        InputError: The values are no numbers, of another shape, or not finite.
     """
     floats = as_figures(name, given, f"numbers of shape {shape}")
     wanted = [word.strip() for word in shape.strip("()").split(",") if word.strip()]
@@ -156,7 +156,7 @@ def as_figures(name: str, given: object, expected: str) -> Floats:
     """Numbers from outside as an array of any shape, a copy; text that reads as a number is none.
 
     Raises:
-        InputError: They are no numbers.
+        InputError: The values are no numbers.
     """
     array = as_array(name, given, "iufO", expected)
     words = array.dtype.kind == "O" and any(isinstance(value, str | bytes | bool | np.bool_) for value in array.ravel())
@@ -183,7 +183,7 @@ def as_rotations(name: str, given: object, n: int) -> Floats:
     """N rotation matrices from outside, rounding taken off them, shape (n, 3, 3).
 
     Raises:
-        InputError: They are of another shape, or no rotations.
+        InputError: The values are of another shape, or no rotations.
     """
     R = as_floats(name, given, f"({n}, 3, 3)")
     off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
@@ -235,7 +235,7 @@ def as_array(name: str, given: object, kinds: str, expected: str) -> NDArray[Any
     """Anything as an array of one of numpy's `kinds`.
 
     Raises:
-        InputError: It is none.
+        InputError: The value is no such array.
     """
     if isinstance(given, np.ma.MaskedArray):
         raise InputError(name, "found a masked array", f"{expected}; nan where something was not measured")
@@ -289,7 +289,7 @@ def as_names(name: str, given: object, *, missing: bool = False) -> list[str | N
         missing: Whether None, nan or an empty word may stand for none, which is None then.
 
     Raises:
-        InputError: They are something else.
+        InputError: The values are neither words nor whole numbers.
     """
     found: list[str | None] = []
     listed = given if isinstance(given, list | tuple) else as_array(name, given, "iufUO", "names").tolist()
@@ -309,7 +309,7 @@ def shape_of(name: str, given: object, expected: str) -> tuple[int, ...]:
     """The shape of something from outside.
 
     Raises:
-        InputError: It has none: its rows are of different lengths.
+        InputError: The array has no shape: its rows are of different lengths.
     """
     return as_array(name, given, "iufObUS", expected).shape
 

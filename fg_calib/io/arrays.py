@@ -129,7 +129,7 @@ def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any
     """Columns of n rows that an array holds.
 
     Raises:
-        InputError: It has another shape, or holds something else.
+        InputError: The array has another shape, or holds something else.
     """
     first, shape = column.names[0], (n,) if len(column.names) == 1 else (n, len(column.names))
     if first == "cov_11":

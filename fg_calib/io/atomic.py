@@ -62,7 +62,7 @@ def decoded(content: bytes, name: str) -> str:
     """UTF-8 text, without a byte order mark.
 
     Raises:
-        InputError: It is something else; the message names the line and the byte.
+        InputError: The text is not UTF-8; the message names the line and the byte.
     """
     at, found = content.find(b"\0"), "a null character"
     if at < 0:
@@ -143,7 +143,7 @@ def require_writable(folder: Path) -> None:
     """Check that files can be written to a folder, which need not exist.
 
     Raises:
-        InputError: They cannot.
+        InputError: A file cannot be written.
     """
     fill_folder(folder, lambda _: None)
 

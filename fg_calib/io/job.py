@@ -154,7 +154,7 @@ def read_job(path: Path | str) -> Job:
         path: The job; the paths in it are relative to its folder.
 
     Raises:
-        InputError: It or a file that it names is missing or cannot be used.
+        InputError: The file, or one that it names, is missing or cannot be used.
     """
     path = Path(path)
     with noting_reads() as files:
@@ -339,7 +339,7 @@ def camera_in(given: Any, place: str, folder: Path) -> tuple[Camera | None, bool
         folder: Where a path starts.
 
     Raises:
-        InputError: It is no camera.
+        InputError: The entry is no camera.
     """
     given = whole_camera(given, folder)
     if given in (None, "fixed"):
@@ -385,7 +385,7 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
             their own. A mapping of DH rows is a robot file of its own: m and rad unless it states others.
 
     Raises:
-        InputError: It is neither, or does not describe a robot.
+        InputError: The entry is no path or mapping, or does not describe a robot.
     """
     if isinstance(given, dict):
         return robot_from_mapping({"units": units} | given if "urdf" in given else given, place, folder)
@@ -406,7 +406,7 @@ def pairing_of(given: Any, place: str = "pairing") -> Pairing:
     """A pairing: a strategy, or how many random pairs.
 
     Raises:
-        InputError: It is neither.
+        InputError: The entry is no pairing.
     """
     try:
         if isinstance(given, dict) and given.keys() <= {"random", "seed"}:
@@ -431,7 +431,7 @@ def joint_noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[flo
     """Sigma of each joint's readings, [rad] (prismatic: [m]), from one number for all or one a joint.
 
     Raises:
-        InputError: It is neither.
+        InputError: The entry is neither one number nor one a joint.
     """
     listed, n = isinstance(given, list), robot.n_joints
     sigmas = validate(_JointNoises, {"joint": given if listed else [given]}, place).joint * (1 if listed else n)

@@ -712,7 +712,7 @@ def require_no_input(folder: Path, path: Path | None, inputs: Mapping[str, str])
         inputs: What it was read from, by path relative to the job.
 
     Raises:
-        InputError: They would.
+        InputError: A file would be replaced.
     """
     files = set() if path is None else {(path.parent / name).resolve() for name in inputs}
     for name in RESULT_FILES:

@@ -288,7 +288,7 @@ def _numbers(joint: Element, child: str, attribute: str, default: str, place: st
     """An attribute of as many numbers as its default; only limits may be infinite.
 
     Raises:
-        InputError: It holds something else.
+        InputError: The attribute holds something else.
     """
     text, n = _attribute(joint, child, attribute, default), len(default.split())
     numbers = _figures(text)
@@ -504,7 +504,7 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
         folder: What the path of a URDF is relative to.
 
     Raises:
-        InputError: It does not describe a robot.
+        InputError: The mapping does not describe a robot.
     """
     if "urdf" in mapping:
         return _build_urdf(validate(_UrdfRobot, dict(mapping), place), place, folder)

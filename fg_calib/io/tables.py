@@ -166,7 +166,7 @@ class Table:
             columns: By known name, what the table calls a column.
 
         Raises:
-            InputError: It cannot be read, it has no rows, or `columns` does not fit.
+            InputError: The table cannot be read, it has no rows, or `columns` does not fit.
         """
         require_polars(name)
         is_file = isinstance(table, os.PathLike | str)
@@ -194,7 +194,7 @@ class Table:
         """Whether the table has columns that belong together.
 
         Raises:
-            InputError: It has some of them only.
+            InputError: The table has some of the columns only.
         """
         missing = [name for name in columns if name not in self.columns]
         if missing and len(missing) < len(columns):
@@ -290,7 +290,7 @@ def _read_file(path: Path) -> Table:
     """The columns of a Parquet file or a CSV.
 
     Raises:
-        InputError: It is missing, or is no table.
+        InputError: The file is missing, or is no table.
     """
     import polars as pl
 
@@ -307,7 +307,7 @@ def _read_csv(name: str, text: str) -> Table:
     """The cells of a CSV as texts, without blank rows; the header tells the separator.
 
     Raises:
-        InputError: It is empty, a quote is not closed on its line, or a row has more or fewer cells than the header.
+        InputError: The file is empty, a quote is not closed on its line, or a row's cells do not match the header.
     """
     import polars as pl
 
@@ -368,7 +368,7 @@ def _as_polars(table: Any, name: str) -> pl.DataFrame:
     """A frame of polars from one of polars or pandas, or from a mapping of columns; nan is an empty cell.
 
     Raises:
-        InputError: It is no table.
+        InputError: The frame is no table.
     """
     import polars as pl
     import polars.selectors as cs
@@ -403,7 +403,7 @@ def _one_line(name: str, what: str) -> Iterator[None]:
     """Errors of polars, and panics of its Rust, become one line.
 
     Raises:
-        InputError: It makes nothing of a table.
+        InputError: Polars cannot read a table.
     """
     import polars as pl
 
@@ -424,7 +424,7 @@ def require_own_csv(path: Path, beginning: bytes) -> None:
         beginning: How tables of that kind begin.
 
     Raises:
-        InputError: It cannot.
+        InputError: The table cannot be written.
     """
     if path.suffix.lower() != ".csv":
         raise InputError(str(path), f"ending {path.suffix!r}", ".csv")
@@ -786,7 +786,7 @@ def _read_pairs(
         noise: Sigmas where the table specifies none.
 
     Raises:
-        InputError: It lacks a column or holds a cell that cannot be used.
+        InputError: The table lacks a column or holds a cell that cannot be used.
     """
     lacking = [key for key in ("a", "b") if key not in table.columns]
     if lacking or not table.present("distance", "angle"):

@@ -84,7 +84,7 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
         place: The file, and the key in it unless `value` is the whole file; names the place in messages.
 
     Raises:
-        InputError: It does not fit; the first misfit is named, others are counted.
+        InputError: The value does not fit; the first misfit is named, others are counted.
     """
     try:
         with within(place):  # of types that check themselves
@@ -293,7 +293,7 @@ class Units:
             place: File and key, for messages.
 
         Raises:
-            InputError: It is so small that nothing can be weighted by it.
+            InputError: The sigma is so small that nothing can be weighted by it.
         """
         value = figure * self.factor(unit)
         if 0.0 < value < LEAST_SIZE:
@@ -318,7 +318,7 @@ def quantity(given: object, unit: str, units: Units | None, place: str) -> float
         place: File and key, for messages.
 
     Raises:
-        InputError: It is neither.
+        InputError: The value is neither a positive number nor one with a unit.
     """
     known = {"m": LENGTHS, "rad": ANGLES}.get(unit, {SCALES[unit].unit: 1.0 / SCALES[unit].factor})
     number, name = given, "" if units is None else units.name(unit)

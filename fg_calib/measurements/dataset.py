@@ -250,7 +250,7 @@ class Measurements(FrozenArrays):
         return found
 
     def with_values(self, values: Mapping[str, Floats]) -> Measurements:
-        """Replace measured values, by the names that `value` takes."""
+        """Copy with other measured values, by the names that `value` takes."""
         own: dict[str, Any] = {name: v for name, v in values.items() if hasattr(self, name)}
         return replace(self, **own, columns={**self.columns, **{k: v for k, v in values.items() if k not in own}})
 
@@ -264,7 +264,7 @@ def check_readings(readings: Floats, robot: Robot, name: str) -> None:
         name: What they are, for messages.
 
     Raises:
-        InputError: They are of more or fewer joints, or outside limits.
+        InputError: The readings are of more or fewer joints, or outside limits.
     """
     if readings.shape[1] != robot.n_joints:
         raise InputError(name, f"readings of {readings.shape[1]} joints", f"{robot.n_joints}, as {robot.name} has")

@@ -309,7 +309,7 @@ def check_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: 
         source: The table that they are from, for messages.
 
     Raises:
-        InputError: They are not, or differ by more than differences do.
+        InputError: The rows are not finite, or their derivatives differ by more than differences do.
     """
     place = f"{source}: kind {type(kind).__name__}"
     for name, array in zip(Rows._fields, checked_rows(kind, at, data, nuisances, source), strict=True):

@@ -179,7 +179,7 @@ class CustomMeasurements(Brief):
         """Configurations of each measurement, of so many that the table has, shape (n, ends).
 
         Raises:
-            InputError: They are at configurations that the table has not.
+            InputError: The measurements are at configurations that the table has not.
         """
         n = len(self.data)
         ends = np.arange(n_configurations)[:, None] if self.ends is None else self.ends.reshape(n, -1)
@@ -194,7 +194,7 @@ class CustomMeasurements(Brief):
         Their unknowns are in the frame of the table's measurements: one of the same name in another frame is another.
 
         Raises:
-            InputError: They are at configurations that the table has not.
+            InputError: The measurements are at configurations that the table has not.
         """
         m, n = table.measurements, len(self.data)
         fields: dict[str, Any] = {"ends": self.at(m.n_configurations), "source": m.source}
@@ -274,16 +274,16 @@ class Table(Brief):
         return self.model in PAIR_MODELS
 
     def by_itself(self) -> Table:
-        """Drop known places that none of its own rows is of."""
+        """Copy without known places that none of its own rows is of."""
         there = {name for labels in self.measurements.labels.values() for name in labels.names}
         return replace(self, known={name: place for name, place in self.known.items() if name in there})
 
     def all_train(self) -> Table:
-        """Take its test rows as train rows."""
+        """Copy with its test rows as train rows."""
         return self.tested_on(np.zeros(self.measurements.n_configurations, dtype=np.bool_))
 
     def tested_on(self, configurations: Booleans) -> Table:
-        """Take the measurements at some configurations as test rows, all others as train rows.
+        """Copy with the measurements at some configurations as test rows, all others as train rows.
 
         Args:
             configurations: True for those, shape (n_configurations,).

@@ -120,7 +120,7 @@ def at_nominal(problem: graph.Problem, before: Floats) -> tuple[graph.Problem, F
     """A problem and the parameter vector at which one asks what its rows, and those before, determine.
 
     Args:
-        problem: It.
+        problem: The problem.
         before: The parameter vector with frame, base and tool fitted, the arm at nominal; of an update where that
             started, which is as calibrated.
     """

@@ -62,7 +62,7 @@ class Identifiability(Brief):
         lost: Every null-space direction with its reason.
         with_fixed_known: The same where the parameters that the robot's file calls fixed are known; None if it calls
             none fixed, or if only the others were looked at anyway.
-        fixed: Those parameters.
+        fixed: The fixed parameters.
         missing: Small motions between neighbouring axes that the robot's convention has no parameter for.
     """
 

@@ -43,7 +43,7 @@ class RelativeGroup:
         parameters: Their names.
         relations: Directions in which they may move together with no effect on any measurement: the change of
             each, in [m] and [rad], the largest being 1 or -1.
-        keep: Those that the package would estimate; the others stay at nominal.
+        keep: Parameters that the package would estimate; the others stay at nominal.
     """
 
     parameters: tuple[str, ...]

@@ -174,7 +174,7 @@ def changes(old: Result, new: Result) -> list[dict[str, Any]]:
     """The parameters that one of two calibrations estimated: old, new, change, its sigma, and both over each other.
 
     Raises:
-        InputError: They are of different robots.
+        InputError: The calibrations are of different robots.
     """
     if [p.name for p in old.parameters] != [p.name for p in new.parameters]:
         raise InputError(new.robot, "other parameters", f"those of {old.robot}")

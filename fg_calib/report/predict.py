@@ -322,7 +322,7 @@ def require_commands(path: Path) -> None:
     """Check that a table of commands can be written: a CSV that is not there yet, or was written as one.
 
     Raises:
-        InputError: It cannot.
+        InputError: The table cannot be written.
     """
     require_own_csv(path, _COMMANDS_BEGIN)
 
@@ -344,7 +344,7 @@ def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, rob
         units: Of the figures.
 
     Raises:
-        InputError: It cannot be written, or is another file.
+        InputError: The table cannot be written, or is another file.
     """
     readings = correction.readings / [units.factor(joint.unit) for joint in robot.joints]
     columns: dict[str, Any] = {

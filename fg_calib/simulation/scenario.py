@@ -206,7 +206,7 @@ def _read(kind: Any, given: object, place: str, context: FileContext | None) -> 
     """Read a value as a type.
 
     Raises:
-        InputError: It does not fit.
+        InputError: The value does not fit.
     """
     return _fit(lambda: TypeAdapter(kind).validate_python(given, context=context), place)
 
@@ -255,7 +255,7 @@ def _require(fits: bool, place: str, found: str, expected: str) -> None:
     """Check the fields of a type of a scenario.
 
     Raises:
-        ValueError: They do not fit, for `_fit`.
+        ValueError: The fields do not fit, for `_fit`.
     """
     if not fits:
         raise ValueError(InputError(place, found, expected))
@@ -383,7 +383,7 @@ class TargetViews(Conditions):
         target: The reflector in the tool frame, shape (3,), [m].
         count: Number of configurations.
         axis: Where the reflector looks, in the tool frame, shape (3,).
-        acceptance: It returns light from within this angle of its axis, [rad].
+        acceptance: The reflector returns light from within this angle of its axis, [rad].
         distance: Smallest and largest distance from the tracker, [m].
         region: Where the reflector may be, in the base frame; None: anywhere.
     """

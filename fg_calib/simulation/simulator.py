@@ -188,7 +188,7 @@ class Measuring:
         """The sigma of a kind that the calibration is given.
 
         Raises:
-            InputError: It is 0.
+            InputError: The sigma is 0.
         """
         sigma = self._value(self.sigmas, kind)
         if sigma == 0.0:

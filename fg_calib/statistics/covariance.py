@@ -198,7 +198,7 @@ def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
 
     Args:
         solution: The solution.
-        spread: That of what was estimated.
+        spread: Covariance of what was estimated.
     """
     problem = solution.problem
     if problem.whole is None:

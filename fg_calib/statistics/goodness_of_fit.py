@@ -184,7 +184,7 @@ class PredictedFit(FrozenArrays):
         n_rows: Number of scalar rows.
         n: Number of them behind chi-square: evenly spaced ones if there are many to be whitened (`MAX_WHITENED`).
         n_measurements: Number of test measurements.
-        n_outliers: Those among them that count for nothing because a robust loss is to pass over outliers.
+        n_outliers: Test measurements that a robust loss passes over as outliers.
         n_unknown: Rows not judged because they depend on what neither data nor priors determine.
         chi2: Sum of the squares of the rows, whitened by their noise and by what the estimate may be off.
         expected: Its mean, were the noise as taken and the arm known as well as is claimed.
@@ -294,7 +294,7 @@ class JudgedRows:
 
     Attributes:
         table: All rows.
-        rows: Those that are judged.
+        rows: The judged rows.
         squares: Their squared residuals over sigma, by robust weight.
         means: Means of these.
         covariance: Of the residuals over sigma; None where that is not known.

@@ -75,7 +75,7 @@ class ResidualCovariance:
         return replace(self, M=np.block([[K, cross], [cross, np.zeros_like(K)]])[:n, :n])
 
     def split(self) -> ResidualCovariance:
-        """Move errors of more than one in `FEW` rows into the columns of P."""
+        """Copy with errors of more than one in `FEW` rows among the columns of P."""
         many = FEW * np.bincount(self.L.indices, minlength=self.L.shape[1]) > len(self.d)
         P, M = np.hstack([self.P, self.L[:, many].toarray()]), block_diag(self.M, np.eye(int(many.sum())))
         return ResidualCovariance(self.d, self.L[:, ~many], P, M)

@@ -85,8 +85,8 @@ class Instrument:
         kind: What it measures, of one configuration; those with several kinds override `kinds`.
         quantities: The data of its kinds, in their order; its generic columns if empty.
         columns: Columns besides those of every table.
-        labels: Those of names: what a row is of.
-        optional_labels: Those of `labels` whose cells may be empty.
+        labels: Columns of names: what a row is of.
+        optional_labels: Columns among `labels` whose cells may be empty.
         noise: Keys of `noise` that it needs.
         landmarks: What it depends on besides the arm, in the order of its kinds' nuisances.
         options: Fields of `Table` that say something to it alone.
@@ -177,7 +177,7 @@ class Instrument:
         """1 sigma of rows, in the order of `measured`.
 
         Raises:
-            ProblemError: It is not specified.
+            ProblemError: The sigma is not specified.
         """
         found = []
         for of in self.measured:
