@@ -370,10 +370,6 @@ class Calibration:
         if growth and days is None:
             raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
         table, inputs = self._rows(rows, pairs, like)
-        counted = {mark for run in history for mark in run.rows}
-        for one in table.tables:
-            if counted_before(one, counted):
-                raise InputError(one.measurements.source, "its rows are in the calibration already", "new rows")
         found = updated(
             self.calibrated,
             table,
@@ -408,7 +404,7 @@ class Calibration:
             with io.noting_reads() as files:
                 table = io.read_table_like(job, robot, path, pairs=of_pairs, like=like)
             inputs = {file.name: digest for file, digest in files.items()}
-            return Rows.of([table], [like or path.name], options), inputs
+            return self._not_counted(Rows.of([table], [like or path.name], options)), inputs
         if pairs is not None or like is not None:
             raise InputError("pairs" if pairs else "like", "given with rows that say it themselves", "none")
         new, inputs = io.read_job(given) if isinstance(given, Path | str) else given, {}
@@ -420,7 +416,19 @@ class Calibration:
         tables = tables_of(new, options)
         for one in tables:
             check_readings(one.measurements.readings, robot, one.measurements.source)
-        return Rows.of(tables, [one.measurements.source for one in tables], options), inputs
+        return self._not_counted(Rows.of(tables, [one.measurements.source for one in tables], options)), inputs
+
+    def _not_counted(self, rows: Rows) -> Rows:
+        """New rows of which none was fitted before.
+
+        Raises:
+            InputError: They are in the calibration already.
+        """
+        counted = {mark for run in (*self.result.history, self.result.run) for mark in run.rows}
+        for one in rows.tables:
+            if counted_before(one, counted):
+                raise InputError(one.measurements.source, "its rows are in the calibration already", "new rows")
+        return rows
 
     @property
     def solution(self) -> Solution:

@@ -57,7 +57,7 @@ def export(
         show_json(made.document())
     elif out is None:
         lines = made.text.removesuffix("\n").split("\n")
-        show("\n".join(escaped(line.expandtabs()) if sys.stdout.isatty() else line for line in lines))
+        show("\n".join(escaped(line.expandtabs()) if sys.stdout and sys.stdout.isatty() else line for line in lines))
     for note in made.notes:
         if as_json or out is not None or note not in made.text:
             say(note)

@@ -48,6 +48,9 @@ MAX_AT_ONCE, SAMPLE_SHARE = 200_000, 0.1
 SLOWEST = 0.9
 """Largest share of what is left to go that whitening anew is taken to leave each time, without end."""
 
+FULL_STEPS, MIN_SHARE = 20, 0.1
+"""Steps that are full ones, and the least share of later ones, where steps to rows whitened anew go in circles."""
+
 COARSE = 1.0
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
@@ -374,7 +377,7 @@ def _fit(problem: Problem, options: SolverOptions) -> _Fit:
     start = problem.variables.parameters(problem.variables.values(problem.start))  # what is held is at nominal
     if problem.options.loss != "none":
         problem = relinearized_at(problem, start, _learn(problem, start, weighting)[0])
-    here, converged, message = _Point(problem, start), False, ""
+    here, converged, message, share = _Point(problem, start), False, "", 1.0
     while not message and len(history) < options.max_iterations:
         was, near, there = here, here.decrement <= COARSE, here
         if not near and (found := here.descend(damping)) is not None:
@@ -382,12 +385,14 @@ def _fit(problem: Problem, options: SolverOptions) -> _Fit:
             history.append(_iteration(was, here, used))
             continue
         stepped = near and here.decrement > max(options.decrement, here.rounding)
-        there = here.after(here.system.step) if stepped else here
+        there = here.after(share * here.system.step) if stepped else here
         state, final = _learn(here.problem, there.parameters, weighting)
         here = _Point(relinearized_at(here.problem, there.parameters, state), there.parameters)
         left = here.decrement
         if stepped:  # each step leaves the same share of what was left, without end
             history.append(_iteration(was, here, 0.0))
+            circling = len(history) > FULL_STEPS and left > SLOWEST * was.decrement
+            share = max(MIN_SHARE, 0.5 * share) if circling else share
             left /= 1.0 - min(left / was.decrement, SLOWEST)
         tries = 0 if near else tries + 1
         if final and left <= max(options.decrement, here.rounding):

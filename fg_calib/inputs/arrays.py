@@ -25,9 +25,15 @@ class _AsLists:
     def __get_pydantic_core_schema__(self, *_: object) -> CoreSchema:
         """The schema of a field with this annotation."""
         return core_schema.no_info_plain_validator_function(
-            lambda value: value if isinstance(value, np.ndarray) else np.array(value, dtype=self._dtype),
+            self._read,
             serialization=core_schema.plain_serializer_function_ser_schema(_listed),
         )
+
+    def _read(self, value: Any) -> NDArray[Any]:
+        try:
+            return value if isinstance(value, np.ndarray) else np.array(value, dtype=self._dtype)
+        except (TypeError, OverflowError) as error:  # pydantic reports ValueError alone
+            raise ValueError(str(error)) from None
 
     def __get_pydantic_json_schema__(self, *_: object) -> dict[str, Any]:
         """The JSON schema of a field with this annotation."""

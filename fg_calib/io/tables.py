@@ -377,7 +377,8 @@ def _as_polars(table: Any, name: str) -> pl.DataFrame:
     if frame is None or not (isinstance(frame, Mapping | pl.DataFrame) or hasattr(frame, "to_dict")):
         raise InputError(name, f"found a {type(table).__name__}", "a path, or a frame of polars or pandas")
     if not isinstance(frame, pl.DataFrame):
-        columns = frame if isinstance(frame, Mapping) else frame.to_dict("list")
+        named = getattr(getattr(frame, "index", None), "name", None) is not None
+        columns = frame if isinstance(frame, Mapping) else (frame.reset_index() if named else frame).to_dict("list")
         check_different(name, columns)
         frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
     if not frame.columns:

@@ -322,7 +322,7 @@ def _limit_hint(readings: Floats, robot: Robot, joint: int, unit: str) -> str:
     far = max(low - readings.min(), readings.max() - high) > FAR * (high - low)
     if far and smaller and low <= size * readings.min() and size * readings.max() <= high:
         return f"is it in {smaller}?"
-    return "widen the joint's limits if the reading is right"
+    return "widen the joint's limits if the reading is right; are the columns in the joints' order?"
 
 
 def no_pairs(source: str) -> Pairs:

@@ -30,6 +30,9 @@ from fg_calib.statistics import TangentCovariance
 MAX_CONFIGURATIONS = 1000
 """Configurations up to which all are looked at; of more, as many evenly spaced."""
 
+MIN_JUDGED = 10
+"""Test configurations below which the train ones are looked at: a rigid fit takes up the errors of few."""
+
 _AT_ONCE = 2000
 """Configurations at once: derivatives of all would fill the memory."""
 
@@ -54,7 +57,7 @@ class ExpectedError:
     Attributes:
         base: In the base frame.
         fitted: After the best rigid fit.
-        at: Whether at the test configurations, or, where there are none, at the train ones.
+        at: Whether at the test configurations, or at the train ones where these are few.
         n: Number of configurations looked at.
         of: Number of configurations that there are.
         relative: Whether no measurement determines the base, so that `fitted` alone describes the measurements.
@@ -69,7 +72,7 @@ class ExpectedError:
 
 
 def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedError:
-    """Expected errors of the tool at the test configurations; where there are none, at the train configurations.
+    """Expected errors of the tool at the test configurations, or at the train ones where these are few.
 
     Args:
         problem: What was solved.
@@ -82,9 +85,10 @@ def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedE
 
 
 def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "train"]]:
-    """The test configurations of all tables, or, where there are none, the train ones; and which they are."""
+    """The test configurations of all tables, or the train ones where these are few; and which they are."""
     test = data.held_out
-    return np.flatnonzero(test if test.any() else ~test), "test" if test.any() else "train"
+    enough = test.sum() >= min(MIN_JUDGED, len(test) - test.sum())
+    return np.flatnonzero(test if enough else ~test), "test" if enough else "train"
 
 
 def _evenly(rows: Integers) -> Integers:

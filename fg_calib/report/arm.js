@@ -7,7 +7,7 @@
   const slider = document.getElementById("arm-slider"), words = document.getElementById("arm-words");
   const ramp = JSON.parse(canvas.dataset.ramp);
   const tip = item => item.links[item.links.length - 1];
-  const every = items.flatMap(item => [item.links[0], tip(item)]);
+  const every = items.flatMap(item => item.links);
   const mean = [0, 1, 2].map(i => every.reduce((sum, p) => sum + p[i], 0) / every.length);
   const reach = Math.max(1e-3, ...every.map(p => Math.hypot(...p.map((v, i) => v - mean[i]))));
   let azimuth = 0.7, elevation = 0.35, chosen = 0, dots = [];

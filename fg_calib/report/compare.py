@@ -301,7 +301,7 @@ def _rms_errors(found: Check) -> Table:
 def _explanations(explanations: Sequence[Explanation]) -> Table:
     rows = []
     for e in explanations:
-        word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "is not: distinguishable"
+        word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "no: these rows rule it out"
         several = list(zip(e.change, e.sigma, e.units, strict=True)) if len(e.change) < 3 else []
         change = ", ".join(f"{figure(c, unit, '+')} {tables.shown_in(unit).unit}" for c, _, unit in several)
         sigma = ", ".join(figure(s, unit) for _, s, unit in several)

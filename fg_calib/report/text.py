@@ -421,7 +421,8 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
     yield from _undetermined(solution, assessed)
     if not assessed.fit.residuals.split.any():
         yield "no test rows: the prediction of new configurations was not checked"
-    if np.any(assessed.fit.goodness.suspect & assessed.fit.residuals.used) and weights is None:
+    few = assessed.fit.goodness.gross is not None or not assessed.fit.chi_square.too_large
+    if few and np.any(assessed.fit.goodness.suspect & assessed.fit.residuals.used) and weights is None:
         yield "suspicious rows may be weighted down by a robust loss: loss in the job"
 
 

@@ -671,7 +671,7 @@ def _errors(given: Any, context: FileContext) -> Errors:
                 raise InputError("normal", f"{p.name} of the robot has no tolerance", "one for all that is estimated")
         return Errors("normal", {p.name: p.tolerance for p in context.robot.parameters if p.tolerance is not None})
     laws = ("uniform", "normal", "values")
-    given = refuse_unknown_keys(*laws)(given)
+    given = refuse_unknown_keys(*laws)(_read(dict[str, Any], given, "", context))
     law, values = _the_one_of({key: given.get(key) for key in laws})
     values = _read(dict[str, Number], values, law, context)
     values = {key: value * context.units.factor(unit_of(key)) for key, value in values.items()}

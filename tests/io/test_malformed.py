@@ -104,7 +104,7 @@ POSES = [
     ("q1,q2\n−0.5,0\n", "poses.csv:2: q1: found '−0.5', expected a finite number; its minus is another character, a dash; write -"),
     (XYZ + '0,0,"1,2,3\n1,1,1,1,1\n', 'poses.csv:2: a quote that is not closed, expected whole cells in quotes, or none'),
     (XYZ + "0,0,1,2,3\n\n0,0,x,2,3\n", "poses.csv:4: x: found 'x', expected a finite number"),
-    (XYZ + "180,0,1,2,3\n", "poses.csv:2: q1 = 180 rad is outside [-2, 2]; widen the joint's limits if the reading is right"),
+    (XYZ + "180,0,1,2,3\n", "poses.csv:2: q1 = 180 rad is outside [-2, 2]; widen the joint's limits if the reading is right; are the columns in the joints' order?"),
     ("q1,q2,id\n0,0,a\n0,0,a\n", "poses.csv:3: id: found 'a', expected different ids"),
     ("q1,q2,sigma_x,sigma_position\n0,0,1,1\n", "poses.csv: no column sigma_y, expected sigma_x sigma_y sigma_z together"),
     ("id,q1,q2\na,0,0\n#b,1,1\n", "poses.csv:3: id: found '#b', expected ids with # all or none; # does not comment a row out"),

@@ -6,7 +6,7 @@ import pytest
 from fg_calib import Robot
 from fg_calib.measurements.dataset import _limit_hint
 
-WIDEN = "widen the joint's limits if the reading is right"
+WIDEN = "widen the joint's limits if the reading is right; are the columns in the joints' order?"
 ROBOT = Robot.from_dh(np.zeros((2, 4)), types=["prismatic", "revolute"], limits=[(0.1, 0.9), (-1.2, 2.5)])
 
 

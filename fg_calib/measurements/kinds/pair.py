@@ -153,7 +153,8 @@ def usable_pairs(table: Table) -> Pairs:
 def missing_values(table: Table) -> list[str]:
     """A sentence on each quantity that the model needs and no measured pair of a table has."""
     pairs = table.measurements.pairs
-    lacking = [of for of in quantities_of(table.model) if pairs is not None and np.isnan(getattr(pairs, of.name)).all()]
+    there = pairs is not None and pairs.n_pairs > 0  # none of a table of contact points
+    lacking = [of for of in quantities_of(table.model) if there and np.isnan(getattr(pairs, of.name)).all()]
     of_table = f"{table.measurements.source}: no pair has a value of"
     return [f"{of_table} {of.name}; is a column misspelt? model: {of.other} needs none" for of in lacking]
 
