@@ -50,10 +50,10 @@ class Assessment(FrozenArrays):
         spread: The covariance in the tangent space of the variables that were estimated, the others taken as known.
         whole: The covariance in the tangent space of all parameters, those left out included.
         fit: Chi-square, residuals, goodness of fit and corrections against prior sigmas.
-        identifiability: What the data alone determine, at the nominal parameters.
+        identifiability: Identifiability by the data alone, at the nominal parameters.
         verdict: Whether the result is to be trusted, and what its reader should know.
         expected_error: Of the tool, by the covariance; None where the arm was evaluated as it is.
-        acceptance: What became of the limits that its user set; None without any.
+        acceptance: Outcome of the limits that its user set; None without any.
         cross_validation: Held-out residuals and spread of the estimates; None where it was not asked for.
     """
 
@@ -75,7 +75,7 @@ class Assessment(FrozenArrays):
 
         Args:
             others: Held-out measurements, by table and kind of noise.
-            solution: What was assessed.
+            solution: The assessed solution.
         """
         tested = self.fit.residuals.held_out(solution.problem.data.labels)
         kinds = {held.kind for held in tested}

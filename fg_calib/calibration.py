@@ -84,9 +84,9 @@ def calibrate(
 
     Args:
         robot: The nominal robot.
-        measurements: What was measured: a table, or several; those that are no `Table` are understood as the options
+        measurements: A table, or several; those that are no `Table` are understood as the options
             say. With `estimate_noise` sigmas that are not specified start at 1 mm and 1 mrad.
-        options: What is estimated from what.
+        options: The options.
         executor: Where folds are calibrated, such as `local_processes(4)`; in this process if None.
         choices: Instead of `options`, any of theirs as keywords: model, frame, pairing, loss, ...
 
@@ -320,7 +320,7 @@ class Calibration:
             rows: A table like the calibration's (a file, or measurements), or a job with several.
             limit: The largest RMS error of positions, or of distances where there are no others, [m]; those of the
                 job's `accept` if None.
-            limit_angle: The same of orientations, or angles, [rad].
+            limit_angle: Limit of orientations, or angles, [rad].
             pairs: Table of pairs that were measured directly.
             like: Of which of the job's tables that is, where it has several.
 

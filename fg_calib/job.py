@@ -18,7 +18,7 @@ class Job(Brief):
     Attributes:
         path: The job's file; None of a job that is in none.
         robot: The robot as it is before the calibration.
-        measurements: What was measured: one table, understood as the options say, or several.
+        measurements: One table, understood as the options say, or several.
         options: Every choice.
         truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.

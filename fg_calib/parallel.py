@@ -48,7 +48,7 @@ def tell(what: str, done: int = 0, of: int = 0) -> None:
     """Report progress to the listener.
 
     Args:
-        what: What is being done, in a few words.
+        what: Task in a few words.
         done: Number of finished parts.
         of: Number of all parts; 0 where it is unknown.
     """
@@ -139,7 +139,7 @@ def require_polars(place: str) -> None:
     """Check that polars works here: in a fork of a process that has loaded it, it waits for threads without end.
 
     Args:
-        place: What is read or written, for messages.
+        place: File that is read or written, for messages.
 
     Raises:
         InputError: Polars does not work here.
@@ -180,7 +180,7 @@ def map_jobs(
         jobs: Any number of picklable objects.
         executor: Where: `local_processes(n)`, `dask_executor(address)`, or any other; this process if None.
         names: Name of each job, for failures; `job 1`, `job 2`, ... if None.
-        what: What is being done, for the listener to progress.
+        what: Task in words, for the listener to progress.
 
     Returns:
         What the function returned, or a failure, in the order of the jobs.

@@ -58,7 +58,7 @@ class PoseError(Brief):
         max: Largest distance between estimated and true tool point, [m].
         mean: Mean of the distances, [m].
         rms: Root of the mean square of the distances, [m].
-        orientation_rms: The same of the angles between estimated and true orientation, [rad].
+        orientation_rms: RMS of the angles between estimated and true orientation, [rad].
     """
 
     max: float

@@ -106,7 +106,7 @@ def fit_least_squares(
 
     Args:
         robot: The nominal robot; its prior sigmas are not used.
-        data: What was measured: all tables of a calibration with their landmarks (see `measurements.build_dataset`).
+        data: All tables of a calibration with their landmarks (see `measurements.build_dataset`).
         names: The parameters to estimate; all that the robot's file lets be estimated if None. With more than the
             measurements determine every step is a minimum-norm step.
         start: Values to start from, as `Problem.start`: see `LeastSquares.parameters`. Nominal values, the identity and

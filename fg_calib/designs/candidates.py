@@ -55,8 +55,8 @@ class Pool(Brief):
     """Candidate poses.
 
     Attributes:
-        scenario: What measures; None where rows of tables are chosen.
-        tables: What it would measure at all candidates.
+        scenario: The instruments; None where rows of tables are chosen.
+        tables: Tables that it would measure at all candidates.
         problem: The problem of these tables.
         readings: Of each pose, shape (n_poses, n_joints), [rad] (prismatic: [m]).
         pose_of: The pose of each configuration of the problem, shape (n_configurations,); `REFERENCE` or `NONE`.

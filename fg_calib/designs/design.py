@@ -60,9 +60,9 @@ class Design(FrozenArrays):
 
     Attributes:
         pool: The candidates.
-        tables: What is to be measured, in order. An instrument of which no pose was chosen has none.
-        criterion: By which criterion.
-        task: What the calibration is for.
+        tables: Tables to measure, in order. An instrument of which no pose was chosen has none.
+        criterion: The criterion.
+        task: Purpose of the calibration.
         readings: The configurations in the order in which to visit them, reference poses first, shape (n, n_joints),
             [rad] (prismatic: [m]).
         ids: Their names: those of chosen rows of a job, else s1, s2, ... after such names of the job, shape (n,).
@@ -76,7 +76,7 @@ class Design(FrozenArrays):
         asked: Number of poses that was asked for; None with a target.
         target: Expected position error that was asked for, [m]; None with a number.
         reached: Whether the target is reached.
-        observability: What the rows determine of the arm; its `lost` are the directions that stay undetermined.
+        observability: Observability of the arm by the rows; its `lost` are the directions that stay undetermined.
         unknown: Share of the task that no candidate determines.
         travel: Joint travel along the configurations, [rad].
         travel_before: Joint travel in the order in which they were chosen, [rad].
@@ -137,7 +137,7 @@ def design(
             job: what was measured counts already, and more is to be measured by the same instruments.
         n: Number of poses; as many as reach the target if None.
         target: Expected RMS position error over the task that is to be reached, [m].
-        criterion: What is minimised: `I` the mean square error over the task, or D, A, E, O1 to O5.
+        criterion: Minimised value: `I` the mean square error over the task, or D, A, E, O1 to O5.
         n_candidates: Number of candidates to draw; of a table all are candidates.
         candidates: Where to measure instead: configurations, or with a job `"rows"`, to choose among its train rows.
         given: With a scenario: readings of poses that were measured already, or will be anyway, shape (n, n_joints).
@@ -150,7 +150,7 @@ def design(
 
     Raises:
         InputError: A value makes no sense, or nothing can be measured from anywhere.
-        ProblemError: What would be measured determines nothing.
+        ProblemError: The measurements would determine nothing.
     """
     _check_values(n, target, n_candidates, lever, seed)
     given, task = (_check_readings(name, q, of.robot) for name, q in (("given", given), ("task", task)))

@@ -162,7 +162,7 @@ class System(FrozenArrays):
         task: W, of which `tr(W C)` is the mean square error of the task, C the covariance, shape (n, n).
         core: P, functions of the arm's parameters that can be determined, orthonormal in changes of ordinary size,
             shape (p, n).
-        basis: What is determined, in the columns of rows, shape (n_columns, n).
+        basis: Determined directions, in the columns of rows, shape (n_columns, n).
         unknown: Share of the task's mean square that no candidate determines, in [0, 1].
     """
 

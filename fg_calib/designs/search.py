@@ -98,7 +98,7 @@ class Chooser:
 
     Args:
         system: The candidates.
-        criterion: What is minimised.
+        criterion: Minimised value.
         error: Expected RMS error with some candidates, [m], where the system does not give it; inf if not determined.
     """
 

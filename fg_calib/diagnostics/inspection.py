@@ -128,7 +128,7 @@ class Inspection(Brief):
         joints: The ranges of the readings.
         setups: Typical residuals of each table before calibration, and a mistake in its set-up if one explains them.
         disagreements: Measurements that disagree with the others, the farthest first.
-        identifiability: What the train rows determine, at nominal.
+        identifiability: Identifiability by the train rows, at nominal.
         expected_error: How far off the calibrated tool is expected to be; None where the arm is only evaluated.
         n_residuals: Scalar residuals of the fit.
         n_priors: Scalar priors.

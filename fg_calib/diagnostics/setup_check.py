@@ -120,11 +120,11 @@ def check_setup(
 
     Args:
         robot: The nominal robot; the estimated parameters of its base and tool are fitted.
-        measurements: What was measured; train rows are looked at.
+        measurements: The measured values; train rows are looked at.
         model: Which measurements take part.
         frame: Whether the measurement frame is known.
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
-        table: What else is known of the table: targets and anchors, an offset, a camera.
+        table: Other knowledge of the table: targets and anchors, an offset, a camera.
 
     Note:
         Models with landmarks (anchors, planes, boards) and targets are looked at only where `doubtful`: these have to

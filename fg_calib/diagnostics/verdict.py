@@ -84,11 +84,11 @@ class Verdict:
     Attributes:
         errors: Why it is not to be trusted; empty if it is.
         warnings: Why sigmas may be too small although it is.
-        notes: What else its reader should know.
+        notes: Other notes for its reader.
         setup: The set-up, by residuals before the calibration.
         noise_like: P-value of residuals as systematic as these by noise alone; None where that was not tested, because
             they are as small as specified, or cannot be told.
-        change: What moved while a table was measured; None if nothing did.
+        change: Change while a table was measured; None if nothing did.
     """
 
     errors: tuple[str, ...]
@@ -112,8 +112,8 @@ class Case:
         solution: The solution.
         spread: The covariance of what was estimated.
         fit: How well it fits.
-        missing: What the robot's convention has no parameter for.
-        change: What moved while a table was measured.
+        missing: Motions that the robot's convention has no parameter for.
+        change: Change while a table was measured.
         noise_like: See `Verdict`.
         setup: The set-up, which is checked after all else.
     """
@@ -159,7 +159,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         solution: The solution.
         spread: The covariance of what was estimated.
         fit: How well it fits.
-        missing: What the robot's convention has no parameter for.
+        missing: Motions that the robot's convention has no parameter for.
     """
     problem, verdicts = solution.problem, {kind.verdict for kind in fit.goodness.kinds}
     tested = not problem.evaluated and ("too small" in verdicts or solution.estimated_noise is not None)

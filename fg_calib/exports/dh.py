@@ -400,7 +400,7 @@ def errors(found: Robot, wanted: Robot, readings: Floats, zeros: Floats | None =
         found: The one.
         wanted: The other.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
-        zeros: What is added to the readings of the first, shape (n_joints,).
+        zeros: Offsets of the readings of the first, shape (n_joints,).
     """
     miss = _miss(poses(found, readings if zeros is None else readings + zeros), poses(wanted, readings))
     turn, shift = (np.linalg.norm(part, axis=1) for part in (miss[:, :3], miss[:, 3:]))

@@ -60,8 +60,8 @@ class Export:
     Attributes:
         to: The format.
         robot: The arm's name.
-        text: What the file holds.
-        notes: What the format could not hold and where it is instead, and what else one has to know: a line each.
+        text: Content of the file.
+        notes: Notes on what the format could not hold, where it is instead, and the like: a line each.
         findings: Why the calibration is not to be trusted; empty if it is, or of a robot.
         not_accepted: The limits of `accept` that it does not keep to.
         details: The same as figures: see `document`.

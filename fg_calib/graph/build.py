@@ -61,8 +61,8 @@ def build_problem(
 
     Args:
         robot: The nominal robot.
-        measurements: What was measured: a table, or several; those that are no `Table` are understood as `options` say.
-        options: What is estimated from what.
+        measurements: A table, or several; those that are no `Table` are understood as `options` say.
+        options: The options.
         choices: Instead of `options`, any of theirs as keywords.
 
     Raises:
@@ -86,8 +86,8 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
 
     Args:
         robot: The nominal robot.
-        tables: What was measured.
-        options: What is estimated from what.
+        tables: The tables.
+        options: The options.
 
     Raises:
         InputError: An option is not one of those possible.
@@ -207,7 +207,7 @@ def true_problem(
 
     Args:
         robot: The robot.
-        tables: What it would measure, without noise.
+        tables: Tables that it would measure, without noise.
         options: Whether pairs share errors; the tables' own choices count for the rest.
         places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
     """

@@ -85,7 +85,7 @@ class Knowledge(FrozenArrays):
 
         Args:
             robot: The arm where they were linearised.
-            unknowns: What stays with it.
+            unknowns: Landmarks that stay with it.
             at: Where that was.
             A: Derivatives, shape (m, n_columns + len(at)).
             b: Residuals, shape (m,).

@@ -173,7 +173,7 @@ class RowNoise:
 
         Args:
             rows: The measurements.
-            W: What their rows are multiplied by, shape (m, residual_dim, residual_dim); nothing if None.
+            W: Matrix that multiplies their rows, shape (m, residual_dim, residual_dim); nothing if None.
             chosen: Which of the entries of `loading` are wanted, of a shape that goes with its rows; all if None.
         """
         G = self.loading[rows] if chosen is None else np.where(chosen, self.loading[rows], 0.0)

@@ -87,7 +87,7 @@ class Eliminated(Brief):
     """A linear system with its landmark columns eliminated by QR.
 
     Attributes:
-        own: What the landmark columns can explain of the right-hand side, shape (rank,).
+        own: Part of the right-hand side that the landmark columns can explain, shape (rank,).
         A: The core's columns, minus what the landmark columns can explain of them, shape (m, n_core).
         b: The right-hand side, minus the same, shape (m,).
         follow: How the landmarks follow the core, shape (n_landmarks, n_core).

@@ -40,7 +40,7 @@ class Problem(FrozenArrays):
     Attributes:
         robot: The nominal robot.
         data: Everything measured.
-        options: What is estimated from what.
+        options: The options.
         variables: The GTSAM variables and their columns.
         start: Initial parameter vector (see `Variables`).
         state: Estimated noise.
@@ -49,7 +49,7 @@ class Problem(FrozenArrays):
         added: Factors that a user added to `graph`.
         evaluated: Whether there are test rows alone: the arm is taken as it is, and measurement frame, base and tool,
             where they are estimated, are fitted to these.
-        knowledge: What earlier rows say of the arm; None without any.
+        knowledge: Information of earlier rows about the arm; None without any.
     """
 
     robot: Robot
@@ -274,7 +274,7 @@ def with_factors(problem: Problem, start: Floats, state: NoiseState | None = Non
         problem: The problem, of which the rows are made anew.
         start: The parameter vector.
         state: Estimated noise; None for what the problem has.
-        changes: What else of the problem is to change.
+        changes: Other changes of the problem.
     """
     p = replace(problem, start=start, state=state or problem.state, **changes)
     given = p.state.weights
@@ -327,7 +327,7 @@ def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
     Args:
         robot: The nominal robot.
         data: The tables.
-        variables: What is estimated.
+        variables: Variables to estimate.
 
     Raises:
         ProblemError: No image shows enough of a board.

@@ -112,7 +112,7 @@ class Effect:
     """Efficiency of a robust loss on Gaussian residuals.
 
     Attributes:
-        variance: What the covariance from weighted rows is multiplied by to be that of the estimate.
+        variance: Factor from the covariance by weighted rows to that of the estimate.
         chi2: Mean of weight * e^2 over h of a measurement that keeps at least half its weight.
     """
 

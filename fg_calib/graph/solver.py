@@ -94,7 +94,7 @@ class ToleranceScale:
     """A factor on the tolerances specified of a group of parameters, estimated with them.
 
     Attributes:
-        group: What shares the scale: `a`, `theta`, `tool`; or a joint's name.
+        group: Parameters that share the scale: `a`, `theta`, `tool`; or a joint's name.
         parameters: The parameters.
         scale: Tolerance estimated over tolerance specified.
         low: Lower end of its 95 % interval.
@@ -116,7 +116,7 @@ class ToleranceScales(FrozenArrays):
 
     Attributes:
         scales: Group by group.
-        added: What not knowing them adds to the covariance of the estimate, shape (n_columns, n_columns).
+        added: Added covariance of the estimate by not knowing them, shape (n_columns, n_columns).
     """
 
     scales: tuple[ToleranceScale, ...]
@@ -136,7 +136,7 @@ class Solution(FrozenArrays):
         history: Its steps.
         initial_cost: Cost at `before`.
         cost: Cost at the estimate, whatever the loss.
-        weighted_cost: The same with every measurement by its robust weight.
+        weighted_cost: The cost with every measurement by its robust weight.
         seconds: Time taken.
         estimated_noise: Tables and kinds whose noise was estimated; None where it was taken as specified.
         estimated_tolerances: Scales on the robot's tolerances; None where they are taken as specified.

@@ -54,7 +54,7 @@ class Source:
         topic: Its topic.
         type: Type of its messages.
         lag: Median of the time of receipt minus the stamp, [s]: latency, and the offset of the two clocks.
-        notes: What was left out or put in order, in words.
+        notes: Notes on rows left out or reordered.
     """
 
     topic: str

@@ -95,7 +95,7 @@ class CalibrationBoard(Schema):
             rows with a white square.
         upright: Whether the camera never turned more than a quarter turn about its axis between images, seen from the
             first one: this orients a checkerboard that looks the same after half a turn.
-        name: What the board is called in a column `board`; without a name there is no such column.
+        name: Name of the board in a column `board`; without a name there is no such column.
         units: Of its file.
     """
 
@@ -345,7 +345,7 @@ class Corners(NamedTuple):
     """Corners found in an image.
 
     Attributes:
-        name: What the image is called.
+        name: Name of the image.
         corners: Which corners of the board, shape (n,).
         uv: Where they are seen, shape (n, 2), [px].
     """
@@ -360,7 +360,7 @@ class View:
     """A board in an image.
 
     Attributes:
-        name: What the image is called.
+        name: Name of the image.
         corners: Which of its corners are seen, shape (n,).
         uv: Where, shape (n, 2), [px].
         rotation: Its axes in the camera's frame, camera_R_board, shape (3, 3).

@@ -47,7 +47,7 @@ def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None
     """Every camera_T_board that explains the image of a board's points, the best first.
 
     Args:
-        camera: What the camera does to what it sees.
+        camera: The camera's model.
         image: u and v, [px], and where the point is on the board, x and y, [m], shape (n, 4).
         sigma: 1 sigma of u and v, shape (n, 2), [px]; 1 pixel if None.
 

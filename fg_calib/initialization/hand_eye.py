@@ -78,7 +78,7 @@ def start_from_poses(
         flange: base_T_flange at the nominal parameters: rotations (n, 3, 3), translations (n, 3), [m].
         measured: world_T_tool: rotations (n, 3, 3) and positions (n, 3), either None where not measured.
         nominal: world_T_base and flange_T_tool as they are known so far.
-        unknown: What is to be found.
+        unknown: Unknowns to find.
     """
     X, T = nominal
     R_F, p_F = (v[:MAX_ROWS] for v in flange)
@@ -106,7 +106,7 @@ def start_from_most_poses(
         flange: base_T_flange at the nominal parameters: rotations (n, 3, 3), translations (n, 3), [m].
         choices: world_T_tool: rotations (n, k, 3, 3) and positions (n, k, 3), the likeliest of each first.
         nominal: world_T_base and flange_T_tool as they are known so far.
-        unknown: What is to be found.
+        unknown: Unknowns to find.
     """
     (R_F, p_F), (R_M, p_M) = ((v[:MAX_ROWS] for v in each) for each in (flange, choices))
     n = np.arange(len(R_F))

@@ -166,7 +166,7 @@ def check(key: str, value: object, possible: Any) -> Any:
 
     Args:
         key: Its name, for the message.
-        value: What was given.
+        value: The given value.
         possible: A `Literal`, or the values themselves.
 
     Raises:
@@ -191,7 +191,7 @@ def check_number(
 
     Args:
         key: Its name, for the message.
-        value: What was given.
+        value: The given value.
         least: The smallest number possible.
         above: Whether it must be above that.
         whole: Whether it must be a whole number.
@@ -221,7 +221,7 @@ def check_names(key: str, names: Iterable[str], known: Sequence[str], what: str 
         key: The list's name, for the message.
         names: The names given.
         known: Possible names.
-        what: What they are names of.
+        what: Kind of the names.
 
     Raises:
         InputError: The list is one word, or a name is not known.

@@ -139,7 +139,7 @@ def as_floats(name: str, given: object, shape: str, *, missing: bool = False) ->
     """Numbers from outside as an array, a copy wherever the caller could change it.
 
     Args:
-        name: What they are, for messages.
+        name: Name in messages.
         given: Numbers, sequences or arrays of them.
         shape: The shape wanted, such as `(n, 3)`: letters are any number of rows.
         missing: Whether nan, or None, may stand for what is missing.
@@ -290,7 +290,7 @@ def as_names(name: str, given: object, *, missing: bool = False) -> list[str | N
     """Names from outside: words, or whole numbers as words.
 
     Args:
-        name: What they are, for messages.
+        name: Name in messages.
         given: The names.
         missing: Whether None, nan or an empty word may stand for none, which is None then.
 

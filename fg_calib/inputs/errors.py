@@ -36,8 +36,8 @@ class InputError(CalibrationError):
 
     Args:
         place: File, with row or key where there is one: `poses.csv:17`, `robot.yaml: joints[2].a`.
-        found: What stands there.
-        expected: What should stand there.
+        found: Value found there.
+        expected: Value expected there.
         hint: A likely cause or remedy, where there is one.
     """
 

@@ -120,7 +120,7 @@ class Options:
         pairing: How pairs are formed from poses where none were measured directly.
         frame: Whether the measurement frame is known to be the base, or world_T_base is estimated too; of no meaning
             for models of pairs.
-        gauge: What holds the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
+        gauge: How to fix the directions that the data do not determine. `prior`: the tolerances. `none`: nothing;
             everything is estimated by minimum-norm steps, and what is not determined has no sigma. `keep`: only
             the independent parameters and those kept of each relative group are estimated, without priors, the
             others stay at nominal (the paper's way); what is said of errors counts them with their tolerance.
@@ -128,7 +128,7 @@ class Options:
         pair_errors: Whether pairs share the errors of their configurations or count as independent.
         encoder: `propagated`: the noise of joint readings is added to that of the rows, to first order. `estimated`:
             the true joint values of every configuration are estimated too, with the readings as their priors.
-        loss: What becomes of large residuals: `none` or a robust loss (see `graph.robust`).
+        loss: Treatment of large residuals: `none` or a robust loss (see `graph.robust`).
         estimate_noise: Whether the sigmas specified are only a start, and scaled to what is seen.
         estimate_tolerance: Whether the robot's tolerances are only a start, and scaled to the corrections seen: one
             scale for each kind of parameters, or each joint; None if they are taken as specified.

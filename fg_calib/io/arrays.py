@@ -69,7 +69,7 @@ def read_arrays(
             measured), `sigma_...` each, `test`.
         sigma_joint: 1 sigma of the readings: one for all, or one a joint.
         source: Name of the measurements, for messages.
-        arrays: What was measured, its 1 sigma (one for all, an axis each, a row each, or all), and what it is of.
+        arrays: Measured values, their 1 sigma (one for all, an axis each, a row each, or all), and what it is of.
 
     These are the columns of a table, under their names, and
 

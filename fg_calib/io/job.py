@@ -334,7 +334,7 @@ def camera_in(given: Any, place: str, folder: Path) -> tuple[Camera | None, bool
     """A camera, and whether it stands in the room.
 
     Args:
-        given: What `whole_camera` takes; a mapping may say `fixed: true`. Or `fixed` alone, or None.
+        given: Argument of `whole_camera`; a mapping may say `fixed: true`. Or `fixed` alone, or None.
         place: File and key, for messages.
         folder: Where a path starts.
 

@@ -304,7 +304,7 @@ class Result(Section):
             job: The document of the job, to read tables like its own.
             date: When its rows were measured; now if None.
             history: The runs before it.
-            notes: What a reader should know besides, a sentence each.
+            notes: Notes for a reader, a sentence each.
         """
         problem = solution.problem
         data, urdf, frames = problem.data, problem.robot.urdf, problem.variables.frames
@@ -709,7 +709,7 @@ def require_no_input(folder: Path, path: Path | None, inputs: Mapping[str, str])
     Args:
         folder: Where to.
         path: The job's file, if there is one.
-        inputs: What it was read from, by path relative to the job.
+        inputs: Files that it was read from, by path relative to the job.
 
     Raises:
         InputError: A file would be replaced.

@@ -501,7 +501,7 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
     Args:
         mapping: The mapping: with `urdf`, or with `convention` and `joints`.
         place: Its file, and its key there if it is not the whole file.
-        folder: What the path of a URDF is relative to.
+        folder: Folder that the path of a URDF is relative to.
 
     Raises:
         InputError: The mapping does not describe a robot.

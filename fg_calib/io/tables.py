@@ -160,7 +160,7 @@ class Table:
 
         Args:
             table: The file, or a frame of polars or pandas, or a mapping of columns.
-            name: What a frame is called in messages.
+            name: Name of a frame in messages.
             known: Names of columns that have a meaning, also if written in another case; None if none has.
             joints: Names that the robot gives to columns.
             columns: By known name, what the table calls a column.

@@ -79,8 +79,8 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
     """`value` as a `schema`.
 
     Args:
-        schema: What it should be.
-        value: What a YAML file holds.
+        schema: Expected type.
+        value: Value in a YAML file.
         place: The file, and the key in it unless `value` is the whole file; names the place in messages.
 
     Raises:
@@ -289,7 +289,7 @@ class Units:
 
         Args:
             figure: As the file has it.
-            unit: What it is in inside the program.
+            unit: Its unit inside the program.
             place: File and key, for messages.
 
         Raises:
@@ -312,7 +312,7 @@ def quantity(given: object, unit: str, units: Units | None, place: str) -> float
     """A positive figure in [m] or [rad] from a number in the file's units, or from text with its own: `0.5 mm`.
 
     Args:
-        given: What the file holds.
+        given: Value in the file.
         unit: `m`, `rad`, or another of `SCALES`.
         units: Of the file; None where a figure must have its own.
         place: File and key, for messages.

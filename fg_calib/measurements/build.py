@@ -36,7 +36,7 @@ class Dataset(Brief):
     Attributes:
         tables: The tables.
         blocks: Their measurements, kind by kind.
-        landmarks: What the blocks depend on besides the arm.
+        landmarks: Landmarks that the blocks depend on.
         places: Of each table, its configurations among those of all tables, shape (n_configurations,) each.
         names: Name of each configuration, then of each landmark.
     """
@@ -253,7 +253,7 @@ def blocks_of(table: Table, number: int, landmarks: Landmarks) -> list[Measureme
     Args:
         table: The table.
         number: Its number.
-        landmarks: What they depend on is added here.
+        landmarks: Landmarks, to which those of the blocks are added.
 
     Raises:
         ProblemError: The table lacks what its model needs, or a sigma.

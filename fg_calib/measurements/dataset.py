@@ -175,14 +175,14 @@ class Measurements(FrozenArrays):
         source: File name, for messages.
         groups: Which configurations touched the same point; None if none did.
         named: Whether the names were given, so that another table may have the same configurations.
-        roll_pitch_yaw: What `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
-        labels: What the rows are of, by `target`, `station`, `anchor`, `plane` or `board`, where that was said.
+        roll_pitch_yaw: Angles that `rotation` was read from, shape (n_configurations, 3), [rad]; None for quaternions.
+        labels: Names in the rows, by `target`, `station`, `anchor`, `plane` or `board`, where that was said.
         image: Where a point of the row's board was seen, u and v, [px], and where it is on the board, x and y, [m],
             shape (n_configurations, 4); None where nothing was.
         covariance: Of a board's measured pose, about and along the camera's axes, shape (n_configurations, 6, 6), [rad]
             and [m]; None where sigmas say it.
         part: Which rows of a table these are, shape (n_configurations,); None where they are all.
-        columns: What else was measured, by column, shape (n_configurations,) each, nan where it was not: `distance` to
+        columns: Other measured values, by column, shape (n_configurations,) each, nan where it was not: `distance` to
             the row's anchor, or from its plane, [m].
         sigmas: 1 sigma of these, by the same names, and of `point`, a touch, per axis, [m], nan where it is not
             specified; and of `pixel`, along u and v, shape (n_configurations, 2), [px].
@@ -261,7 +261,7 @@ def check_readings(readings: Floats, robot: Robot, name: str) -> None:
     Args:
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
         robot: The robot.
-        name: What they are, for messages.
+        name: Name in messages.
 
     Raises:
         InputError: The readings are of more or fewer joints, or outside limits.
@@ -283,9 +283,9 @@ def check_limits(
     Args:
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
         robot: The robot.
-        names: What the joints are called.
-        place: What a row is called in messages.
-        shown: What rad and m are shown in: a unit and its size.
+        names: Names of the joints.
+        place: Name of a row in messages.
+        shown: Units that rad and m are shown in, with their sizes.
 
     Raises:
         InputError: One is outside.

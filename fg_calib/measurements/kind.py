@@ -49,7 +49,7 @@ class Kind(ABC):
     """One kind of measurement.
 
     Attributes:
-        names: What its rows are called, such as `position.x`: kind of noise, then component.
+        names: Names of its rows, such as `position.x`: kind of noise, then component.
         units: Unit of each row, `m`, `rad` or `px`.
         ends: Configurations of one measurement: 1, 2, or 0 if it is of nuisances alone.
         residual_dim: Rows of residual.
@@ -79,7 +79,7 @@ class Kind(ABC):
 
         Args:
             at: Tool frames of the ends.
-            data: What was measured, shape (n, width).
+            data: Measured values, shape (n, width).
             nuisances: Their values, shape (n, n_nuisances).
         """
 
@@ -277,7 +277,7 @@ def checked_rows(
     Args:
         kind: The kind.
         at: Tool frames of the measurements.
-        data: What was measured.
+        data: Measured values.
         nuisances: Values of the nuisances.
         source: The table that they are from, for messages.
 
@@ -304,7 +304,7 @@ def check_rows(kind: Kind, at: Frames, data: Floats, nuisances: Floats, source: 
     Args:
         kind: The kind.
         at: Tool frames of some measurements.
-        data: What was measured.
+        data: Measured values.
         nuisances: Values of the nuisances.
         source: The table that they are from, for messages.
 

@@ -21,8 +21,8 @@ class LandmarkKind:
 
     Attributes:
         letter: Letter of its GTSAM symbols, and of its name in `result.json`.
-        name: What one is called: `target`, `anchor`.
-        description: What all of them are called where they explain a null-space direction.
+        name: Name of one: `target`, `anchor`.
+        description: Name of all where they explain a null-space direction.
         heading: Of its table in reports, with frame and unit; empty where reports do not show it.
         units: `m` or `rad` of each coordinate.
         key: Key of a job that may say where they are; empty where none does.
@@ -89,7 +89,7 @@ class Landmark:
 
     Attributes:
         kind: What it is.
-        name: What it is called.
+        name: Its name.
         start: Where it is started, or is said to be, shape (size,); nan where the measurements are to say it.
         tolerance: 1 sigma of where it is said to be; None where its start says nothing.
         known: Whether it is where it is said to be, and not estimated.

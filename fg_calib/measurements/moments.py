@@ -72,7 +72,7 @@ def length_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mom
     Args:
         f: True lengths, >= 0, any shape, [m].
         along: Variance of the vector's error along it, of the same shape, [m^2].
-        across: The same in each direction across.
+        across: Variance in each direction across.
         own: Variance of the length's own error.
     """
     vector = _vector_length(f, along, across)
@@ -85,7 +85,7 @@ def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mome
     Args:
         f: True angles in [0, pi], any shape, [rad].
         along: Variance of the rotation error about the axis, of the same shape, [rad^2].
-        across: The same about each axis across.
+        across: Variance about each axis across.
         own: Variance of the angle's own error.
     """
     along, across, own = (np.minimum(v, WIDE) for v in (along, across, own))

@@ -40,10 +40,10 @@ class Block(Brief):
     """Measurements of one kind.
 
     Attributes:
-        kind: What they are.
+        kind: Kind of measurement.
         trig: Readings, from `Robot.trig`, shape (n_configurations, n_joints, 2).
         ends: Row in `trig` of each end, shape (n, kind.ends).
-        data: What was measured, as the kind has it, shape (n, kind.width); any number in a row without weight.
+        data: Measured values, as the kind has them, shape (n, kind.width); any number in a row without weight.
         whitening: Lower triangle, row by row, of a matrix that whitens a measurement's rows, shape (n, residual_dim *
             (residual_dim + 1) / 2); zero for a row that is not measured. See `pack`.
         nuisances: Values of the kind's nuisances, shape (n, kind.n_nuisances).

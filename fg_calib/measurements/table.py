@@ -41,10 +41,10 @@ class MeasurementBlock(Brief):
     """Measurements of one kind from one table.
 
     Attributes:
-        kind: What they are.
+        kind: Kind of measurement.
         table: Which table they are from.
         ends: Configurations of each, rows of that table, shape (n, kind.ends).
-        data: What was measured, shape (n, kind.width); any number where not measured.
+        data: Measured values, shape (n, kind.width); any number where not measured.
         sigma: 1 sigma of each row's own noise, shape (n, kind.residual_dim); 0 where measured poses alone say it.
         measured: Which rows were measured, shape (n, kind.residual_dim).
         test: Which are predicted but never fitted, shape (n,).
@@ -55,7 +55,7 @@ class MeasurementBlock(Brief):
             kind.residual_dim); its diagonal is that of sigma.
         excluded: Measured ones that take no part: masks by reason, shape (n,) each.
         source: File name, for messages.
-        of: What each is of by name, such as its target, anchor or corner; None where the table says nothing of it.
+        of: Name of each, such as its target, anchor or corner; None where the table says nothing of it.
     """
 
     kind: Kind
@@ -80,10 +80,10 @@ class MeasurementBlock(Brief):
         """Measurements all of whose components were measured.
 
         Args:
-            kind: What they are.
+            kind: Kind of measurement.
             table: Which table they are from.
             rows: Number of each in the table, shape (n,): its configuration, unless `more` says the ends.
-            data: What was measured, shape (n, kind.width).
+            data: Measured values, shape (n, kind.width).
             sigma: 1 sigma, which broadcasts to (n, kind.residual_dim).
             more: Other fields.
         """
@@ -134,8 +134,8 @@ class CustomMeasurements(Brief):
     """Measurements of a custom kind, at the configurations of a table.
 
     Attributes:
-        kind: What they are.
-        data: What was measured, shape (n, kind.width).
+        kind: Kind of measurement.
+        data: Measured values, shape (n, kind.width).
         sigma: 1 sigma of each row, a number or an array that broadcasts to (n, kind.residual_dim).
         ends: Configurations of each, shape (n, kind.ends); the table's, one after the other, if None.
         unknowns: Start of each unknown that the kind depends on, shape (n_unknowns, dimension).
@@ -234,7 +234,7 @@ class Table(Brief):
     """A table of measurements, and how it is to be understood.
 
     Attributes:
-        measurements: What was measured.
+        measurements: The measured values.
         model: Which of it takes part; None if only `own` does.
         pairing: How pairs are formed from poses where none were measured directly.
         frame: Whether its measurement frame is known to be the base, or world_T_base is estimated.

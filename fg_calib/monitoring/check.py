@@ -47,12 +47,12 @@ class Explanation:
     """A change that explains new rows.
 
     Attributes:
-        parameters: What changed.
+        parameters: Changed parameters.
         kind: `zero`, `parameter`, `tool`, `frame`, `zeros`, or `row` of gross errors.
-        change: By how much, [m] and [rad]; empty of gross errors.
+        change: Size, [m] and [rad]; empty of gross errors.
         sigma: 1 sigma of that; None where it is not determined.
         units: `m` or `rad` of each.
-        chi2_drop: By how much chi-square falls with it.
+        chi2_drop: Drop of chi-square with it.
         p_value: Probability that chance explains as much, all hypotheses counted.
         likely: Whether it explains most, or the rows do not distinguish it from the change that does.
         told_apart_from: Changes that the rows would exclude, were it this one.
@@ -81,20 +81,20 @@ class Check:
     Attributes:
         verdict: Whether it is still good.
         reasons: Why not, or why that cannot be said.
-        cautions: What its reader should know all the same.
+        cautions: Notes for the reader.
         n: Number of measurements.
         chi2: Of the rows, by their noise and the calibration's uncertainty, after what is free was fitted.
         dof: Its degrees of freedom.
         p_value: Probability of one as large, were arm and noise as specified.
         rms: RMS of residuals by kind, frame fitted, the arm as calibrated, [m] and [rad].
         noise: RMS of the noise specified for them.
-        limits: What they may be, as far as a limit was set.
-        explanations: What changed, the best first; none where nothing is certain.
+        limits: Their limits, as far as set.
+        explanations: Possible changes, the best first; none where nothing is certain.
         gross_rows: Configurations whose rows are gross errors, left out of all that is said here.
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.
         detectable: Joint offset changes that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
             None where they show none at all.
-        advice: What to measure to distinguish the two likeliest changes; None where there is nothing to.
+        advice: Measurements to distinguish the two likeliest changes; None where there is nothing to.
     """
 
     verdict: Verdict

@@ -70,7 +70,7 @@ class ChangeHypothesis:
     """A change that is tested.
 
     Attributes:
-        names: What changes.
+        names: Parameters that change.
         kind: `zero`, `parameter`, `tool`, `frame`, `zeros`, or `row` of gross errors.
         units: `m` or `rad` of each.
         columns: Derivatives of the rows in it, shape (m, k).
@@ -94,7 +94,7 @@ class HypothesisTest:
         hypothesis: The change.
         change: Its best size, shape (k,), [m] and [rad].
         sigma: 1 sigma of each; nan where the rows do not see it.
-        drop: By how much chi-square falls.
+        drop: Drop of chi-square.
         left: Chi-square that is left.
         k: Degrees of freedom that it takes.
         dof: Degrees of freedom that are left.

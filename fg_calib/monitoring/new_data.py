@@ -136,7 +136,7 @@ def started(
         options: The options.
         values: The robot's parameters as calibrated.
         fit: The fit of the same rows with the arm held.
-        more: What else the problem has.
+        more: Other fields of the problem.
     """
     v = graph.variables_of(arm, data, options)
     x, there = v.nominal(), v.coordinates >= 0

@@ -41,9 +41,9 @@ class Calibrated:
     Attributes:
         robot: The nominal robot, with its tolerances; what the calibration is of is estimated.
         values: Its parameters as calibrated, shape (n_parameters,).
-        knowledge: What the calibration's rows say; None where the arm was evaluated only.
+        knowledge: Information of the calibration's rows; None where the arm was evaluated only.
         options: Its options.
-        noise: What specified sigmas are multiplied by, by table and kind, where noise was estimated.
+        noise: Factors on the specified sigmas, by table and kind, where noise was estimated.
         noise_degrees: Degrees of freedom that it was estimated by; None where it was specified, or is not known.
     """
 

@@ -63,7 +63,7 @@ class Bound(Brief):
         robot: The true robot.
         names: The parameters that may be wrong.
         covariance: Of estimated minus true parameters, held ones included, shape (n_names, n_names), [m] and [rad].
-        claimed: What the estimator itself takes for its covariance: held parameters count as known, and rows that are
+        claimed: Covariance that the estimator itself reports: held parameters count as known, and rows that are
             weighted as independent as independent; shape (n_names, n_names), [m] and [rad].
         rank: Number of directions that data and priors determine.
     """

@@ -55,7 +55,7 @@ class Identifiability(Brief):
 
     Attributes:
         robot: The robot's name.
-        model: What is measured; of `pixels` it is looked at what the boards' poses would say.
+        model: Model of the measurements; `pixels` count as the boards' poses.
         kind: On random configurations, or on the user's.
         n_configurations: How many.
         observability: Rank, classes, groups, indices.
@@ -95,7 +95,7 @@ def observe_structure(
 
     Args:
         robot: The robot.
-        model: What is measured.
+        model: Model of the measurements.
         frame: Whether the measurement frame is unknown too.
         prefer: Parameters to keep, first choice first, where only combinations are determined.
         n_configurations: Random configurations; 0 for ten for every parameter, 300 at least.
@@ -135,7 +135,7 @@ def observe_configurations(
     Args:
         robot: The robot; what is fixed counts as known.
         measurements: The configurations (train rows) and their noise; 1 mm and 1 mrad where it is not specified.
-        model: What would be measured.
+        model: Model of the measurements.
         frame: Whether the measurement frame is unknown too.
         pairing: How pairs are formed; a star if None.
         prefer: Parameters to keep, first choice first, where only combinations are determined.

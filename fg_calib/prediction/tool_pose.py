@@ -75,7 +75,7 @@ def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedE
     """Expected errors of the tool at the test configurations, or at the train ones where these are few.
 
     Args:
-        problem: What was solved.
+        problem: The solved problem.
         covariance: The covariance of its solution, what was left out to fix the gauge included.
     """
     judged, at = judged_configurations(problem.data)

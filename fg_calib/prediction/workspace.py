@@ -84,7 +84,7 @@ class PredictedErrors(FrozenArrays):
     """Expected errors of the tool of a calibrated arm.
 
     Attributes:
-        model: What is expected of the tool.
+        model: Expected error of the tool.
         errors: Configuration by configuration.
         fitted: Whether they count after the best rigid fit of what was measured, because nothing was measured in the
             base frame; else in the base frame.

@@ -110,7 +110,7 @@ class Plot:
     Args:
         x: From left to right.
         y: Values from bottom to top, or names from top to bottom.
-        names: What the axes show, with units.
+        names: Titles of the axes, with units.
         height: Of the chart with values from bottom to top.
         powers: Whether the values from bottom to top are powers of ten.
     """

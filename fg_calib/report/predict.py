@@ -339,7 +339,7 @@ def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, rob
     Args:
         path: The CSV; one that was written as such is replaced.
         ids: The targets' names.
-        correction: What to command.
+        correction: The commands.
         robot: Whose joints they are of.
         units: Of the figures.
 

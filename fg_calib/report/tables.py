@@ -172,7 +172,7 @@ def figure(value: float | None, unit: str, form: str = "", unknown: str = "unkno
         value: The value, [m], [rad] or [px]; None or not finite if it is unknown.
         unit: Its unit.
         form: `+` for a sign, and digits such as `.3g` instead of the decimals of the unit.
-        unknown: What an unknown value is shown as.
+        unknown: Text of an unknown value.
     """
     if value is None or not np.isfinite(value):
         return unknown

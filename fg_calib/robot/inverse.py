@@ -49,7 +49,7 @@ class Inverse(Brief):
         readings: Within the joint limits, and the nearest to the pose that was found, shape (n_poses, n_joints),
             [rad] (prismatic: [m]).
         miss_position: How far the tool point is from the pose's, shape (n_poses,), [m].
-        miss_rotation: By what angle the tool is turned from the pose, shape (n_poses,), [rad].
+        miss_rotation: Angle between tool and pose, shape (n_poses,), [rad].
     """
 
     readings: Floats

@@ -241,7 +241,7 @@ def fill(chain, trig, ends, data, whitening, twins, given, turning, panel):  # t
         chain: `ChainArrays`.
         trig: From `Robot.trig`, shape (n_configurations, n_joints, 2).
         ends: Row of `trig` of each end, shape (n, n_ends).
-        data: What was measured, shape (n, width).
+        data: Measured values, shape (n, width).
         whitening: Lower triangles, row by row, shape (n, d * (d + 1) / 2), d the `residual_dim`.
         twins: Of a kind that is computed here, part by part: code, first row, first column of `data`, shape (n_parts,
             3).

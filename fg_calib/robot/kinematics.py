@@ -134,8 +134,8 @@ def build_chain(
         columns: Jacobian column of each parameter that has one, by the parameter's index.
         tool_tangent: First of six columns for a small motion of the tool frame in itself, rotation first
             (GTSAM's tangent of a Pose3); None if there are none.
-        base_tangent: The same for the base frame.
-        frame_tangent: The same for the measurement frame world_T_base.
+        base_tangent: Such columns for the base frame.
+        frame_tangent: Such columns for the measurement frame world_T_base.
         frame: Whether the chain starts in a measurement frame; `Chain.at` then takes six more values, and the
             frame is the identity until it got them.
     """

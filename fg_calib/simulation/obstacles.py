@@ -56,7 +56,7 @@ def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
     Args:
         robot: The robot, at its nominal values.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
-        boxes: What must stay free.
+        boxes: Boxes that must stay free.
     """
     if not boxes:
         return np.zeros(len(readings), dtype=np.bool_)

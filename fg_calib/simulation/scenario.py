@@ -592,12 +592,12 @@ class Instrument:
         pairs: Pairs of configurations that are measured directly.
         sockets: Contact points by name, or how many: the tool point touches one from each configuration.
         anchors: By name, or how many; three if None.
-        offset: What is added to every length, [m], which the calibration then estimates; nothing if None.
+        offset: Offset of every length, [m], which the calibration then estimates; nothing if None.
         planes: By name, or how many; three if None.
         contact: Whether the tool point is brought to the anchor, or along the normal to the plane, from each
             configuration. What is out of reach is left out.
         boards: base_T_board by name; that which the configurations look at if None.
-        camera: What takes the images.
+        camera: The camera.
         fixed: Whether the camera stands in the room, and the board is the tool.
         corners: Points of the boards, x and y in their planes, shape (n, 2), [m].
         from_behind: Names of boards whose z axis points away from the camera.
@@ -712,9 +712,9 @@ class Scenario(Brief):
         job: Other keys of the calibration job, such as model and pairing.
         length_unit: Unit of length of the job's files.
         angle_unit: Unit of angles of the job's files.
-        name: What it is called.
+        name: Its name.
         source: The file's name, or that of a shipped scenario; for messages.
-        instruments: What measures, each a table of its own; poses of the tool are measured if empty.
+        instruments: Instruments, each with a table of its own; poses of the tool are measured if empty.
     """
 
     robot: InstanceOf[Robot]

@@ -131,7 +131,7 @@ class Measuring:
     """One instrument at work.
 
     Attributes:
-        scenario: What is simulated.
+        scenario: The scenario.
         instrument: The instrument.
         true_robot: The robot that moves.
         visits: Where it was sent.
@@ -507,14 +507,14 @@ class Simulation(Brief):
     """One run of a scenario.
 
     Attributes:
-        scenario: What was simulated.
+        scenario: The scenario.
         seed: The seed.
         robot: The nominal robot.
         true_robot: The robot that moved: the same parameters, with their true values.
         true_readings: Where the joints stood at the scenario's configurations: the readings plus the encoder noise,
             shape (n_configurations, n_joints), [rad] (prismatic: [m]).
         frame: world_T_base.
-        tables: What was measured, as `calibrate` takes it: a table for each instrument. Rows of the validation are
+        tables: The measurements, as `calibrate` takes them: a table for each instrument. Rows of the validation are
             test rows.
         truth: Where targets, anchors, planes, boards, sockets and frames truly are, by kind and name: `Spot`, `Plane`,
             `Placement` (base_T_board, world_T_base); offsets in [m].
@@ -567,7 +567,7 @@ def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simul
     what is drawn for the others as it is.
 
     Args:
-        scenario: What to simulate.
+        scenario: The scenario.
         seed: Same seed, same simulation.
         exact: Whether nothing has noise, and known points are where the calibration takes them to be.
 
@@ -604,7 +604,7 @@ def _visit(scenario: Scenario, of: Configurations, seed: int, what: str, exact: 
     """Configurations, and where the joints stand there.
 
     Args:
-        scenario: What is simulated.
+        scenario: The scenario.
         of: Which configurations.
         seed: Seed of all draws.
         what: The key that says so: `configurations`, `validation`, or `instruments: name`.

@@ -39,7 +39,7 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
 
     Args:
         folder: Where to; files of these names are replaced where they are of another simulation, others stay.
-        simulation: What to write.
+        simulation: The simulation.
 
     Returns:
         The names of the files.

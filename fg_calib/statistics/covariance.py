@@ -41,7 +41,7 @@ class TangentCovariance(FrozenArrays):
         tangent: Covariance of the determined part, by the noise that rows are weighted by, shape (n_columns,) * 2.
         undetermined: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
             (n_undetermined, n_columns).
-        undetermined_at_nominal: The same at the nominal parameters.
+        undetermined_at_nominal: Such directions at the nominal parameters.
     """
 
     variables: graph.Variables
@@ -110,7 +110,7 @@ class Spread(TangentCovariance):
             columns are the directions that data and priors determine, orthogonal in `prior_scales`.
         actual: `tangent` by the errors that rows share, also where they are asked to count as independent.
         rank: Number of directions that data and priors determine.
-        excess: By how much the mean of chi-square is below its degrees of freedom, because rows that share errors are
+        excess: Shortfall of the mean of chi-square below its degrees of freedom, because rows that share errors are
             weighted as independent.
     """
 
@@ -165,7 +165,7 @@ def held_frames(undetermined: Floats, undetermined_at_nominal: Floats, scales: F
 
     Args:
         undetermined: Undetermined directions at the estimate, shape (n, n_columns), orthonormal in units of `scales`.
-        undetermined_at_nominal: The same at the nominal parameters.
+        undetermined_at_nominal: Such directions at the nominal parameters.
         scales: Of the columns, shape (n_columns,).
         n_robot: How many columns, the first ones, are the robot's.
     """

@@ -253,7 +253,7 @@ class Judgement:
     """One limit, and what the held-out rows say of it.
 
     Attributes:
-        kind: What it limits: `position`, `orientation`, `distance` or `angle`.
+        kind: Limited quantity: `position`, `orientation`, `distance` or `angle`.
         limit: Its value, [m] or [rad].
         error: RMS error of the calibrated arm at the held-out rows; None without any.
         noise: RMS of the specified noise of these rows.

@@ -35,7 +35,7 @@ class ParameterEstimate:
         sigma: 1 sigma of estimate minus true; 0 if fixed; None where neither data nor priors determine it. Of a
             parameter that was left out to fix the gauge: its prior sigma.
         prior_sigma: 1 sigma of its prior; None without one.
-        identifiability: What the data alone say of it: `independent`, `relative`, `ineffective`; or `fixed`.
+        identifiability: Class by the data alone: `independent`, `relative`, `ineffective`; or `fixed`.
         stands_for: Of a relative parameter that was kept where others were left out to fix the gauge: the combination
             that it was estimated for, factors by name; else None.
         sigma_of_combination: 1 sigma of the estimate as one of that combination; None where it stands for itself.
@@ -160,7 +160,7 @@ def estimates_at(solution: graph.Solution, spread: Spread, whole: Spread, observ
         solution: The solution.
         spread: The covariance of what was estimated.
         whole: The covariance of all parameters, those left out to fix the gauge among them.
-        observability: What the data alone determine.
+        observability: Observability by the data alone.
     """
     return Estimates(
         parameters=_parameters(solution, spread, whole, observability),

@@ -81,7 +81,7 @@ class KindFit:
         unit: `m`, `rad` or `px`.
         n: Number of scalar rows.
         specified_sigma_rms: Root mean square of their specified sigmas.
-        factor: What they were multiplied by, all noise together: 1 unless the noise was estimated.
+        factor: Factor on them, all noise together: 1 unless the noise was estimated.
         observed_over_specified: Observed over specified noise; nan where less than one degree of freedom is left.
         chi2: Sum of squared residuals over sigma, as it was taken.
         expected: Its mean, were the noise as taken: the rows' redundancy.
@@ -213,7 +213,7 @@ class Goodness(FrozenArrays):
         leverage: Variance of the row's prediction over its noise; nan where it has none.
         studentised: Residual over its own 1 sigma: of a fitted row less its leverage, of a predicted one more.
         weight: Robust weight of each row's measurement.
-        flag: What is said of each row, in `FLAGS`.
+        flag: Flag of each row, in `FLAGS`.
         level: |studentised| above which a row is suspect.
         suspect: Rows that are too large, and outliers among the fitted ones.
         configurations: Suspect configurations among the fitted rows, the worst first.

@@ -91,7 +91,7 @@ def estimate_tolerances(
 
     Args:
         problem: The problem; its options say what shares a scale, its prior sigmas are where the scales start from.
-        solve_with: What solves it at given prior sigmas: `solve`, or `estimate_noise`.
+        solve_with: Solver at given prior sigmas: `solve`, or `estimate_noise`.
 
     Returns:
         The solution with the prior sigmas it ends with, and their scales in its `estimated_tolerances`. It has not
@@ -142,7 +142,7 @@ class ScalePosterior:
     """The corrections at given scales, and the posterior of these.
 
     Args:
-        corrections: What the data say of the corrections.
+        corrections: Information of the data on the corrections.
         theta: Logarithms of the scales, shape (n_groups,).
 
     Attributes:
@@ -151,7 +151,7 @@ class ScalePosterior:
         covariance: Of the corrections, shape (n, n).
         determined: How many corrections of each group the data determine, shape (n_groups,).
         gradient: Of the logarithm of the posterior, shape (n_groups,).
-        hessian: The same, shape (n_groups, n_groups).
+        hessian: Second derivative of it, shape (n_groups, n_groups).
     """
 
     def __init__(self, corrections: Corrections, theta: Floats) -> None:
@@ -182,7 +182,7 @@ class EstimatedScales:
     Attributes:
         mean: The corrections at the mean of the logarithms.
         sigma: 1 sigma of the logarithms, shape (n_groups,).
-        added_covariance: What unknown scales add to the covariance of the corrections, shape (n, n).
+        added_covariance: Added covariance of the corrections by unknown scales, shape (n, n).
     """
 
     mean: ScalePosterior
@@ -200,7 +200,7 @@ def fit_scales(corrections: Corrections) -> EstimatedScales:
     """The posterior of the scales, about its highest mode.
 
     Args:
-        corrections: What the data say of the corrections.
+        corrections: Information of the data on the corrections.
     """
 
     def cost(theta: Floats) -> tuple[float, Floats]:
@@ -408,7 +408,7 @@ def _with_scales(problem: graph.Problem, by: SharedScale, scales: Mapping[str, f
 
     Args:
         problem: The problem.
-        by: What shares a scale.
+        by: Grouping of parameters that share a scale.
         scales: Factor on the tolerances of each group.
     """
     parameters = tuple(

@@ -97,7 +97,7 @@ class ResidualTable(FrozenArrays):
     """Every scalar residual, train and test, before and after, in its kind's unit. Words are codes: a table is long.
 
     Attributes:
-        kinds: What rows are of, by code.
+        kinds: Kinds of rows, by code.
         kind_code: Of each row, shape (n,).
         block: Which of the problem's blocks each row is of, shape (n,).
         measurement: Number of each row's measurement in its block, shape (n,).
@@ -105,7 +105,7 @@ class ResidualTable(FrozenArrays):
         a: The (first) configuration, in `names`, or the (first) landmark where there is none, shape (n,).
         b: The second, -1 where there is none, shape (n,).
         names: Name of each configuration, then of each landmark.
-        label_code: What each row is of by name, in `labels`; 0 where its table does not say, shape (n,).
+        label_code: Label of each row, in `labels`; 0 where its table does not say, shape (n,).
         labels: Names of targets, anchors, planes, boards, corners and contact points by code; the first is empty.
         table_row: Row of its table that each row is from, counted from 0; -1 where it is of a pair, shape (n,).
         test: Predicted only, shape (n,).
@@ -114,7 +114,7 @@ class ResidualTable(FrozenArrays):
         measured: Measured value; nan where it is no figure of its own, as of orientations, shape (n,).
         before: Residual with the arm at nominal, shape (n,).
         after: Residual at the estimate, shape (n,).
-        excess: What noise adds to the measured value on average (see `moments`), at the estimate, shape (n,); the arm's
+        excess: Bias of the measured value by noise (see `moments`), at the estimate, shape (n,); the arm's
             own prediction is measured + after - excess.
         sigma: 1 sigma of the residual, shape (n,).
         seen: Which rows are at readings that are fitted too, shape (n,).

@@ -84,10 +84,10 @@ def start_boards(start: FrameStart, rows: Integers, first: Integers, choices: tu
     """Start boards and the camera from camera_T_board: seen from a board, the camera is a tool, and the base unknown.
 
     Args:
-        start: What is known so far; what is found is put there.
+        start: Known coordinates so far; found ones are put there.
         rows: Configuration of each pose, shape (n,).
         first: First coordinate of each one's board, shape (n,).
-        choices: What each may be, the likeliest first: rotations, shape (n, k, 3, 3), positions, shape (n, k, 3), [m].
+        choices: Possible poses, the likeliest first: rotations, shape (n, k, 3, 3), positions, shape (n, k, 3), [m].
     """
     boards, count = np.unique(first, return_counts=True)
     for board in boards[np.argsort(-count, kind="stable")].tolist():

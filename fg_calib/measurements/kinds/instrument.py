@@ -37,7 +37,7 @@ class Column(NamedTuple):
     Attributes:
         names: Their names.
         unit: `length`, `angle`, `pixel`, or empty of names and pure numbers.
-        meaning: What they are.
+        meaning: Meaning of the cells.
         generic: Whether the reader of tables puts them into `Measurements.columns` by their first name, and what
             `sigma_...` says of them into `sigmas`, as no field of `Measurements` is theirs.
     """
@@ -66,7 +66,7 @@ class Quantity(NamedTuple):
         field: Field of `Measurements`, or column, that holds it.
         noise: Kind of its noise.
         columns: Its columns, for messages.
-        words: What it is, for messages.
+        words: Name in messages.
         shape: Of one measurement.
     """
 
@@ -82,15 +82,15 @@ class Instrument:
 
     Attributes:
         model: Model of its tables.
-        kind: What it measures, of one configuration; those with several kinds override `kinds`.
+        kind: Kind of its measurements, of one configuration; those with several kinds override `kinds`.
         quantities: The data of its kinds, in their order; its generic columns if empty.
         columns: Columns besides those of every table.
         labels: Columns of names: what a row is of.
         optional_labels: Columns among `labels` whose cells may be empty.
         noise: Keys of `noise` that it needs.
-        landmarks: What it depends on besides the arm, in the order of its kinds' nuisances.
+        landmarks: Kinds of landmarks that it depends on, in the order of its kinds' nuisances.
         options: Fields of `Table` that say something to it alone.
-        words: What it measures, for reports.
+        words: Name of its measurements in reports.
         uses_pairs: Whether it measures between configurations.
         is_pose: Whether it measures the tool's pose, or part of it, in a measurement frame.
         sees_position: Whether its rows depend on where the tool point is.
@@ -194,7 +194,7 @@ class Instrument:
         Args:
             table: The table.
             number: Its number.
-            landmarks: What they depend on is added here.
+            landmarks: Landmarks, to which those of the blocks are added.
 
         Raises:
             ProblemError: A column or a sigma is missing.
