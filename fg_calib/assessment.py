@@ -1,4 +1,4 @@
-"""From a job to its solution, and from a solution to its assessment: the steps of `calibrate`."""
+"""Solve a job and assess its solution: the steps of `calibrate`."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def fit_least_squares(
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]
-"""From the unknowns to residuals, shape (m,), and their derivatives, shape (m, n)."""
+"""Residuals of the unknowns, shape (m,), and their derivatives, shape (m, n)."""
 
 Weights = tuple[Floats, ...]
 """Whitening of each block of rows, shape (n, residual_dim, residual_dim)."""

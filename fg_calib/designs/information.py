@@ -140,7 +140,7 @@ def _stack(rows: Floats, which: Integers, n_poses: int) -> Floats:
 
 
 def _compress(rows: Floats) -> Floats:
-    """As few rows with the same information: an image of a board says as much as the board's pose."""
+    """Fewer rows with the same information: an image of a board says as much as the board's pose."""
     if len(rows) <= MAX_ROWS:
         return rows
     _, s, Vt = np.linalg.svd(rows, full_matrices=False)

@@ -138,7 +138,7 @@ class Chooser:
         return exchange(self.measure, self.starts(n)[0], sweeps=1)
 
     def reaching(self, target: float) -> Integers:
-        """As few as reach a target, [m]; as many as allowed where none do."""
+        """The fewest poses that reach a target, [m]; as many as allowed where none do."""
         most = min(MAX_POSES, self.system.n_candidates)
         if self.system.unknown > UNKNOWN_SHARE:  # no number of poses would do
             return self.quickly(min(MIN_CURVE, most))

@@ -136,7 +136,7 @@ def setup_of(robot: Robot, table: Table) -> Setup | None:
 
 
 def evenly(n: int, most: int) -> NDArray[np.int64]:
-    """At most so many of n numbers, evenly spread."""
+    """Indices of at most so many of n numbers, evenly spread."""
     return np.unique(np.linspace(0, n - 1, min(most, n)).astype(np.int64))
 
 

@@ -1,4 +1,4 @@
-"""From a robot and its tables to a problem: checks, the start, and what is left out to fix the gauge."""
+"""Build a problem from a robot and its tables: checks, the start, and what is left out to fix the gauge."""
 
 from __future__ import annotations
 

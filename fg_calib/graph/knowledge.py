@@ -32,7 +32,7 @@ STAYING = tuple(letter for letter, kind in LANDMARKS.items() if kind.stays)
 """Letters of the unknowns that may stay where they are: targets on the tool, anchors around the arm."""
 
 SIZE = 3
-"""Coordinates of each of them."""
+"""Number of coordinates of each unknown."""
 
 Name = tuple[str, str]
 """Letter and name of an unknown."""

@@ -320,7 +320,7 @@ class _Point:
         return None if self.at_rounding else self._descend_damped(damping)
 
     def _descend_damped(self, damping: float) -> tuple[_Point, float, float] | None:
-        """By GTSAM's Levenberg-Marquardt, on a graph of one factor: rows and priors in the singular directions."""
+        """Step by GTSAM's Levenberg-Marquardt on a graph of one factor: rows and priors in the singular directions."""
         system, key, start, graph = self.system, gtsam.symbol("S", 0), gtsam.Values(), gtsam.NonlinearFactorGraph()
         n, weights = len(system.coordinates), system.weights
 

@@ -182,7 +182,7 @@ class Variables(Brief):
 
     @cached_property
     def prior_weights(self) -> dict[int, tuple[list[int], Floats]]:
-        """By key of each core variable: which of its parameters have a prior, and 1 / sigma of these."""
+        """Parameters with a prior, and 1 / sigma of these, by key of each core variable."""
         found = {}
         for v in self.items:
             of_v = () if v.kind == "frame" or not self.priors else v.parameters

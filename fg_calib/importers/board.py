@@ -70,7 +70,7 @@ MAX_SQUARE_M = 2.0
 """Side of a square, [m]: larger ones are in another unit."""
 
 MIN_IMAGES = 3
-"""From which a camera can be estimated: a plane gives two equations a view, and there are four unknowns and
+"""Least number of views to estimate a camera: a plane gives two equations a view, and there are four unknowns and
 the lens."""
 
 MIN_CORNERS = 6
@@ -646,7 +646,7 @@ BOARD_FILES = {
 
 
 Readings = Mapping[str, Mapping[str, str]]
-"""By the name of an image, the cells of its row by column: joint readings, and `split`, as they are written."""
+"""Cells of a row by column, by the name of its image: joint readings, and `split`, as they are written."""
 
 
 def read_readings(path: Path) -> Readings:

@@ -83,7 +83,7 @@ class _UrdfJoint:
     parent: str
     child: str
     origin: Mapping[str, float]
-    """By kind, [m] and [rad]."""
+    """Values by kind, [m] and [rad]."""
 
 
 @checked

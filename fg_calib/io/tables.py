@@ -457,7 +457,7 @@ _NOT_JOINTS = names_of(
 """Names of columns that a joint's readings cannot have, whatever the model."""
 
 _BY_AXIS = {"position": "sigma_x", "orientation": "sigma_rx", "pixel": "sigma_u"}
-"""By kind of noise, the first of the columns that may hold its sigma on each axis."""
+"""First of the columns that may hold sigma on each axis, by kind of noise."""
 
 ROUNDED = 1e-9
 """Share of a covariance that may be rounding."""

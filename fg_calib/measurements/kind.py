@@ -127,7 +127,7 @@ class Kind(ABC):
         return type(self) is type(other) and vars(self) == vars(other)
 
     def __hash__(self) -> int:
-        """By the class, which is nearly all there is."""
+        """Hash of the class, which is nearly all there is."""
         return hash(type(self))
 
 

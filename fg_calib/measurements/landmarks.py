@@ -88,7 +88,7 @@ class Landmark:
     """A landmark.
 
     Attributes:
-        kind: What it is.
+        kind: Kind of landmark.
         name: Its name.
         start: Where it is started, or is said to be, shape (size,); nan where the measurements are to say it.
         tolerance: 1 sigma of where it is said to be; None where its start says nothing.
@@ -149,7 +149,7 @@ class Landmarks:
 
     @property
     def n_coordinates(self) -> int:
-        """Number of coordinates of all."""
+        """Number of all landmarks' coordinates."""
         return self._first[-1]
 
     @property

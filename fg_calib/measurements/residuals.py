@@ -84,7 +84,7 @@ def unpack(whitening: Floats, residual_dim: int) -> Floats:
 
 
 def unit_whitening(n: int, residual_dim: int) -> Floats:
-    """For rows that are not whitened; all of them are the same in memory."""
+    """Whitening of rows that are not whitened; all of them are the same in memory."""
     unit = pack(np.eye(residual_dim)[None])
     return np.broadcast_to(unit, (n, unit.shape[1]))
 

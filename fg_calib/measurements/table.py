@@ -189,7 +189,7 @@ class CustomMeasurements(Brief):
         return ends
 
     def block(self, table: Table, number: int, landmarks: Landmarks) -> MeasurementBlock:
-        """A block of them.
+        """The measurement block of a table.
 
         Their unknowns are in the frame of the table's measurements: one of the same name in another frame is another.
 

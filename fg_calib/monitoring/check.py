@@ -88,7 +88,7 @@ class Check:
         p_value: Probability of one as large, were arm and noise as specified.
         rms: RMS of residuals by kind, frame fitted, the arm as calibrated, [m] and [rad].
         noise: RMS of the noise specified for them.
-        limits: Their limits, as far as set.
+        limits: Limits of errors by kind, as far as set.
         explanations: Possible changes, the best first; none where nothing is certain.
         gross_rows: Configurations whose rows are gross errors, left out of all that is said here.
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.

@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 360.0, 230.0
 """Size of an ordinary chart, in its own units; the page stretches it."""
 
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 10.0, 12.0, 40.0
-"""Margins of the plot within it."""
+"""Margins of the plot within the chart."""
 
 CELL, LETTER = 14.0, 5.8
 """Size of a row or column that has a name, and width of a letter of the name."""

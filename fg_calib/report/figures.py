@@ -29,7 +29,7 @@ MAX_PARAMETERS = 40
 """Parameters whose correlations are shown: the most correlated ones."""
 
 MAX_SIGMA = 5.0
-"""Residuals in their sigma, up to which a histogram distinguishes them."""
+"""Largest residual, in its sigma, that a histogram distinguishes."""
 
 MAX_STUDENTISED = 12.0
 """Residuals in their sigma, up to which rows are drawn where they are."""

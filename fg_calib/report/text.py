@@ -270,7 +270,7 @@ def expected_tool_error(expected: ExpectedError | None) -> list[Section]:
 
 
 def _residuals(result: Result) -> Table:
-    """By kind; by table where several tables have it."""
+    """Rows by kind; by table where several tables have it."""
     names, rows = list(result.residual_rms["train"]), []
     for kind in in_order(name for name in names if ", table" not in name):
         for name in [name for name in names if name.startswith(f"{kind}, table ")] or [kind]:

@@ -72,4 +72,4 @@ def part(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
 
 
 inlined = partial(part, forceinline=True)
-"""As `part`, where it must see its caller's constants, or is faster in its place."""
+"""A `part` inlined where it must see its caller's constants, or is faster in its place."""

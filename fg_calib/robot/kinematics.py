@@ -107,7 +107,7 @@ class Chain(Brief):
 
     @cached_property
     def _turns(self) -> NDArray[np.bool_]:
-        """For each column, joints included, whether it belongs to a rotation, shape (n_columns + n_joints,)."""
+        """Whether each column, joints included, belongs to a rotation, shape (n_columns + n_joints,)."""
         turns = np.zeros(self.n_columns + self.n_joints, dtype=np.bool_)
         rotation = self.axis >= Axis.RX
         turns[self.column[rotation & (self.column >= 0)]] = True

@@ -115,7 +115,7 @@ class Visits(NamedTuple):
     test: Booleans
 
     def select(self, rows: Integers | Booleans) -> Visits:
-        """Some of them."""
+        """Some of the visits."""
         values: list[Any] = [values[rows] for values in self]
         return Visits(*values)
 

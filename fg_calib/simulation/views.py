@@ -227,7 +227,7 @@ def view_board(views: BoardViews, generator: np.random.Generator) -> tuple[Float
 
 
 def sees_board(views: BoardViews, rotation: Floats, position: Floats) -> Booleans:
-    """From which poses all corners of the board are in the field of view, shape (n,); all without a `board_size`.
+    """Poses from which all corners of the board are in the field of view, shape (n,); all without a `board_size`.
 
     Args:
         views: Board and camera.

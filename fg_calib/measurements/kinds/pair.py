@@ -101,8 +101,8 @@ class PairQuantity(NamedTuple):
 
     Attributes:
         name: Field of `Pairs`; with `sigma_` before it, that of its noise.
-        kind: What it is.
-        pose: What of a measured pose it is formed from.
+        kind: Kind of measurement.
+        pose: Part of a measured pose that it is formed from.
         other: The model of pairs of the other quantity alone.
     """
 
