@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
 from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
-from fg_calib.measurements import Landmarks, Table
+from fg_calib.measurements import INSTRUMENTS, Landmarks, Table
 from fg_calib.robot import Robot
 from fg_calib.simulation import (
     BoardViews,
@@ -358,7 +358,7 @@ def _nominal(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
             changes["configurations"] = GivenReadings(readings[i.name])
         if i.pairing is not None and i.pairing.strategy != "star":
             changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3)), "pairing": None}
-        elif i.model in ("board", "pixels") and not (i.boards or i.fixed) and isinstance(views, BoardViews):
+        elif "board" in INSTRUMENTS[i.model].labels and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))
     return replace(

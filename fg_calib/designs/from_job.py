@@ -20,7 +20,7 @@ from fg_calib.designs.candidates import Pool, pool_of
 from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
-from fg_calib.measurements import Measurements, Noise
+from fg_calib.measurements import INSTRUMENTS, Measurements, Noise
 from fg_calib.robot import pose
 from fg_calib.simulation import (
     BoardViews,
@@ -134,7 +134,7 @@ def _instrument_of(problem: Problem, number: int, name: str, configurations: Con
         given |= {"planes": planes, "contact": contact}
     elif table.fixed_camera:
         given |= {"fixed": True, "frame": frame}
-    else:
+    elif "board" in INSTRUMENTS[str(model)].labels:
         robot = problem.robot.with_values(problem.start[problem.variables.robot_span])
         boards = {one: places["B", one] for one in _names(m, "board") or ("board",)}
         given = given | _seen(boards, pose(robot, m.readings).position)

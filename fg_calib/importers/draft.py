@@ -194,7 +194,8 @@ def _guess_unit(table: Table, kind: str, columns: Mapping[str, int]) -> str:
 def _find_model(present: set[str]) -> Model | None:
     """The model whose columns a table of configurations has."""
     models = [model for column, model in _MODELS.items() if column in present]
-    models += [model for model, i in INSTRUMENTS.items() if set(i.generic_columns) & present and not i.labels]
+    needed = {model: {*i.generic_columns, *i.labels} for model, i in INSTRUMENTS.items() if i.generic_columns}
+    models += [model for model, columns in needed.items() if columns <= present]
     position, orientation = {"x", "y", "z"} <= present, bool({"qw", "roll", "rx"} & present)
     models += [model for model, of in POSE_MODELS.items() if of == (orientation, position)]
     return next(iter(models), None)

@@ -13,7 +13,6 @@ from pydantic import BeforeValidator, Field, StrictBool, create_model
 from fg_calib.initialization import Camera
 from fg_calib.inputs import (
     LIMITED,
-    POSE_MODELS,
     FrameKnowledge,
     InputError,
     Limits,
@@ -44,7 +43,7 @@ from fg_calib.io.yaml import (
     within,
 )
 from fg_calib.job import Job
-from fg_calib.measurements import GENERIC_COLUMNS, KnownPoint, Noise, Table
+from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, KnownPoint, Noise, Table
 from fg_calib.robot import Robot, names_of
 
 UNSPECIFIED = Noise(position=1e-3, orientation=1e-3, distance=1e-3, angle=1e-3, point=1e-3, pixel=1.0)
@@ -286,22 +285,23 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
         columns=entry.columns,
     )
     camera, fixed = camera_in(file.camera if entry.camera == "fixed" else entry.camera, f"{place}: camera", folder)
+    options = INSTRUMENTS[model].options
     return Table(
         measurements,
         model,
         pairing_of(entry.pairing, f"{place}: pairing"),
         entry.frame,
         known=_known_points(file, model, of_job),
-        offset=model == "anchor" and entry.offset == "estimate",
-        camera=camera if model == "pixels" else None,
-        fixed_camera=model == "pixels" and (fixed or "fixed" in (entry.camera, file.camera)),
+        offset="offset" in options and entry.offset == "estimate",
+        camera=camera if "camera" in options else None,
+        fixed_camera="camera" in options and (fixed or "fixed" in (entry.camera, file.camera)),
     )
 
 
 def _known_points(file: Any, model: Model, place: str) -> dict[str, KnownPoint]:
     """Targets or anchors, whatever a model has, that the job says something of."""
-    key = "anchors" if model == "anchor" else "targets"
-    if model != "anchor" and model not in POSE_MODELS:
+    key = INSTRUMENTS[model].key
+    if not key:
         return {}
     found, shared = {}, getattr(file.tolerance, key)
     for name, point in getattr(file, key).items():

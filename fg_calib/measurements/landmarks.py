@@ -80,7 +80,7 @@ class LandmarkKind:
             return np.zeros((n, self.size))
         places = middle + self.away * reach * Rotation.random(n, random_state=0).as_matrix()[:, :, 2]
         rotated = Rotation.random(n, random_state=np.random.default_rng(0).integers(1000)).as_rotvec()
-        return places if self.size == 3 else np.hstack([rotated, places])
+        return places[:, : self.size] if self.size <= 3 else np.hstack([rotated, places])
 
 
 @dataclass(frozen=True)

@@ -321,6 +321,8 @@ class Measuring:
     def plain(self) -> tuple[Table, Truth]:
         """Columns that the model alone has."""
         model = INSTRUMENTS[self.model]
+        if model.landmarks:
+            raise InputError(self.place, f"model {self.model} has landmarks", "a model whose landmarks can be placed")
         exact = model.predict(self.rows(), self.at(), lambda kind, names: np.zeros((len(names), kind.size)))
         columns = {name: exact.columns[name] + self.noise(name, self.n) for name in model.generic_columns}
         sigmas = {name: self.sigma(name, self.n) for name in model.generic_columns}
@@ -494,12 +496,12 @@ def merge_truths(tables: list[Table], truths: list[Truth], source: str) -> tuple
         other = every.setdefault(kind, {}).setdefault(name, landmark)
         if other is not landmark and not all(map(np.array_equal, astuple(other), astuple(landmark))):
             raise InputError(f"{source}: instruments: {kind}: {name}", "at two places", "one, or other names")
-    known: dict[bool, dict[str, KnownPoint]] = {True: {}, False: {}}
-    for table in tables:
-        known[table.model == "anchor"] |= table.known
-    takes = [t.model == "anchor" or t.model in POSE_MODELS for t in tables]
-    shared = (replace(t, known=known[t.model == "anchor"]) if one else t for t, one in zip(tables, takes, strict=True))
-    return tuple(shared), {kind: landmarks for kind, landmarks in every.items() if landmarks}
+    known: dict[str, dict[str, KnownPoint]] = {}
+    keys = [INSTRUMENTS[str(table.model)].key for table in tables]
+    for key, table in zip(keys, tables, strict=True):
+        known.setdefault(key, {}).update(table.known)
+    shared = tuple(replace(table, known=known[key]) for key, table in zip(keys, tables, strict=True))
+    return shared, {kind: landmarks for kind, landmarks in every.items() if landmarks}
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, checked
 from fg_calib.io import NOISE_UNITS, Units, fill_folder, write_csv, write_robot, write_text, write_urdf
-from fg_calib.measurements import GENERIC_COLUMNS, Measurements, Pairs, Table
+from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Measurements, Pairs, Table
 from fg_calib.robot import Robot, yaw_pitch_roll
 from fg_calib.simulation.scenario import Placement, Plane, Spot, frame_knowledge
 from fg_calib.simulation.simulator import Simulation
@@ -159,7 +159,7 @@ def instrument_keys(tables: Sequence[Table], units: Units) -> dict[str, Any]:
     found: dict[str, Any] = {"measurements": [_entry(table, units) for table in tables]}
     for table in tables:
         if table.known:
-            found["anchors" if table.model == "anchor" else "targets"] = {
+            found[INSTRUMENTS[str(table.model)].key] = {
                 name: _xyz(point.xyz, units)
                 | ({} if point.tolerance is None else {"tolerance": units.from_si(point.tolerance, "m")})
                 for name, point in table.known.items()

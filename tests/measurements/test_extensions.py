@@ -1,6 +1,7 @@
 """`docs/architecture.md` adds an instrument and an effect of joints: applied to a copy, they work from end to end."""
 
 import json
+import math
 import os
 import re
 import shutil
@@ -13,6 +14,7 @@ import yaml
 
 import fg_calib
 
+DEG = math.pi / 180.0
 PAGE = Path(__file__).resolve().parents[2] / "docs/architecture.md"
 
 ROBOT = """\
@@ -21,9 +23,9 @@ convention: dh
 units: {length: m, angle: deg}
 joints:
   - {a: 0.02, alpha: 90, d: 0.3, theta: 0, limits: [-170, 170]}
-  - {a: 0.40, alpha: 20, d: 0.0, theta: 0, limits: [-170, 170], gain: 0}
-  - {a: 0.30, alpha: 70, d: 0.1, theta: 30, limits: [-170, 170], gain: 0}
-tolerance: {a: 0.001, d: 0.001, alpha: 0.5, theta: 0.5, gain: 0.002}
+  - {a: 0.40, alpha: 20, d: 0.0, theta: 0, limits: [-170, 170], gain: 0, wave: 0}
+  - {a: 0.30, alpha: 70, d: 0.1, theta: 30, limits: [-170, 170], gain: 0, wave: 0.2}
+tolerance: {a: 0.001, d: 0.001, alpha: 0.5, theta: 0.5, gain: 0.002, wave: 0.1}
 """
 
 SCENARIO = """\
@@ -39,7 +41,7 @@ instruments:
 
 
 def extend(root):
-    """A package with what the page adds to it."""
+    """A package with what the page adds to it, and an effect like its gain whose unit is rad: a wave."""
     text = PAGE.read_text()
     name, module = re.search(r"^```python\n# (\S+)\n(.*?)^```$", text, flags=re.S | re.M).groups()
     (root / name).write_text(module)
@@ -47,7 +49,10 @@ def extend(root):
         for name, before, more in re.findall(r"--- (\S+)\n (.*\n)((?:\+.*\n)+)", block):
             source = (root / name).read_text()
             assert source.count(before) == 1, f"{name}: {before}"
-            (root / name).write_text(source.replace(before, before + re.sub(r"^\+", "", more, flags=re.M)))
+            added = re.sub(r"^\+", "", more, flags=re.M)
+            if "gain" in added:
+                added += added.replace("gain", "wave").replace('"1"', '"rad"').replace('"reading"', '"sin"')
+            (root / name).write_text(source.replace(before, before + added))
 
 
 @pytest.fixture(scope="module")
@@ -87,21 +92,44 @@ def test_a_new_instrument_and_a_new_effect_are_calibrated_and_reported(run):
     assert result["residual_rms"]["test"]["inclination"]["before"] > 1e-3
     found = {p["name"]: p for p in result["parameters"]}
     true = yaml.safe_load((folder / "simulated/robot_true.yaml").read_text())["joints"]
-    for joint in (2, 3):
-        one = found[f"q{joint}.gain"]
-        assert one["unit"] == "1"
+    calibrated = yaml.safe_load((folder / "result/robot_calibrated.yaml").read_text())["joints"]
+    for joint, kind, unit, factor in ((j, *of) for j in (2, 3) for of in (("gain", "1", 1.0), ("wave", "rad", DEG))):
+        one = found[f"q{joint}.{kind}"]
+        assert one["unit"] == unit
         assert one["sigma"] < 0.3 * one["prior_sigma"]
-        assert abs(one["estimate"] - true[joint - 1]["gain"]) < 3.0 * one["sigma"]
+        assert abs(one["estimate"] - factor * true[joint - 1][kind]) < 3.0 * one["sigma"]
+        assert one["estimate"] == pytest.approx(calibrated[joint - 1][kind], rel=1e-12)  # in rad
+    assert found["q3.wave"]["nominal"] == pytest.approx(0.2 * DEG, rel=1e-12)
+    assert found["q3.wave"]["prior_sigma"] == pytest.approx(0.1 * DEG, rel=1e-12)
     for words in (text, (folder / "result/report.html").read_text()):
         assert "inclination" in words
         assert "q2.gain" in words
         assert "ppm" in words
-    assert "gain: " in (folder / "result/robot_calibrated.yaml").read_text()
 
 
 @pytest.mark.slow
 def test_what_a_new_instrument_can_identify_follows_from_its_kind(run):
     text, _ = run("observe", "robot.yaml", "--model", "inclination", "--json")
     found = json.loads(text)
-    assert {"q2.gain", "q3.gain"} <= set(found["independent"])
+    assert {"q2.gain", "q3.gain", "q2.wave", "q3.wave"} <= set(found["independent"])
     assert set(found["ineffective"]) >= {"a1", "d1", "a2", "d2", "a3", "d3", "theta1"}
+
+
+@pytest.mark.slow
+def test_more_rows_of_a_new_instrument_are_designed_for_its_job(run):
+    text, _ = run("design", "simulated/calibration.yaml", "--n", "4", "--json")
+    assert json.loads(text)
+
+
+@pytest.mark.slow
+def test_a_table_of_a_new_instrument_that_has_its_sigmas_is_drafted_with_its_model(run):
+    _, folder = run("inspect", "simulated/calibration.yaml")
+    header, *rows = (folder / "simulated/levels.csv").read_text().splitlines()
+    (folder / "levels.csv").write_text("\n".join([f"{header},sigma_inclination", *(f"{row},0.02" for row in rows)]))
+    run("init", "robot.yaml", "levels.csv", "--out", "drafted.yaml")
+    job = yaml.safe_load((folder / "drafted.yaml").read_text())
+    assert job["measurements"][0]["model"] == "inclination"
+    assert "inclination" not in job["noise"]
+    run("calibrate", "drafted.yaml", "--out", "drafted")
+    (ratio,) = json.loads((folder / "drafted/result.json").read_text())["noise_factors"].values()
+    assert 0.3 < ratio < 0.8

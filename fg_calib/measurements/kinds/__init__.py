@@ -16,10 +16,12 @@ INSTRUMENTS: dict[str, Instrument] = {
 }
 """The instrument of each model."""
 
-LANDMARKS: dict[str, LandmarkKind] = {
-    kind.letter: kind for kinds in ((UNKNOWN,), *(i.landmarks for i in INSTRUMENTS.values())) for kind in kinds
-}
+_KINDS = dict.fromkeys((UNKNOWN, *(kind for one in INSTRUMENTS.values() for kind in one.landmarks)))
+LANDMARKS: dict[str, LandmarkKind] = {kind.letter: kind for kind in _KINDS}
 """Kinds of landmarks, by the letter of their symbols."""
+
+if len(LANDMARKS) < len(_KINDS):
+    raise ValueError(f"two kinds of landmarks have one letter: {' '.join(sorted(kind.letter for kind in _KINDS))}")
 
 GENERIC_COLUMNS: dict[str, Column] = {
     column.names[0]: column for one in INSTRUMENTS.values() for column in one.columns if column.generic

@@ -122,6 +122,11 @@ class Instrument:
         return tuple(column.names[0] for column in self.columns if column.generic)
 
     @property
+    def key(self) -> str:
+        """Key of a job that may say where its landmarks are; empty where none does."""
+        return next((kind.key for kind in self.landmarks if kind.key), "")
+
+    @property
     def measured(self) -> tuple[Quantity, ...]:
         """Measured quantities, or those of generic columns."""
         return self.quantities or tuple(Quantity(name, name, name, self.words) for name in self.generic_columns)
