@@ -171,7 +171,6 @@ def map_jobs(
     executor: Executor | None = None,
     *,
     names: Sequence[str] | None = None,
-    what: str = "calibrating",
 ) -> list[R | Failure]:
     """Call a function with each job.
 
@@ -180,7 +179,6 @@ def map_jobs(
         jobs: Any number of picklable objects.
         executor: Where: `local_processes(n)`, `dask_executor(address)`, or any other; this process if None.
         names: Name of each job, for failures; `job 1`, `job 2`, ... if None.
-        what: Task in words, for the listener to progress.
 
     Returns:
         What the function returned, or a failure, in the order of the jobs.
@@ -190,7 +188,7 @@ def map_jobs(
     calls = [_submit(executor, function, *both) for both in zip(given, named, strict=True)]
     results: list[R | Failure] = []
     for k, result in enumerate(calls):
-        tell(what, k, len(given))
+        tell("calibrating", k, len(given))
         try:
             results.append(result())
         except BrokenExecutor:

@@ -29,10 +29,10 @@ def test_progress_is_reported_to_the_listener():
     told, token = [], None
     token = listener.set(lambda *what: told.append(what))
     try:
-        map_jobs(work, [1, 2], what="doubling")
+        map_jobs(work, [1, 2])
     finally:
         listener.reset(token)
-    assert told == [("doubling", 0, 2), ("doubling", 1, 2)]
+    assert told == [("calibrating", 0, 2), ("calibrating", 1, 2)]
 
 
 def test_an_executor_that_refuses_a_job_fails_that_job_alone():

@@ -23,7 +23,6 @@ from fg_calib.graph import (
     SIGNAL_FLOOR,
     Problem,
     Solution,
-    SolverOptions,
     directions,
     solve,
     with_factors,
@@ -60,12 +59,11 @@ MAX_ROWS = 20_000
 
 
 @checked
-def multistart(solution: Solution, options: SolverOptions | None = None) -> Solution:
+def multistart(solution: Solution) -> Solution:
     """The best optimum that a solution and descents from other starts find.
 
     Args:
         solution: The solution of the descent from nominal.
-        options: Settings of the solver.
 
     Returns:
         The solution of least cost, with `others` that data and priors cannot distinguish from it; the given solution
@@ -77,11 +75,11 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
     with one_blas_thread:
         starts = [solution.problem.variables.moved(solution.parameters, step) for step in _steps(solution)]
     for start in starts:
-        found += _solve_from(solution, solution.problem, options, start)
+        found += _solve_from(solution, solution.problem, start)
     for landmark in _mirrored_landmarks(solution.problem) if solution.problem.options.loss == "none" else ():
         mirrored = _mirrored(min(found, key=_objective), landmark)
         if mirrored is not None and mirrored.system.cost < MAX_MIRROR_COST * solution.initial_cost:
-            found += _solve_from(solution, mirrored, options)
+            found += _solve_from(solution, mirrored)
     best, others = min(found, key=_objective), list[Solution]()
     kept = best if solution.objective - best.objective > LEAST_GAIN else solution
     for one in found:
@@ -95,12 +93,10 @@ def multistart(solution: Solution, options: SolverOptions | None = None) -> Solu
 _objective = attrgetter("objective")
 
 
-def _solve_from(
-    solution: Solution, problem: Problem, options: SolverOptions | None, start: Floats | None = None
-) -> list[Solution]:
+def _solve_from(solution: Solution, problem: Problem, start: Floats | None = None) -> list[Solution]:
     """The optimum from another start, as a later stage of a solution; none where there is no solution from there."""
     try:
-        other = solve(problem, options, start=start)
+        other = solve(problem, start=start)
     except CalibrationError:  # says nothing against the first
         return []
     if start is not None:

@@ -188,11 +188,11 @@ def _seen(A: Floats, b: Floats) -> Floats:
 
 
 def _tool_point_by_distances(
-    dR: Floats, dp: Floats, distance: Floats, t: Floats, free: Booleans, steps: int = 10
+    dR: Floats, dp: Floats, distance: Floats, t: Floats, free: Booleans
 ) -> tuple[Floats, float]:
     """Gauss-Newton on the distances; the tool point with the least cost met, and that cost."""
     best, least = t, np.inf
-    for _ in range(steps + 1):
+    for _ in range(11):
         v = dp + dR @ t
         length = np.linalg.norm(v, axis=1)
         r = length - distance

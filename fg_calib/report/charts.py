@@ -198,7 +198,7 @@ def _labels(scale: Scale, powers: bool = False) -> list[tuple[float, str]]:
     return [(value, f"1e{value:.3g}" if powers else word.replace("-", "\N{MINUS SIGN}")) for value, word in labels]
 
 
-def short(name: str, most: int = 14) -> str:
+def short(name: str, most: int) -> str:
     """A name in few characters: its end distinguishes it from others, such as `.x`."""
     return name if len(name) <= most else f"{name[: most - 8]}…{name[-7:]}"
 

@@ -76,14 +76,6 @@ def run(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_new_instrument_is_simulated_into_a_table_with_its_column(run):
-    _, folder = run("inspect", "simulated/calibration.yaml")
-    header = (folder / "simulated/levels.csv").read_text().splitlines()[0].split(",")
-    assert "inclination" in header
-    assert {"x", "qx", "distance"}.isdisjoint(header)
-
-
-@pytest.mark.slow
 def test_a_new_instrument_and_a_new_effect_are_calibrated_and_reported(run):
     text, folder = run("calibrate", "simulated/calibration.yaml", "--out", "result", "--report")
     result = json.loads((folder / "result/result.json").read_text())
@@ -122,9 +114,10 @@ def test_more_rows_of_a_new_instrument_are_designed_for_its_job(run):
 
 
 @pytest.mark.slow
-def test_a_table_of_a_new_instrument_that_has_its_sigmas_is_drafted_with_its_model(run):
+def test_a_new_instrument_is_simulated_into_a_table_with_its_column_and_drafted_with_its_sigmas(run):
     _, folder = run("inspect", "simulated/calibration.yaml")
     header, *rows = (folder / "simulated/levels.csv").read_text().splitlines()
+    assert set(header.split(",")) == {"id", "q1", "q2", "q3", "inclination", "split"}
     (folder / "levels.csv").write_text("\n".join([f"{header},sigma_inclination", *(f"{row},0.02" for row in rows)]))
     run("init", "robot.yaml", "levels.csv", "--out", "drafted.yaml")
     job = yaml.safe_load((folder / "drafted.yaml").read_text())
