@@ -221,11 +221,6 @@ class Element:
     sign: int = 1
     basis: Basis | None = None
 
-    def __post_init__(self) -> None:
-        """Check that a basis has a coefficient and nothing else."""
-        if self.basis is not None and (self.parameter is None or self.joint is not None or self.constant != 0.0):
-            raise InputError("element", "a basis with a constant or a reading", "a basis and its parameter alone")
-
 
 @dataclass(frozen=True)
 class Joint:

@@ -92,7 +92,6 @@ def test_a_new_instrument_and_a_new_effect_are_calibrated_and_reported(run):
         assert abs(one["estimate"] - factor * true[joint - 1][kind]) < 3.0 * one["sigma"]
         assert one["estimate"] == pytest.approx(calibrated[joint - 1][kind], rel=1e-12)  # in rad
     assert found["q3.wave"]["nominal"] == pytest.approx(0.2 * DEG, rel=1e-12)
-    assert found["q3.wave"]["prior_sigma"] == pytest.approx(0.1 * DEG, rel=1e-12)
     for words in (text, (folder / "result/report.html").read_text()):
         assert "inclination" in words
         assert "q2.gain" in words

@@ -10,7 +10,7 @@ from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.initialization import Camera
-from fg_calib.measurements import Frames, check_rows, residuals
+from fg_calib.measurements import Frames, LandmarkKind, check_rows, residuals
 from fg_calib.measurements.kind import Stacked
 from fg_calib.measurements.kinds.anchor import AnchorContact, AnchorDistance
 from fg_calib.measurements.kinds.board import BoardPose
@@ -117,6 +117,11 @@ def test_predicted_data_leave_no_residuals(kind):
     assert data.shape == (6, kind.width)
     if kind.width:  # of a contact nothing is measured: the arm is where the point is
         assert kind.rows(at, data, nuisances).residual == pytest.approx(0.0, abs=rounding(10.0))
+
+
+def test_default_places_of_landmarks_of_two_coordinates_have_two():
+    kind = LandmarkKind("Z", "spot", "", "", units=("m", "m"), away=1.0)
+    assert kind.default_places(4, np.zeros(3), 1.0).shape == (4, 2)
 
 
 def test_the_mirror_image_of_an_anchor_is_as_far_from_points_in_a_plane():

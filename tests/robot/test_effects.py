@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from fg_calib import InputError, Measurements, Options, Robot, calibrate, observe_structure
+from fg_calib import InputError, Measurements, Options, calibrate, observe_structure
 from fg_calib.io import Units, quantity
 from fg_calib.robot import PARAMETER_KINDS, Joint, Parameter, RobotBuilder, pose
 from fg_calib.robot.model import ParameterKind
@@ -65,8 +65,3 @@ def test_units_of_a_gain_in_files_and_options():
 def test_an_unknown_kind_and_a_name_that_hides_it_are_one_line(name, kind):
     with pytest.raises(InputError, match=rf"parameter '{name}': kind '{kind}', expected a name that ends in its kind"):
         Parameter(name, kind, 1, 0.0)
-
-
-def test_a_robot_without_gains_refuses_their_tolerance():
-    with pytest.raises(InputError, match="unknown parameter or kind 'gain'"):
-        Robot.from_dh([[0.1, 0.0, 0.2, 0.0]], tolerance={"gain": 1e-3})

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from sparing import diagonal
 from tolerances import rounding
 
-from fg_calib.inputs import InputError
 from fg_calib.robot.kernels import LANES
 from fg_calib.robot.kinematics import SPAN, build_chain, forward, pose
 from fg_calib.robot.model import BASES, CONVENTIONS, Axis, Basis, Element, Joint, Parameter, RobotBuilder
@@ -236,8 +235,3 @@ def test_coefficients_that_are_fixed_at_zero_do_nothing():
     q = rng.uniform(-3, 3, (3, 4))
     assert len(build_chain(off).axis) == len(build_chain(robot).axis)
     assert np.array_equal(forward(build_chain(off), off.trig(q)).position, pose(robot, q).position)
-
-
-def test_a_basis_with_a_reading_is_refused():
-    with pytest.raises(InputError, match="a basis with a constant or a reading"):
-        Element(Axis.RZ, parameter=0, joint=1, basis=Basis("sin", 1))
