@@ -282,10 +282,9 @@ def mean_nees(rows: Sequence[Row]) -> float | None:
 def warned_answer(found: Row) -> str:
     """Which cells are outside the bounds, in what share of their draws a warning fires, and NEES of the other draws."""
     bad = {cell: row for cell, row in found.items() if not honest(row)}
-    others = {cell: row["nees without warning"] or float("nan") for cell, row in bad.items()}
+    others = {c: f", the others {one:.2f}" if (one := row["nees without warning"]) else "" for c, row in bad.items()}
     names = "; ".join(
-        f"{cell}: NEES {row['nees']:.2f}, warned {row['warned']:.0%}, the others {others[cell]:.2f}"
-        for cell, row in bad.items()
+        f"{cell}: NEES {row['nees']:.2f}, warned {row['warned']:.0%}{others[cell]}" for cell, row in bad.items()
     )
     return f"{honesty_answer(found)}. Not within: {names or 'none'}"
 
