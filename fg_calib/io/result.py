@@ -18,7 +18,7 @@ import platform
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
@@ -573,10 +573,11 @@ def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
 
 
 def _coded(words: Sequence[str], codes: Any) -> pl.Series:
-    """A column of words by their codes, empty words as null."""
+    """A column of words by their codes, four bytes a row, empty words as null."""
     import polars as pl
 
-    return pl.Series([word or None for word in words], dtype=pl.String)[np.asarray(codes, dtype=np.int64)]
+    kept = pl.Enum(list(dict.fromkeys(filter(None, words))))
+    return pl.Series([word or None for word in words], dtype=kept)[np.asarray(codes, dtype=np.uint32)]
 
 
 def configuration_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
@@ -642,13 +643,18 @@ def write_calibration(
         _write_robot(into, robot)
         for name, table in tables.items():
             table.write_parquet(into / name) if name.endswith(".parquet") else table.write_csv(into / name)
-        digests = {name: sha256(read_bytes(into / name)).hexdigest() for name in tables}
+        digests = {name: _digest(into / name) for name in tables}
         document = result.model_copy(update={"files": digests}).document()
         texts = {**pages, "result.json": json.dumps(document, indent=1, allow_nan=False) + "\n"}
         for name, text in texts.items():
             write_text(into / name, text)
 
     fill_folder(folder, write, RESULT_FILES)
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def _write_robot(folder: Path, robot: Robot) -> None:
