@@ -43,7 +43,7 @@ COLUMNS: Mapping[str, str] = {
     "sigma_orientation": "sigma_rx",
     "sigma_pixel": "sigma_u",
 }
-"""Arrays that hold several columns, or are called otherwise, by the first of these; others are called like theirs."""
+"""First column of each array that holds several, or whose name is not that of its column."""
 
 _SINGLE = [name for name, of in OF_CONFIGURATIONS.items() if len(of.names) == 1 and name not in ("id", "split")]
 
