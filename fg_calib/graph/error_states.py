@@ -313,13 +313,14 @@ def whitened_rows(
     ]
     parts = tuple(part for part, _, _ in found)
     L = spare = Sparse((sum(part.n_rows for part in parts), 0))
+    configurations = slots = np.zeros(0, dtype=np.int64)
     if shared.any():
         L = _stacked([L for _, L, _ in found])
         spare = Sparse(scipy.sparse.block_diag([E for _, _, E in found]))
-    configuration, slot = np.divmod(L.indices, width)
-    configurations, at = _ranks(configuration)
-    slots, k = _ranks(slot)
-    L = Sparse((L.data, at * len(slots) + k, L.indptr), shape=(L.shape[0], len(configurations) * len(slots)))
+        configuration, slot = np.divmod(L.indices, width)
+        configurations, at = _ranks(configuration)
+        slots, k = _ranks(slot)
+        L = Sparse((L.data, at * len(slots) + k, L.indptr), shape=(L.shape[0], len(configurations) * len(slots)))
     return WhitenedRows(
         parts=parts,
         states=SchurComplement(L, max(len(slots), 1)),

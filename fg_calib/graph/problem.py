@@ -141,13 +141,13 @@ class Problem(FrozenArrays):
         Raises:
             SolverError: A residual or derivative is not finite.
         """
-        v = self.variables
+        v, given = self.variables, self.rows  # of the system, which would keep the problem in a cycle
         r, J = prior_rows(v, parameters)
         rows, priors = square_root(self, parameters, with_loss=with_loss), np.column_stack([J, r])
         with np.errstate(over="ignore"):
             if not np.isfinite(np.vdot(rows, rows) + np.vdot(priors, priors)):
                 raise SolverError("a residual is not finite: the measurements or the robot hold absurd numbers")
-        gather = lambda: self.rows.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
+        gather = lambda: given.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
         return NormalSystem(rows, v.n_columns, v.prior_scales, priors, self.rows.states, gather)
 
     @cached_property

@@ -378,6 +378,7 @@ def _fit(problem: Problem, options: SolverOptions) -> _Fit:
     if problem.options.loss != "none":
         problem = relinearized_at(problem, start, _learn(problem, start, weighting)[0])
     here, converged, message, share = _Point(problem, start), False, "", 1.0
+    del problem  # a million pairs once less in memory
     while not message and len(history) < options.max_iterations:
         was, near, there = here, here.decrement <= COARSE, here
         if not near and (found := here.descend(damping)) is not None:
@@ -410,7 +411,7 @@ def _fit(problem: Problem, options: SolverOptions) -> _Fit:
     if converged and here.rounding > NEAR_ENOUGH:
         hidden = f"rounding hides the optimum, by {here.rounding:.0e} sigma"
         converged, message = False, f"not converged: {hidden}: noise, tolerances or lengths are out of all proportion"
-    return _Fit(here, tuple(history), converged, message if problem.variables.keys else "nothing to fit")
+    return _Fit(here, tuple(history), converged, message if here.problem.variables.keys else "nothing to fit")
 
 
 def _iteration(before: _Point, after: _Point, damping: float) -> Iteration:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +29,9 @@ from fg_calib.inputs import (
 from fg_calib.io.tables import OF_CONFIGURATIONS, OF_PAIRS, ROUNDED, Table, measurements_of
 from fg_calib.io.yaml import Units
 from fg_calib.measurements import Column, Measurements, Noise
+
+if TYPE_CHECKING:
+    import polars as pl
 
 COLUMNS: Mapping[str, str] = {
     "ids": "id",
@@ -116,9 +119,11 @@ class _Arrays(Table):
         """See `Table.numbers`."""
         return np.stack([self.frame[column] for column in columns], axis=1)
 
-    def names(self, column: str, expected: str, *, optional: bool = False) -> list[Any]:
+    def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
         """See `Table.names`."""
-        return as_names(f"{self.name}: {column}", self.frame[column], missing=optional)
+        import polars as pl
+
+        return pl.Series(as_names(f"{self.name}: {column}", self.frame[column], missing=optional), dtype=pl.String)
 
     def test_rows(self) -> Booleans:
         """See `Table.test_rows`."""

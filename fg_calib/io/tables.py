@@ -258,11 +258,11 @@ class Table:
             self.require(texts.is_not_null().to_numpy(), column, expected)
         return texts
 
-    def names(self, column: str, expected: str, *, optional: bool = False) -> list[Any]:
-        """The column as texts, without a word such as NA that stands for nothing; None where a cell may be empty."""
+    def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
+        """The column as texts, without a word such as NA that stands for nothing; null where a cell may be empty."""
         names = self.texts(column, "" if optional else expected)
         self.require(~names.str.to_lowercase().is_in(NOTHING).fill_null(False).to_numpy(), column, expected)
-        return names.to_list()
+        return names
 
     def test_rows(self) -> Booleans:
         """True where `split` says test, shape (n_rows,)."""
@@ -600,13 +600,12 @@ def read_ids(table: Table, *, repeated: bool) -> NDArray[np.str_]:
     """The configurations' names, different ones unless `repeated`: their ids, or else their 0-based row numbers."""
     if "id" not in table.columns:
         return np.arange(table.n_rows).astype(np.str_)
-    names, first = table.names("id", "an id"), dict[str, int]()
-    commented = np.array([name.startswith("#") for name in names])
+    names = table.names("id", "an id")
+    commented = names.str.starts_with("#").to_numpy()
     table.require(~commented | commented.all(), "id", "ids with # all or none", "# does not comment a row out")
     if not repeated:
-        different = np.array([first.setdefault(name, row) == row for row, name in enumerate(names)])
-        table.require(different, "id", "different ids")
-    return np.array(names, dtype=np.str_)
+        table.require(names.is_first_distinct().to_numpy(), "id", "different ids")
+    return np.array(names.to_list(), dtype=np.str_)
 
 
 def read_joint_table(
@@ -765,9 +764,15 @@ def _labels(table: Table, column: str, *, optional: bool) -> Labels:
     what = "point" if column == "group" else column
     expected = f"the name of a{'n' * (what[0] in 'aeiou')} {what}"
     cells = table.names(column, expected + ", or an empty cell" * optional, optional=optional)
-    names = tuple(dict.fromkeys(cell for cell in cells if cell is not None))
-    place = {name: i for i, name in enumerate(names)}
-    return Labels(names, np.array([-1 if cell is None else place[cell] for cell in cells], dtype=np.int64))
+    names = tuple(cells.drop_nulls().unique(maintain_order=True))
+    return Labels(names, _places(cells, {name: i for i, name in enumerate(names)}))
+
+
+def _places(names: pl.Series, place: dict[str, int]) -> Integers:
+    """The place of each name, -1 for others and for none."""
+    import polars as pl
+
+    return np.asarray(names.replace_strict(place, default=-1, return_dtype=pl.Int64).to_numpy(), dtype=np.int64)
 
 
 # --- pairs ------------------------------------------------------------------------------------------------------------
@@ -831,7 +836,7 @@ def _ends(table: Table, ids: NDArray[np.str_], groups: Sequence[str]) -> tuple[I
         if numbers and getattr(table.frame[key].dtype, "kind", "") in ("i", "u"):
             end = np.where(table.frame[key] < n, table.frame[key], -1).astype(np.int64)
         else:
-            end = np.array([place.get(name, -1) for name in table.names(key, "a configuration")], dtype=np.int64)
+            end = _places(table.names(key, "a configuration"), place)
         table.require(end >= 0, key, expected, "names of both stand for neither" * bool(both))
         found.append(end)
     a, b = found

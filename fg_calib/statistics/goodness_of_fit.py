@@ -323,17 +323,17 @@ class JudgedRows:
 
     def suspect_configurations(self) -> tuple[SuspectConfiguration, ...]:
         """Configurations whose rows are too large together, the least likely first."""
-        (place, end), n = self.table.row_ends(self.rows), len(self.table.names)
-        chi2, expected = (np.bincount(end, v[place], n) for v in (self.squares, self.means))
-        count, known = np.bincount(end, minlength=n), expected > 1e-3
+        chi2, expected = (self.table.sum_by_end(values, self.rows) for values in (self.squares, self.means))
+        known, table = expected > 1e-3, self.table
         limit = ALARM / max(1, int(np.sum(known)))
         # No effective number of degrees of freedom is below 1, where the tail is heaviest.
         least, found = 2.0 * special.erfcinv(limit) ** 2, []
         for k in np.flatnonzero(known & (chi2 > least * expected)).tolist():
             ratio = chi2[k] / expected[k]
-            p = upper_probability(ratio, max(1.0, self.degrees(np.unique(place[end == k]))))
+            mine = np.flatnonzero((table.a[self.rows] == k) | (table.b[self.rows] == k))
+            p = upper_probability(ratio, max(1.0, self.degrees(mine)))
             if p < limit:
-                one = SuspectConfiguration(self.table.names[k], int(count[k]), float(chi2[k]), float(expected[k]))
+                one = SuspectConfiguration(table.names[k], len(mine), float(chi2[k]), float(expected[k]))
                 found.append((p, -ratio, k, one))
         return tuple(one for *_, one in sorted(found))
 
@@ -378,10 +378,10 @@ class RowStatistics:
             squares = (table.after / table.sigma) ** 2
         self.studentised[variance < LEAST_VARIANCE] = np.nan
         covariance = self._of(fitted).with_errors(-self._model.of_all(spread.tangent)) if known else None
-        chosen = slice(None) if len(fitted) == table.n else fitted
-        of_fitted, means = w[chosen] * squares[chosen], w[chosen] * variance[chosen]
-        self.fitted = JudgedRows(table, fitted, of_fitted, means, covariance, self._shared)
-        self.predicted = self._predict(test, squares[test])
+        chosen, of_test = slice(None) if len(fitted) == table.n else fitted, squares[test]
+        squares, variance = (np.multiply(w, values, out=values)[chosen] for values in (squares, variance))
+        self.fitted = JudgedRows(table, fitted, squares, variance, covariance, self._shared)
+        self.predicted = self._predict(test, of_test)
 
     def _of(self, rows: Integers) -> ResidualCovariance:
         """Covariance of some of the kept rows, over sigma."""
@@ -468,7 +468,7 @@ class RowStatistics:
             expected, degrees, size = mean - excess[code], part.degrees(chosen), np.abs(self.studentised[rows])
             of_noise = np.inf if part is self.fitted else self._degrees_of_noise(self.fitted.of_kind(code))
             enough = expected >= 1.0
-            variance, specified = (float(np.mean(v[rows])) for v in (table.sigma**2, self._specified_variance))
+            variance, specified = (float(np.mean(v)) for v in (table.sigma[rows] ** 2, self._specified_variance[rows]))
             factor = float(np.sqrt(variance / specified))
             found.append(
                 KindFit(

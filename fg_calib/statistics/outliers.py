@@ -71,11 +71,10 @@ def _far(table: ResidualTable, fit: Goodness) -> Booleans:
     with np.errstate(invalid="ignore"):
         far = table.used & (np.abs(fit.studentised) > scale * suspect_level(int(np.sum(table.used)), CHANCE))
     far = table.used & np.isin(table.measurement_number, table.measurement_number[far])
-    place, end = table.row_ends(np.arange(table.n))
-    n_far, n_used = (np.bincount(end, rows[place], len(table.names)) for rows in (far, table.used))
-    wrong = place[(2.0 * n_far > n_used)[end]]
-    far[wrong] = table.used[wrong]
-    return far
+    n_far, n_used = (table.sum_by_end(rows) for rows in (far, table.used))
+    wrong = np.append(2.0 * n_far > n_used, False)  # the last for rows without an end
+    found: Booleans = far | table.used & (wrong[table.a] | wrong[table.b])
+    return found
 
 
 def _fit_without_outliers(

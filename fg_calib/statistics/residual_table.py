@@ -197,16 +197,20 @@ class ResidualTable(FrozenArrays):
     @cached_property
     def begins(self) -> Booleans:
         """Rows that begin a measurement's rows of one kind of noise, shape (n,)."""
-        key = np.stack([self.measurement_number, self.family])
-        begins = np.asarray(np.diff(key, prepend=-1).any(axis=0))
+        begins = np.ones(self.n, dtype=np.bool_)
+        begins[1:] = np.any([key[1:] != key[:-1] for key in (self.block, self.measurement, self.family)], axis=0)
         begins.flags.writeable = False
         return begins
 
-    def row_ends(self, rows: Integers) -> tuple[Integers, Integers]:
-        """The ends of some rows: place among these, and configuration or landmark, in `names`."""
-        ends = np.concatenate([self.a[rows], self.b[rows]]).astype(np.int64)
-        place = np.tile(np.arange(len(rows)), 2)
-        return place[ends >= 0], ends[ends >= 0]
+    def sum_by_end(self, values: Floats | Booleans, rows: Integers | slice = slice(None)) -> Floats:
+        """Sum of the values of the rows that each configuration or landmark, in `names`, takes part in.
+
+        Args:
+            values: Of some rows, shape (m,).
+            rows: Which ones they are, shape (m,); all by default.
+        """
+        of_none_too = sum(np.bincount(end[rows] + 1, values, len(self.names) + 1) for end in (self.a, self.b))
+        return np.asarray(of_none_too, dtype=np.float64)[1:]
 
     def rms(self, table: int | None = None) -> dict[str, dict[str, dict[str, float]]]:
         """RMS by split and kind, before and after: of the length of a measurement's rows of that kind.
@@ -242,19 +246,18 @@ class ResidualTable(FrozenArrays):
             Rows, shape (n,); sum of squares in sigma, shape (n,); by kind of noise the RMS of the length of a
             measurement's rows at the estimate, shape (n,), nan where there are none.
         """
-        n, (row, end) = len(held_out), self.row_ends(np.arange(self.n))
-        row, end = row[end < n], end[end < n]
-        counted = (self.reason_code[row] == 0) & (self.split[row] == held_out[end])
-        row, end = row[counted], end[counted]
-        family, first = self.family[row], self.begins[row]
-        rms = {}
+        mine = [(self.reason_code == 0) & (self.split == code) for code in (0, 1)]
+
+        def total(values: Floats | Booleans) -> Floats:
+            train, test = (self.sum_by_end(np.where(rows, values, 0.0))[: len(held_out)] for rows in mine)
+            return np.where(held_out, test, train)
+
         with np.errstate(divide="ignore", invalid="ignore"):  # of rows that have no sigma
-            for k, name in enumerate(self.families):
-                mine = family == k
-                squares = np.bincount(end[mine], self.after[row[mine]] ** 2, n)
-                rms[name] = np.sqrt(squares / np.bincount(end[mine], first[mine], n))
-            chi2 = np.bincount(end, (self.after[row] / self.sigma[row]) ** 2, n).astype(np.float64)
-        return np.bincount(end, minlength=n), chi2, rms
+            rms = {
+                name: np.sqrt(total((self.family == k) * self.after**2) / total((self.family == k) & self.begins))
+                for k, name in enumerate(self.families)
+            }
+            return total(self.reason_code == 0).astype(np.int64), total((self.after / self.sigma) ** 2), rms
 
     def held_out(self, labels: Sequence[str]) -> tuple[HeldOut, ...]:
         """Test rows that count, by table and kind of noise; rows at readings that are fitted too are left out.
@@ -286,7 +289,7 @@ class ResidualTable(FrozenArrays):
 def residual_table(solution: Solution) -> ResidualTable:
     """Every scalar residual, train and test, with the arm at nominal and at the estimate."""
     problem, data = solution.problem, solution.problem.data
-    before = noises_at(problem, solution.before)
+    before = [noise.residual() for noise in noises_at(problem, solution.before)]
     kinds: dict[RowKind, int] = {}
     reasons, labels = {"": 0}, {"": 0}
     columns: list[dict[str, NDArray[Any]]] = []
@@ -296,14 +299,14 @@ def residual_table(solution: Solution) -> ResidualTable:
         excluded = np.zeros(s.n, dtype=np.int16)
         for reason, mask in s.excluded.items():
             excluded[mask] = reasons.setdefault(reason, len(reasons))
-        m, k = np.nonzero(s.measured)  # measurement and component of each row
+        m, k = (index.astype(np.int32) for index in np.nonzero(s.measured))  # measurement and component of each row
         a, b = _ends(data.places[s.table][s.ends], data.landmarks.owners[s.nuisances], data.n_configurations)
         after, excess, sigma = new.residual(), new.excess, new.sigma
         columns.append(
             {
                 "kind_code": codes[k],
                 "block": np.full(len(m), number, dtype=np.int16),
-                "measurement": m.astype(np.int32),
+                "measurement": m,
                 "row": k.astype(np.int16),
                 "a": a[m],
                 "b": b[m],
@@ -312,7 +315,7 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "test": s.test[m],
                 "reason_code": excluded[m],
                 "measured": s.kind.figures(s.data)[m, k],
-                "before": old.residual()[m, k],
+                "before": old[m, k],
                 "after": after[m, k],
                 "excess": excess[m, k],
                 "sigma": sigma[m, k],
@@ -333,10 +336,11 @@ def residual_table(solution: Solution) -> ResidualTable:
 
 def _at_fitted_readings(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:
     """Which rows are of readings, at both ends, at which rows are fitted, shape (n,)."""
-    place, fitted = np.append(same_readings(readings), -1), (rows["reason_code"] == 0) & ~rows["test"]
-    ends = [place[np.where(rows[end] < len(readings), rows[end], -1)] for end in ("a", "b")]  # -1: no configuration
-    known = np.isin(ends, [-1, *np.unique(np.compress(fitted, ends, axis=1))]).all(axis=0)
-    out: Booleans = np.logical_and(known, np.not_equal(ends, -1).any(axis=0))
+    n, fitted = len(readings), (rows["reason_code"] == 0) & ~rows["test"]
+    place = np.append(same_readings(readings), n).astype(np.int32)  # the last is of no configuration
+    a, b = (place[np.minimum(rows[end], n)] for end in ("a", "b"))
+    has_fitted = np.bincount(np.concatenate([a[fitted], b[fitted], [n]]), minlength=n + 1) > 0
+    out: Booleans = has_fitted[a] & has_fitted[b] & (np.minimum(a, b) < n)
     return out
 
 
