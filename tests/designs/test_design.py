@@ -82,7 +82,6 @@ def test_a_target_is_reached():
     assert plan.n in (5, 6, 7)
 
 
-@pytest.mark.slow
 def test_what_no_candidate_determines_is_reported():
     """Lengths between configurations do not say where the base is."""
     lengths = scenario(Instrument(model="distance", name="it"), n=20, job={"gauge": "none"})
@@ -105,7 +104,7 @@ def job_of(instrument, configurations, stated=NOISE, **changes):
     return Job(None, of.robot, tables, Options(tables[0].model))
 
 
-@pytest.mark.slow
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["planes", "faces", "board", "pixels", "sockets"])
 def test_more_of_every_instrument_is_planned(kind):
     rng = np.random.default_rng(4)
@@ -116,7 +115,6 @@ def test_more_of_every_instrument_is_planned(kind):
     assert 0.0 < plan.expected.position <= plan.before.position
 
 
-@pytest.mark.slow
 def test_a_board_seen_from_below_is_seen_from_below_again():
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
     job = job_of(Instrument(model="board", name="it", boards=WALL), GivenReadings(q))
@@ -128,7 +126,6 @@ def test_a_board_seen_from_below_is_seen_from_below_again():
     assert under.expected.position == pytest.approx(above.expected.position, rel=1e-5)
 
 
-@pytest.mark.slow
 def test_rows_of_a_job_are_chosen_among_themselves():
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (30, 4))
     job = job_of(Instrument(model="pose", name="it", frame="unknown"), GivenReadings(q))
@@ -234,7 +231,6 @@ def test_pairs_that_are_measured_directly_are_refused_in_one_line():
 # --- all of it --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_the_curve_falls_and_designed_poses_are_better_than_random_ones():
     plan = planned(INSTRUMENTS["targets"], n=20, n_candidates=60)
     designed = np.array([p.designed for p in plan.curve])

@@ -41,12 +41,6 @@ KINDS = {name: (INSTRUMENTS[name],) for name in ALONE} | {
 }
 
 
-def kinds(*others):
-    """All kinds but some; what takes long is slow."""
-    slow = ("some that see nothing", "two boards")
-    return [pytest.param(k, marks=pytest.mark.slow) if k in slow else k for k in KINDS if k not in others]
-
-
 def pool_with(*instruments, n=N, **changes):
     n = 2 * n if any(i.model == "pixels" for i in instruments) else n
     of = scenario(*instruments, n=n, noise=NOISE, **changes)
@@ -84,7 +78,7 @@ def of_poses(rows, chosen=slice(None)):
     return square(rows.rows[chosen].reshape(-1, rows.rows.shape[2])) + square(rows.always)
 
 
-@pytest.mark.parametrize("kind", kinds())
+@pytest.mark.parametrize("kind", KINDS)
 def test_all_poses_together_hold_what_their_problem_holds(kind):
     """Column by column, nuisances too: to the rounding of sums, of a triangle, and of one Schur complement."""
     pool = pool_with(*KINDS[kind])
@@ -94,7 +88,7 @@ def test_all_poses_together_hold_what_their_problem_holds(kind):
     assert len(pool.rows.rows) == len(pool.readings) == pool.pose_of.max() + 1
 
 
-@pytest.mark.parametrize("kind", kinds("formed lengths"))
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "formed lengths"])
 def test_some_poses_hold_what_a_problem_of_them_alone_holds(kind):
     """Of the arm and its frames: landmarks, which may start at other values, are eliminated."""
     pool = pool_with(*KINDS[kind])
@@ -106,7 +100,7 @@ def test_some_poses_hold_what_a_problem_of_them_alone_holds(kind):
     assert apart(expected, found) < 1e-6  # eliminating unknowns that so few poses hardly hold takes half the digits
 
 
-@pytest.mark.parametrize("kind", kinds(*KINDS.keys() - {"pixels", "two boards"}))
+@pytest.mark.parametrize("kind", ["pixels", "two boards"])
 def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     """An image says of a tool frame what a pose says; of two boards in sight twice that."""
     pool = pool_with(*KINDS[kind])

@@ -47,7 +47,6 @@ def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
     assert ones @ covariance @ ones == pytest.approx(d5.sigma_of_combination**2, rel=1e-3)
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize("gauge", ["keep", "none"])
 def test_without_a_tolerance_only_what_does_not_depend_on_it_is_known(gauge):
     rng = np.random.default_rng(4)
@@ -69,7 +68,6 @@ def test_without_a_tolerance_only_what_does_not_depend_on_it_is_known(gauge):
         assert sigma[0] == pytest.approx(by_name["d5"].sigma_of_combination, rel=1e-2)
 
 
-@pytest.mark.slow
 def test_a_measurement_frame_is_as_uncertain_as_the_base_that_was_left_out():
     """The first joint's parameters move it along x and z and about them; along y and about it the frame is known."""
     rng = np.random.default_rng(5)

@@ -132,7 +132,6 @@ def test_groups_of_a_table_and_distances_between_them_are_read(tmp_path):
     assert (m.pairs.a.tolist(), m.pairs.b.tolist(), m.pairs.distance.tolist()) == ([0], [3], [0.7])
 
 
-@pytest.mark.slow
 def test_a_job_with_contacts_runs_from_the_command_line(fg_calib, tmp_path):
     robot, _, m = case(distances=((0, 1, 1e-4), (0, 3, 1e-4)), test=(3,))
     path = write_job(tmp_path, robot, m, model="distance", noise={"point": SIGMA, "distance": 1e-4})

@@ -90,7 +90,6 @@ def test_the_order_of_tables_and_one_table_in_parts_change_nothing():
         assert found.fit.chi_square.dof == whole.fit.chi_square.dof
 
 
-@pytest.mark.slow
 def test_a_point_of_one_name_in_two_tables_is_one_point():
     """Touches of three points, the last of them and the distances in a second table: the same as one table."""
     rng = np.random.default_rng(7)
@@ -166,7 +165,6 @@ def write_tables(folder, robot, tables, **keys):
     return path
 
 
-@pytest.mark.slow
 def test_a_job_of_several_tables_runs(fg_calib, tmp_path):
     robot, _, tables = mixture(11, sigma_joint=5e-4)
     ended = fg_calib("calibrate", write_tables(tmp_path, robot, tables), "--out", tmp_path / "result")

@@ -30,7 +30,6 @@ FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0,
 MAX_STEPS = 15
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("model", ["pose", "position", "distance", "distance-rotation"])
 @pytest.mark.parametrize("prior", [True, False])
 def test_the_calibrated_arm_predicts_what_it_was_not_fitted_to(model, prior):
@@ -51,7 +50,6 @@ def test_the_calibrated_arm_predicts_what_it_was_not_fitted_to(model, prior):
 AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8]]
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("model", "axis"), diagonal(["pose", "position", "orientation"], AXES, every=3))
 def test_a_frame_metres_away_and_rotated_by_180_degrees_converges(model, axis):
     rng, robot = np.random.default_rng(2), small_arm(estimate=TOOL if model == "pose" else [])
@@ -197,7 +195,6 @@ def test_sixty_real_poses_without_priors_arrive_in_few_steps(model, data_folder)
     assert solution.iterations <= MAX_STEPS + 1  # one more round: near 0 and 180 degrees rows change with the estimate
 
 
-@pytest.mark.slow
 def test_contacts_and_positions_that_share_joint_noise_arrive_with_a_robust_loss():
     """Derivatives of contacts leave out a rotation: the cost of rows whitened once may rise by some 1e-6."""
     rng, robot = np.random.default_rng(0), small_arm(tolerance=TOUCH_TOLERANCE, estimate=TOOL_POINT)

@@ -42,7 +42,7 @@ def measured(flange, X, T):
 @pytest.mark.parametrize("T", FAR)
 def test_frame_and_tool_are_found_from_poses(X, T):
     flange = flange_poses()
-    found = start_from_poses(flange, measured(flange, X, T), (IDENTITY, IDENTITY), Unknown(True, True, ALL))
+    found = start_from_poses(flange, measured(flange, X, T), (FAR[1], FAR[2]), Unknown(True, True, ALL))
     for f, expected in zip(found, (X, T), strict=True):
         assert f.rotation == pytest.approx(expected.rotation, abs=rounding(1, 10))
         assert f.translation == pytest.approx(expected.translation, abs=rounding(1, 1e3))
@@ -66,7 +66,6 @@ def test_tool_alone_is_found(T):
     assert found.translation == pytest.approx(T.translation, abs=rounding(1, 100))
 
 
-@pytest.mark.sampled(6)
 @pytest.mark.parametrize("X", FAR)
 @pytest.mark.parametrize("T", FAR)
 def test_rotations_about_one_axis_only_still_give_a_start_that_explains_the_poses(X, T):
@@ -92,9 +91,9 @@ def test_what_the_poses_leave_open_stays_at_nominal():
     R, p = flange_poses()
     flange = (np.tile(R[:1], (12, 1, 1)), p)  # never turns: frame and tool translations act together
     T = Frame(np.eye(3), np.array([0.0, 0.0, 0.4]))
-    X, tool = start_from_poses(flange, measured(flange, IDENTITY, T), (IDENTITY, T), Unknown(True, False, ALL))
+    X, tool = start_from_poses(flange, measured(flange, FAR[2], T), (FAR[2], T), Unknown(True, False, ALL))
     assert tool.translation == pytest.approx(T.translation, abs=rounding(1, 10))
-    assert X.translation == pytest.approx(np.zeros(3), abs=rounding(1, 10))
+    assert X.translation == pytest.approx(FAR[2].translation, abs=rounding(1, 10))
 
 
 @pytest.mark.parametrize("t", [[0.3, -0.2, 0.9], [-2.0, 1.0, 3.0], [0.0, 0.0, 0.01]])

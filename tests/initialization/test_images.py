@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization import Camera
-from fg_calib.initialization.boards import boards_from_image, undistorted
+from fg_calib.initialization.boards import _two_poses, boards_from_image, undistorted
 
 CAMERA = Camera(fx=900, fy=880, cx=640, cy=480)
 CORNERS = np.array([[0.08 * i, 0.08 * j] for i in range(4) for j in range(3)])
@@ -54,7 +54,6 @@ def test_a_board_from_its_image(distortion):
             assert found.rotation == pytest.approx(R, abs=abs_R)
 
 
-@pytest.mark.sampled(3)
 @pytest.mark.parametrize("cosine", [-0.9, 0.05, 0.12, 0.3, 0.9])
 def test_an_image_leaves_two_poses_and_the_true_one_is_among_them(cosine):
     """At 0.3 pixel, of a board seen nearly from its edge too."""
@@ -68,7 +67,18 @@ def test_an_image_leaves_two_poses_and_the_true_one_is_among_them(cosine):
         assert min(angle_between(R, frame.rotation) for _, frame in found) < 0.15
 
 
-@pytest.mark.sampled(1)
+@pytest.mark.parametrize("cosine", [-0.9, 0.3, 0.9])
+def test_one_of_the_two_poses_that_a_homography_leaves_is_the_true_one(cosine):
+    """Its derivative at the board's middle is that of two turned boards."""
+    R, place = tilted(cosine, np.random.default_rng(1))
+    H = np.column_stack([R[:, :2], place])
+    seen = np.column_stack([CORNERS, np.ones(12)]) @ H.T
+    found = _two_poses(H, CORNERS, seen[:, :2] / seen[:, 2:])
+    off = [angle_between(R, frame.rotation) for frame in found]
+    assert min(off) < 1e-7 < max(off)
+    assert found[np.argmin(off)].translation == pytest.approx(place, abs=1e-9)
+
+
 @pytest.mark.parametrize("n_off", [1, 2])
 def test_corners_that_are_far_off_do_not_move_a_board(n_off):
     """30 pixels, of 12 corners at 0.1 pixel: where the others alone have it."""

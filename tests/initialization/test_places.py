@@ -20,7 +20,6 @@ def arm(n, rng):
     return Rotation.random(n, random_state=rng.integers(1000)).as_matrix(), rng.normal(size=(n, 3))
 
 
-@pytest.mark.sampled(9)
 @pytest.mark.parametrize("away", [0.1, 3.0])
 @pytest.mark.parametrize("n_targets", [1, 2, 3])
 @pytest.mark.parametrize("n_known", [0, 1])
@@ -42,7 +41,6 @@ def test_targets_and_frame_from_positions(away, n_targets, n_known, unknown_fram
         assert found.translation == pytest.approx(X.translation, abs=0.1)  # 30 mrad at some metres
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 @pytest.mark.parametrize("flat", [1.0, 0.2])
 def test_anchors_and_what_an_instrument_adds_from_lengths(offset, flat):

@@ -63,7 +63,6 @@ class Pandas:
         return self._columns
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize("frame", ["polars", "lazy", "pandas", "mapping", "arrays"])
 def test_every_way_in_gives_what_a_csv_gives(tmp_path, frame):
     columns, pairs, arrays = table()

@@ -155,7 +155,6 @@ def test_compiled_twins_compute_what_numpy_does(kind, convention):
         assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
 
 
-@pytest.mark.sampled(2)
 @EVERY_KIND
 def test_the_reductions_are_those_of_the_rows(kind):
     rng = np.random.default_rng(20)

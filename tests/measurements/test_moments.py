@@ -24,7 +24,6 @@ def of_angle(f, along, across, own=0.0):
     return found.excess[0], found.slope[0], found.variance[0]
 
 
-@pytest.mark.sampled(6)
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e3])
 @pytest.mark.parametrize("f", LENGTHS)
 def test_errors_alike_in_all_directions_give_the_noncentral_chi_distribution(f, scale):

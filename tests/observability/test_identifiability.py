@@ -56,7 +56,6 @@ RANKS = [
 ]
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("robot", "ranks", "n"), RANKS, ids=[f"{r.name}-{i}" for i, (r, _, _) in enumerate(RANKS)])
 def test_ranks_of_known_arms(robot, ranks, n):
     for model, rank in zip(MODELS, ranks, strict=True):

@@ -52,7 +52,6 @@ def observed(robot, model, frame="known", n=300, seed=0):
     return observability_of(problem, problem.variables.nominal())
 
 
-@pytest.mark.sampled(3)
 @pytest.mark.parametrize("model", TABLE)
 def test_the_papers_robot_has_the_ranks_and_groups_of_its_tables(model):
     rank, ineffective, groups = TABLE[model]
@@ -71,7 +70,6 @@ def test_the_package_keeps_what_the_paper_keeps():
     assert [g.keep for g in found.relative] == [("theta2",), ("theta3",), ("d5",), ("theta6",), ("theta7",)]
 
 
-@pytest.mark.slow
 def test_relations_say_what_moves_together():
     found = observed(paper_robot(), "distance")
     relations = {g.parameters: g.relations for g in found.relative}

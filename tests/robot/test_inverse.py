@@ -55,7 +55,6 @@ def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
     require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
 
-@pytest.mark.slow
 def test_limits_that_are_no_whole_turn_about_zero_are_kept():
     builder = RobotBuilder("shifted", "dh")
     builder.add_frame("base", {}, 0, False)

@@ -36,7 +36,6 @@ def job_of(robot, *tables, **options):
     return Job(None, robot, given, options)
 
 
-@pytest.mark.slow
 def test_every_configuration_is_predicted_once_by_the_others():
     """Against separate calibrations, fold by fold."""
     robot, m = poses(n_test=7)
@@ -77,7 +76,6 @@ def with_measured_pairs(ends, seed=0):
     return robot, Measurements.from_arrays(m.readings, ids=m.ids, pairs=pairs)
 
 
-@pytest.mark.slow
 def test_a_measured_pair_is_held_out_once():
     chain = [(k, k + 1) for k in range(39)] + [(k, (k + 7) % 40) for k in range(33)] + [(k, k + 3) for k in range(37)]
     robot, m = with_measured_pairs(chain)
@@ -87,7 +85,6 @@ def test_a_measured_pair_is_held_out_once():
     assert found.kinds["distance"].n == len(chain)  # each once, although it is fitted without neither of its ends
 
 
-@pytest.mark.slow
 def test_the_hub_of_measured_pairs_is_never_held_out():
     robot, m = with_measured_pairs([(0, k) for k in range(1, 40)])
     found = cross_validate(job_of(robot, m, model="distance"), 5)
@@ -143,7 +140,6 @@ def test_only_what_chance_does_not_explain_is_wide():
     assert wide({"a": 2.0}, 30) == ["a"]
 
 
-@pytest.mark.slow
 def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
     robot, _, table = measured_by("anchors", np.random.default_rng(0), n=40)
     m = table.measurements

@@ -58,7 +58,6 @@ def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(in
     assert any(about in finding for finding in wrong.findings)
 
 
-@pytest.mark.slow
 def test_contact_with_a_single_point_does_not_move_it():
     """Nothing that was measured moves: healthy, and no figure over 0."""
     robot, table = touched("contacts", np.random.default_rng(1), n_points=1)

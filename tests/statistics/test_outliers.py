@@ -14,6 +14,7 @@ from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import Pairing
+from fg_calib.statistics.outliers import _names
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 
@@ -54,7 +55,7 @@ def spoilt(name, by, rng):
 SPOILT = ["pose", "star", "all", "anchors", "planes", "board", "targets"]
 
 
-@pytest.mark.slow
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(("name", "by"), diagonal(SPOILT, [60.0, 2000.0]))
 def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     problem, wrong = spoilt(name, min(by, 300.0) if name == "all" else by, np.random.default_rng(5))
@@ -64,6 +65,10 @@ def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     assert [name.removeprefix("0 and ") for name in found.fit.goodness.gross.names] == [wrong]
     assert found.fit.goodness.gross.ratio < 1.5
     assert not found.noise_may_be_estimated
+
+
+def test_what_is_an_end_of_several_wrong_pairs_is_named_in_their_place():
+    assert _names([("0", "9"), ("3", "9"), ("4", "5"), ("", "7")]) == ("9", "4 and 5", "7")
 
 
 @pytest.mark.slow

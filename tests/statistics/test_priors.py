@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from instruments import measured_by
 from scipy.stats import chi2, multivariate_normal, norm
 from simulated import TOOL, measure, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
@@ -160,7 +161,6 @@ def test_the_estimate_is_that_with_the_tolerances_found_specified():
     assert sigmas_apart(solved().parameters[:n], again.parameters[:n], sigma) < NEGLIGIBLE
 
 
-@pytest.mark.slow
 def test_not_knowing_the_scales_makes_sigmas_larger():
     problem, _ = drawn_problem("distance", n=14, estimate_tolerance="kind")
     solution = estimate_tolerances(problem)
@@ -191,7 +191,6 @@ def test_joints_without_tolerances_start_from_a_millimetre_and_a_milliradian():
     assert set(arm.values()) == {FIRST_TOLERANCE}
 
 
-@pytest.mark.slow
 def test_noise_and_tolerances_are_estimated_together():
     problem, _ = drawn_problem(n=30, estimate_tolerance="kind", estimate_noise=True)
     tripled = replace(problem.measurements, sigma_position=3.0 * problem.measurements.sigma_position)
@@ -231,6 +230,18 @@ def test_a_correction_varies_by_what_the_data_take_off_its_prior_variance():
     A = np.eye(16) - P @ found.spread.tangent @ P.T
     nu = np.trace(A) ** 2 / np.sum(A * A)
     assert priors.p_value == pytest.approx(chi2.sf(nu * priors.chi2 / priors.expected, nu))
+
+
+def test_a_place_varies_by_what_the_data_take_off_its_prior_variance():
+    """As a parameter does, on each axis."""
+    robot, _, table = measured_by("anchors nearly", np.random.default_rng(3), n=12)
+    found = assess(solve(build_problem(robot, [table])))
+    priors, places = found.fit.priors, [one for one in found.estimates.landmarks if one.name in table.known]
+    sigma = np.concatenate([place.sigma for place in places]) / 1e-3
+    z = np.concatenate([place.xyz - table.known[place.name].xyz for place in places]) / 1e-3
+    assert priors.names[-9:] == tuple(np.repeat([f"anchor {place.name}" for place in places], 3))
+    np.testing.assert_allclose(priors.z[-9:], z, rtol=1e-6)
+    np.testing.assert_allclose(priors.sigma[-9:], np.sqrt(1.0 - sigma**2), rtol=1e-6)
 
 
 def test_a_correction_beyond_its_prior_is_named_and_what_follows_it_is_not():
