@@ -125,7 +125,8 @@ def command(*arguments: str, root: Path = ROOT) -> Row:
         before, clock = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         done = subprocess.run(
             [sys.executable, "-P", "-c", _COMMAND, str(peak), *arguments],
-            capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": str(root)},
+            capture_output=True, text=True, check=False,
+            env=os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": ""},
         )  # fmt: skip
         seconds, after = time.perf_counter() - clock, resource.getrusage(resource.RUSAGE_CHILDREN)
         if done.returncode:

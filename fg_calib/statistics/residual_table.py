@@ -209,8 +209,8 @@ class ResidualTable(FrozenArrays):
             values: Of some rows, shape (m,).
             rows: Which ones they are, shape (m,); all by default.
         """
-        of_none_too = sum(np.bincount(end[rows] + 1, values, len(self.names) + 1) for end in (self.a, self.b))
-        return np.asarray(of_none_too, dtype=np.float64)[1:]
+        of_ends = [np.bincount(end[rows] + 1, values, len(self.names) + 1)[1:] for end in (self.a, self.b)]
+        return np.asarray(np.sum(of_ends, axis=0), dtype=np.float64)
 
     def rms(self, table: int | None = None) -> dict[str, dict[str, dict[str, float]]]:
         """RMS by split and kind, before and after: of the length of a measurement's rows of that kind.
@@ -301,7 +301,6 @@ def residual_table(solution: Solution) -> ResidualTable:
             excluded[mask] = reasons.setdefault(reason, len(reasons))
         m, k = (index.astype(np.int32) for index in np.nonzero(s.measured))  # measurement and component of each row
         a, b = _ends(data.places[s.table][s.ends], data.landmarks.owners[s.nuisances], data.n_configurations)
-        after, excess, sigma = new.residual(), new.excess, new.sigma
         columns.append(
             {
                 "kind_code": codes[k],
@@ -316,9 +315,9 @@ def residual_table(solution: Solution) -> ResidualTable:
                 "reason_code": excluded[m],
                 "measured": s.kind.figures(s.data)[m, k],
                 "before": old[m, k],
-                "after": after[m, k],
-                "excess": excess[m, k],
-                "sigma": sigma[m, k],
+                "after": new.residual()[m, k],
+                "excess": new.excess[m, k],
+                "sigma": new.sigma[m, k],
             }
         )
     together = {name: np.concatenate([c.pop(name) for c in columns]) for name in list(columns[0])}  # never all twice
@@ -340,8 +339,7 @@ def _at_fitted_readings(readings: Floats, rows: dict[str, NDArray[Any]]) -> Bool
     place = np.append(same_readings(readings), n).astype(np.int32)  # the last is of no configuration
     a, b = (place[np.minimum(rows[end], n)] for end in ("a", "b"))
     has_fitted = np.bincount(np.concatenate([a[fitted], b[fitted], [n]]), minlength=n + 1) > 0
-    out: Booleans = has_fitted[a] & has_fitted[b] & (np.minimum(a, b) < n)
-    return out
+    return np.asarray(has_fitted[a] & has_fitted[b] & (np.minimum(a, b) < n))
 
 
 def same_readings(readings: Floats) -> Integers:
