@@ -22,7 +22,7 @@ from fg_calib.inputs import InputError, options
 from fg_calib.io import Units, read_measurements
 from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot import pose
-from fg_calib.simulation.scenario import Errors, Placement, RandomReadings, Scenario
+from fg_calib.simulation.scenario import Errors, RandomReadings, Scenario
 
 ROBOT = planar_robot(tolerance={"a": 1e-3, "theta": 1e-3})
 TABLE = measure(ROBOT, 20, np.random.default_rng(0))
@@ -53,7 +53,6 @@ def scenario(**changes):
                        "noise": Noise(1e-3, 1e-3)} | changes)  # fmt: skip
 
 
-BOARD = Placement(np.eye(3), np.zeros(3))
 WORDS = {
     "model": (options.Model, (problem, bound, structure, practical)),
     "frame": (options.FrameKnowledge, (problem, bound, structure, practical)),

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
 from fg_calib.graph.build import build_problem
+from fg_calib.graph.problem import named_rows
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import Pairing, ProblemError
 from fg_calib.measurements.dataset import Measurements, Pairs
@@ -197,6 +198,17 @@ def test_a_configuration_against_itself_says_nothing_of_the_arm():
     )
     assert problem.n_excluded["same_configuration"] == 1
     assert problem.n_residuals == 2
+
+
+def test_a_frame_takes_no_more_of_rows_than_it_explains():
+    """Two positions leave its turn about the line between them open: five of its six columns are told apart."""
+    robot = small_arm(tolerance={"a": 1e-3})
+    problem = build_problem(robot, measure(robot, 2, np.random.default_rng(0)), model="position", frame="unknown")
+    v, J = problem.variables, problem.linearize(problem.start).left.A
+    rows, frame = (J @ v.tangent_derivative(problem.start))[:, : v.n_robot_columns], J[:, v.n_robot_columns :]
+    assert np.linalg.matrix_rank(frame, rtol=1e-9) == 5
+    expected = rows - frame @ np.linalg.pinv(frame, rcond=1e-9) @ rows
+    assert named_rows(v, problem.start, J) == pytest.approx(expected, abs=1e-9 * np.abs(rows).max())
 
 
 def test_numbers_of_rows_pairs_and_priors():

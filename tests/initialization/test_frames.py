@@ -14,7 +14,6 @@ from fg_calib.initialization.hand_eye import (
 )
 
 ALL = np.ones(3, dtype=bool)
-NONE = np.zeros(3, dtype=bool)
 IDENTITY = Frame(np.eye(3), np.zeros(3))
 FAR = [
     Frame(Rotation.from_rotvec([0, 0, np.pi]).as_matrix(), np.array([20.0, -3.0, 7.0])),

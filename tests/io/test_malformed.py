@@ -87,7 +87,6 @@ URDFS = [
 TWO_JOINTS = "convention: mdh\njoints:\n" + ROW + "  - {a: 0, alpha: 0, d: 0, theta: 0, type: prismatic}\n"
 ONE_JOINT = "convention: mdh\njoints:\n" + ROW
 JOB = "robot: robot.yaml\nmeasurements: poses.csv\nmodel: pose\n"
-T = "robot: robot.yaml\nmeasurements:\n"
 JOBS = [
     (JOB + "columns: {q1: {name: x, scale: 0}}\n", 'job.yaml: columns: x: scale: found 0, expected a number other than 0'),
     (JOB + "prior: false\ngauge: prior\n", "job.yaml: prior: found False with gauge: prior, expected gauge alone"),

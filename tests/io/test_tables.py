@@ -198,7 +198,6 @@ def changed(old, new, table=POSES):
 
 COLUMNS = "id, x, y, z, qx, qy, qz, qw, split, note"
 JOINTS = "expected q1 to q3 for the robot's 3 joints, or their names q1, q2, lift; the columns are"
-WIDEN = "; widen the joint's limits if the reading is right; are the columns in the joints' order?"
 
 MISTAKES = [
     (changed("q3,id", "q3,q4"),

@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import InputError, Robot, calibrate, correct
+from fg_calib.prediction import correction
 from fg_calib.robot import pose
 from fg_calib.robot.inverse import random_readings
 
@@ -77,8 +78,8 @@ def test_positions_alone_take_any_orientation_and_stay_near(calibrated):
     assert np.abs(there - T[:, :3, 3]).max() < 1e-9
 
 
-@pytest.mark.slow
-def test_limits_are_kept_and_what_is_out_of_reach_is_said(calibrated):
+def test_limits_are_kept_and_what_is_out_of_reach_is_said(calibrated, monkeypatch):
+    monkeypatch.setattr(correction, "N_STARTS", 2)
     robot, _, found = calibrated
     lower, upper = robot.limits.T
     edge = np.array([upper, lower, 0.5 * upper])

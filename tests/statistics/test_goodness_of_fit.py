@@ -20,9 +20,7 @@ from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.rotations import rotation_angle
 from fg_calib.statistics import variance_components as noise
-from fg_calib.statistics.covariance import spread_of
-from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit, RowStatistics
-from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit
 from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
@@ -93,10 +91,6 @@ def factors_of(solution):
     """The factors that noise was estimated with, by kind, of the only table."""
     assert all(table == 0 or name == "joint" for table, name in solution.problem.state.factors)
     return {kind: factor for (_, kind), factor in solution.problem.state.factors.items()}
-
-
-def kinds_of(solution):
-    return RowStatistics(solution, spread_of(solution), residual_table(solution)).fit_kinds()
 
 
 def test_leverages_are_those_of_the_hat_matrix():

@@ -81,10 +81,8 @@ CHOICES = {
     "encoder estimated": {"model": "pose", "encoder": "estimated"},
     "no joint noise": {"model": "pose"},
     "joints drowned": {"model": "pose"},
-    "star": {"model": "distance-rotation"},
     "star of distances": {"model": "distance"},
     "all distances": {"model": "distance", "pairing": Pairing("all")},
-    "random": {"model": "distance-rotation", "pairing": Pairing("random", 100, 0)},
     "touches": {"model": "distance"},
     "tables": {},
 }
@@ -236,16 +234,3 @@ def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeyp
     solution = estimate_noise(draw("pose", np.random.default_rng(11))[0])
     assert not solution.converged
     assert assess(solution).verdict.errors[0].startswith("not converged: the estimated noise still moved by ")
-
-
-N_DRAWS = 24
-
-CELLS = {  # how much own and joint noise is specified, as a multiple of what there is
-    "pose": (1 / 3, 2.0),
-    "encoder estimated": (1 / 3, 2.0),
-    "joints drowned": (1 / 3, 1.0),
-    "tables": (1 / 3, 2.0),
-    "star": (1.0, 2.0),
-    "random": (1 / 3, 2.0),
-    "touches": (1 / 3, 2.0),
-}
