@@ -74,12 +74,7 @@ def _anchors(at, q, test, rng, sigma_joint, how):
     which, offset = np.arange(n) % 3, 0.3 if "offset" in how else 0.0
     length = np.linalg.norm(at.position - anchors[which], axis=1) + offset + sigma * rng.normal(size=n)
     data = Measurements.from_arrays(
-        q,
-        anchor=[f"a{i}" for i in which],
-        distance=length,
-        sigma_distance=sigma,
-        sigma_joint=sigma_joint,
-        test=test,
+        q, anchor=[f"a{i}" for i in which], distance=length, sigma_distance=sigma, sigma_joint=sigma_joint, test=test
     )
     known = {"a0": KnownPoint(anchors[0])} if "known" in how else {}
     if "nearly" in how:
@@ -93,12 +88,7 @@ def _planes(at, q, test, rng, sigma_joint, how):
     which, normals = np.arange(n) % 3, np.linalg.qr(rng.normal(size=(3, 3)))[0]
     distance = np.einsum("ni,ni->n", normals[which], at.position) + 1.0 + sigma * rng.normal(size=n)
     data = Measurements.from_arrays(
-        q,
-        plane=[f"p{i}" for i in which],
-        distance=distance,
-        sigma_distance=sigma,
-        sigma_joint=sigma_joint,
-        test=test,
+        q, plane=[f"p{i}" for i in which], distance=distance, sigma_distance=sigma, sigma_joint=sigma_joint, test=test
     )
     return Table(data, "plane")
 

@@ -90,11 +90,7 @@ def test_unknown_frame_and_tool_start_where_the_graph_starts(tmp_path, prefer):
 
 @pytest.mark.slow
 def test_a_job_without_test_rows_is_reweighted_at_its_train_rows(simulated_job):
-    job = replace(
-        simulated_job,
-        truth=None,
-        measurements=replace(simulated_job.measurements, test=np.zeros(85, bool)),
-    )
+    job = replace(simulated_job, truth=None, measurements=replace(simulated_job.measurements, test=np.zeros(85, bool)))
     found = compare(job)
     assert (found.judged_on, found.n_judged, found.errors_before) == ("train", 85, None)
     assert all(e.errors is None for e in found.estimates)
@@ -148,10 +144,7 @@ def test_where_nothing_is_determined_only_the_graph_with_priors_runs(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "instrument",
-    ["targets", "targets stations", "anchors offset", "planes", "pixels"],
-)
+@pytest.mark.parametrize("instrument", ["targets", "targets stations", "anchors offset", "planes", "pixels"])
 def test_plain_least_squares_finds_the_graphs_optimum_of_every_instrument(instrument, tmp_path):
     """Two roads that share residuals alone, places and frames unknown to both: to a thousandth of a sigma."""
     robot, true, table = measured_by(instrument, np.random.default_rng(0))

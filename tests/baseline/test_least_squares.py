@@ -116,12 +116,7 @@ def test_an_unknown_frame_is_the_graphs(model):
     solution = solve(problem, TO_THE_END)
     near = np.array([*robot.nominal, 6.9, -3.1, 2.05, 0.4, 1.2, 0.25])
     fit = fit_least_squares(
-        robot,
-        measurements,
-        model=model,
-        frame="unknown",
-        names=[p.name for p in problem.estimated],
-        start=near,
+        robot, measurements, model=model, frame="unknown", names=[p.name for p in problem.estimated], start=near
     )
     assert fit.converged, fit.message
     assert apart(fit, solution.parameters[:-6]) < NEGLIGIBLE

@@ -39,11 +39,7 @@ def drawing(tmp_path_factory):
     folder = tmp_path_factory.mktemp("board")
     (folder / "board.yaml").write_text(yaml.safe_dump(CHECKERBOARD))
     (folder / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA)))
-    true = drawn(
-        folder / "images",
-        BOARD,
-        np.random.default_rng(0),
-    )
+    true = drawn(folder / "images", BOARD, np.random.default_rng(0))
     rows = "".join(f"view{k},{10 * k},0.50,,{1 + k}\n" for k in range(N))
     (folder / "poses.csv").write_text(f"id,q1,q2,split,x\n{rows}absent,1,2,test,3\n")
     return folder, true

@@ -71,11 +71,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     ),
     "an unknown model": (replaced(JOB, "^model: .*", "model: distances"), CALIBRATE, "did you mean distance?"),
     "no noise": (replaced(JOB, "^noise.*", ""), CALIBRATE, "no sigma for distance, expected noise.position or a"),
-    "a table as the job": (
-        nothing,
-        ("calibrate", POSES),
-        "expected a mapping, key: value",
-    ),
+    "a table as the job": (nothing, ("calibrate", POSES), "expected a mapping, key: value"),
     "an output folder that is a file": (written("mine", "out"), CALIBRATE, "out: cannot be written: "),
     "no robot to observe": (nothing, ("observe", "missing.yaml"), "missing.yaml: no such file"),
     "an unknown parameter": (nothing, ("observe", ROBOT, "--prefer", "d9"), "unknown parameter 'd9'"),
@@ -107,11 +103,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "a date before": (nothing, (*UPDATE, "--date", "1999-01-01"), "is before the calibration"),
     "the folder of the result": (nothing, (*UPDATE[:-1], "result"), "the folder of the result"),
     "too many stops": (nothing, (*DESIGN, "--n", 100000), "n: "),
-    "a target without unit": (
-        nothing,
-        (*DESIGN, "--target", "0.3"),
-        "--target: 0.3; give a unit, such as 0.3mm",
-    ),
+    "a target without unit": (nothing, (*DESIGN, "--target", "0.3"), "--target: 0.3; give a unit, such as 0.3mm"),
     "a folder without result": (
         lambda folder: (folder / "empty").mkdir(),
         ("export", "empty", "--to", "dh"),

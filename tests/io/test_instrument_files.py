@@ -91,11 +91,7 @@ def test_every_form_of_a_known_point(tmp_path):
 @pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("top", "entry", "fixed"),
-    [
-        ("camera.yaml", "fixed", True),
-        (None, {"file": "camera.yaml", "fixed": True}, True),
-        (None, INTRINSICS, False),
-    ],
+    [("camera.yaml", "fixed", True), (None, {"file": "camera.yaml", "fixed": True}, True), (None, INTRINSICS, False)],
 )
 def test_every_form_of_a_camera(top, entry, fixed, tmp_path):
     robot, _, table = measured_by("pixels", np.random.default_rng(22))

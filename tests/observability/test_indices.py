@@ -7,7 +7,7 @@ from simulated import measure, paper_robot
 from fg_calib.graph.build import build_problem
 from fg_calib.inputs import Pairing
 from fg_calib.observability.identifiability import observability_of
-from fg_calib.observability.indices import RelativeGroup, observability_indices, observability_of_rows
+from fg_calib.observability.indices import RelativeGroup, _chained, observability_indices, observability_of_rows
 from fg_calib.robot.model import Parameter
 
 # Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.
@@ -28,11 +28,7 @@ TABLE = {
         BASE_FREE,
         [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6", "a7"], ["d6", "alpha7"]],
     ),
-    "rotation": (
-        11,
-        None,
-        [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"]],
-    ),
+    "rotation": (11, None, [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"]]),
     "position": (
         25,
         ["beta6", "theta7", "beta7"],
@@ -79,6 +75,11 @@ def test_relations_say_what_moves_together():
     assert relations[("d6", "alpha7")] == ({"d6": 0.5, "alpha7": 1.0},)
 
 
+def test_relations_are_chained_each_to_the_next():
+    found = _chained(np.array([[1.0, 0.0, 0.0, -2.0], [0.0, 1.0, 0.0, -4.0], [0.0, 0.0, 1.0, -2.0]]))
+    assert found.tolist() == [[1.0, -0.5, 0.0, 0.0], [0.0, 1.0, -2.0, 0.0], [0.0, 0.0, 1.0, -2.0]]
+
+
 def test_indices_follow_their_formulas():
     s = np.array([9.0, 8.0, 3.0])
     expected = {"O1": 6.0 / 2, "O2": 1 / 3, "O3": 3.0, "O4": 1.0, "O5": 1 / (1 / 9 + 1 / 8 + 1 / 3)}
@@ -123,3 +124,6 @@ def test_a_tolerance_says_what_is_weak():
     assert [weak.members for weak in found.weak] == [{"a2": 1.0}]
     assert found.weak[0].signal_to_noise == pytest.approx(2.0)
     assert found.sigma == pytest.approx(dict.fromkeys(("a1", "a2", "a3"), 1e-6))
+    rows = np.array([[1e6, 1e6], [2e3, -2e3]])  # the sum is seen a thousand times as well as the difference
+    (weak,) = observability_of_rows(rows, parameters[::2], scales=np.full(2, 1e-3), n_measurements=2).weak
+    assert weak.members == pytest.approx({"a1": np.sqrt(0.8), "a3": -np.sqrt(0.2)}, rel=1e-3)  # in tolerances

@@ -10,12 +10,13 @@ from simulated import measure, true_robot
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
+from fg_calib.io.robot_file import read_robot
 from fg_calib.observability.parallel_axes import missing_motions
 from fg_calib.robot.model import Axis, Joint, RobotBuilder
 
 QUARTER, SIGMA = np.pi / 2, (5e-5, 1e-4)
 TILT, SHIFT = (Axis.RY,), (Axis.TY,)
-BOTH = (Axis.TY, Axis.RY)
+BOTH, TURNS = (Axis.TY, Axis.RY), (Axis.RX, Axis.RY, Axis.RZ)
 
 
 def arm(convention, *joints, tool=(0.1, 0.2)):
@@ -104,6 +105,8 @@ def test_a_joint_origin_pitched_by_a_quarter_turn_hardly_holds_a_tilt(pitch, tol
     joints = "".join(joint.format(f"j{i}", i, i + 1, origin) for i, origin in enumerate(origins))
     links = "".join(f'<link name="l{i}"/>' for i in range(3))
     (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    found = missing_motions(read_robot(tmp_path / "arm.urdf"))
+    assert [(m.axes, m.motions, m.frame) for m in found] == [((1, 2), TURNS, "the origin of joint j1")] * told
     ended = fg_calib("observe", tmp_path / "arm.urdf", "--model", "pose")
     assert ended.code == 0
     assert ("the origin of joint j1 is pitched by about 90 deg" in " ".join(ended.out.split())) == told

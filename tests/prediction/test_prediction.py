@@ -7,7 +7,7 @@ from tolerances import rounding
 
 from fg_calib import InputError, build_problem, calibrate, predict, solve
 from fg_calib.prediction import workspace
-from fg_calib.prediction.tool_pose import ToolPoseUncertainty
+from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
 from fg_calib.prediction.workspace import predict_errors, summed_up
 from fg_calib.robot import pose
 from fg_calib.robot.model import Joint, RobotBuilder
@@ -124,6 +124,19 @@ def test_what_a_parameter_is_responsible_for_goes_when_it_is_known(calibrated):
         assert one.change == pytest.approx(C[i] @ along / np.sqrt(along @ C @ along), rel=1e-5)
     shares = [1.0 - np.trace(v @ (C - np.outer(c, c) / c[i]) @ v.T) / before for i, c in enumerate(C)]
     assert worst.responsible[0].name == names[int(np.argmax(shares))]
+
+
+def test_errors_over_two_configurations_are_roots_of_mean_squares_and_half_the_length_between(calibrated):
+    """The best rigid fit of two points leaves half of what the length between them is off, at each."""
+    result, _ = calibrated
+    q = np.random.default_rng(8).uniform(-2.0, 2.0, (2, 4))
+    names = [p.name for p in result.robot.parameters if p.estimated]
+    v, C = [derivatives(result.robot, names, row) for row in q], result.covariance(names)
+    between = np.diff(pose(result.robot, q).position, axis=0)[0]
+    length = between / np.linalg.norm(between) @ (v[1] - v[0])
+    base, fitted = errors_at(result.posterior, q)
+    assert base.position == pytest.approx(np.sqrt(np.mean([np.trace(one @ C @ one.T) for one in v])), rel=1e-5)
+    assert fitted.position == pytest.approx(0.5 * np.sqrt(length @ C @ length), rel=1e-5)
 
 
 def derivatives(robot, names, q, step=1e-6):

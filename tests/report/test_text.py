@@ -7,13 +7,7 @@ import numpy as np
 from reported import format_report
 from simulated import measure, plus, small_arm, true_robot
 
-from fg_calib import (
-    Measurements,
-    Pairing,
-    assess,
-    build_problem,
-    solve,
-)
+from fg_calib import Measurements, Pairing, assess, build_problem, solve
 from fg_calib.robot.model import Joint, Robot, RobotBuilder
 
 

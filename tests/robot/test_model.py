@@ -68,10 +68,7 @@ FOUR = [row[:4] for row in ROWS]
         ({"rows": np.zeros((0, 4))}, "rows: no joints, expected at least one"),
         ({"rows": [[0, 1, 2, np.nan]]}, "rows: row 0: found nan, expected a finite number"),
         ({"rows": [[0, 1, 2, "x"]]}, "rows: found .*, expected numbers of shape"),
-        (
-            {"rows": [[0, 90, 2, 0]]},
-            "rows: row 0: found 90, expected angles in rad, two turns at most; are they",
-        ),
+        ({"rows": [[0, 90, 2, 0]]}, "rows: row 0: found 90, expected angles in rad, two turns at most; are they"),
         ({"rows": ROWS}, r"rows: shape \(3, 5\), expected \(n, 4\): the convention dh has no beta"),
         ({"convention": "DH"}, "convention: found 'DH', expected one of dh, .* did you mean dh?"),
         ({"types": "sliding"}, "types: joint 1: found 'sliding', expected one of revolute, prismatic"),

@@ -42,8 +42,7 @@ def touched(what, rng, n=36, n_points=3):
 
 @pytest.mark.usefixtures("without_reasons", "without_mistakes")
 @pytest.mark.parametrize(
-    "instrument",
-    ["faces", *(as_case(x, is_slow=True) for x in ("contacts", "board", "targets", "anchors", "planes"))],
+    "instrument", ["faces", *(as_case(x, is_slow=True) for x in ("contacts", "board", "targets", "anchors", "planes"))]
 )
 def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(instrument):
     """All readings exchanged with those of other rows: the noise estimated is then as large as what was measured."""
