@@ -52,6 +52,7 @@ def test_given_configurations_have_the_errors_of_predicted_poses(calibrated):
     C = poses.covariance[row, :3, :3]
     for axis, sigma in zip(found.worst.axes, found.worst.sigma, strict=True):
         assert C @ axis == pytest.approx(sigma**2 * axis, abs=1e-9 * np.trace(C))
+        assert axis[np.argmax(np.abs(axis))] > 0.0
 
 
 def test_orientations_after_the_best_fit_lack_its_rotation(in_unknown_frame):

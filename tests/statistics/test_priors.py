@@ -11,10 +11,12 @@ from simulated import TOOL, measure, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib.assessment import assess
+from fg_calib.graph import square_root, unknown_prior_rows
 from fg_calib.graph.build import FIRST_TOLERANCE, build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
 from fg_calib.inputs import InputError, Options
+from fg_calib.statistics.covariance import spread_of
 from fg_calib.statistics.priors import (
     COMMON_SIGMA,
     GROUP_SIGMA,
@@ -22,6 +24,7 @@ from fg_calib.statistics.priors import (
     ScalePosterior,
     _beyond,
     _corrections,
+    _judged_rows,
     estimate_tolerances,
     fit_scales,
 )
@@ -242,6 +245,18 @@ def test_a_place_varies_by_what_the_data_take_off_its_prior_variance():
     assert priors.names[-9:] == tuple(np.repeat([f"anchor {place.name}" for place in places], 3))
     np.testing.assert_allclose(priors.z[-9:], z, rtol=1e-6)
     np.testing.assert_allclose(priors.sigma[-9:], np.sqrt(1.0 - sigma**2), rtol=1e-6)
+
+
+def test_corrections_of_parameters_and_places_covary_as_the_information_on_both_says():
+    robot, _, table = measured_by("anchors nearly", np.random.default_rng(3), n=12)
+    solution = solve(build_problem(robot, [table]))
+    v, x = solution.problem.variables, solution.parameters
+    P, rows = prior_rows(v, x)[1], square_root(solution.problem, x)[:, :-1]
+    P = np.pad(P, ((0, 0), (0, v.n_nuisance)))
+    H = rows.T @ rows + P.T @ P  # the rows of places are among the others
+    every = np.vstack([P, unknown_prior_rows(v, x)[1]])
+    A = _judged_rows(solution, spread_of(solution))[2]
+    np.testing.assert_allclose(A, np.eye(len(every)) - every @ np.linalg.solve(H, every.T), atol=1e-7)
 
 
 def test_a_correction_beyond_its_prior_is_named_and_what_follows_it_is_not():

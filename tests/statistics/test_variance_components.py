@@ -202,6 +202,30 @@ def test_noise_that_rows_hardly_see_is_as_specified_unless_that_is_three_sigma_o
         assert estimation._is_indeterminate(found, names[0], names) is expected
 
 
+@pytest.mark.parametrize(("own", "joint", "wrong"), [(1.0, 1.0, ()), (0.1, 1.0, (0, 1)), (1.0, 10.0, (2,))])
+def test_of_noise_that_rows_hardly_see_what_is_far_off_alone_is_estimated(own, joint, wrong, monkeypatch):
+    monkeypatch.setattr(estimation, "LEAST_REDUNDANCY", 1e6)
+    solution = estimate_noise(draw("pose", np.random.default_rng(4), own, joint, n=20)[0])
+    names = (0, "orientation"), (0, "position"), JOINT_NOISE
+    assert solution.estimated_noise == tuple(names[k] for k in wrong)
+    expected = {name: (1.0 / own, 1.0 / own, 1.0 / joint)[k] for k, name in enumerate(names)}
+    assert factors_of(solution) == pytest.approx(expected, rel=0.4)
+
+
+def test_rows_of_no_weight_show_no_noise():
+    """Components are those of the other rows alone."""
+    problem, _ = draw("pose", np.random.default_rng(3), n=14)
+    out = np.isin(np.arange(problem.measurements.n_configurations), [2, 5])
+    state = replace(problem.state, weights=(np.where(out, 0.0, 1.0),))
+    m = replace(problem.measurements, test=problem.measurements.test | out)
+    others = relinearized_at(build_problem(problem.robot, m, model="pose"), problem.start)
+    weighted = relinearized_at(problem, problem.start, state)
+    found, expected = (noise_components(solve(one)) for one in (weighted, others))
+    assert found.squares == pytest.approx(expected.squares, rel=1e-5)
+    assert found.expected == pytest.approx(expected.expected, rel=1e-5)
+    assert found.information == pytest.approx(expected.information, rel=1e-5)
+
+
 @cache
 def estimated(name, own=1 / 3, joint=2.0):
     problem, true = draw(name, np.random.default_rng(4), own, joint)
