@@ -124,6 +124,11 @@ def test_weights_are_those_of_the_residuals_at_the_estimate(loss, model, encoder
                 of_priors + np.sum(cost(loss, e[train], tuning(loss, h))), rel=1e-6
             )
             assert solution.cost == pytest.approx(of_priors + 0.5 * np.sum(e[train] ** 2), rel=1e-6)
+            kept, fit = train[found[train] >= 0.5], assessed.fit.chi_square  # outliers are not in chi-square
+            assert fit.dof == h * len(kept)  # as many parameters as priors
+            assert fit.value == pytest.approx(2.0 * of_priors + np.sum((found * e**2)[kept]), rel=1e-6)
+            of_loss = (1.0 - effect(loss, h).chi2) * h * len(kept)
+            assert fit.expected == pytest.approx(fit.dof - assessed.spread.excess - of_loss, rel=1e-9)
     else:
         return
     there = relinearized_at(solution.problem, solution.parameters)
