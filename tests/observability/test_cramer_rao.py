@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated import measure, planar_robot, small_arm
+from simulated import TOOL, measure, planar_robot, small_arm
 from tolerances import rounding
 
 from fg_calib import Pairing
@@ -59,8 +59,8 @@ def test_what_is_held_but_wrong_adds_what_the_kept_do_not_make_up_for():
     assert bound.rank == cramer_rao(robot, stretched, model="position", prior=False).rank == 1
 
 
-def dense_bound(robot, readings, sigma_joint, pairs, step=1e-6):
-    """(J^T C^-1 J + P)^-1 of distances, by central differences of the positions alone and a dense C."""
+def dense_bound(robot, readings, sigma_joint, pairs, pair_errors, step=1e-6):
+    """The covariance of an estimate from distances, by central differences of the positions and a dense C."""
     i = [k for k, p in enumerate(robot.parameters) if p.estimated]
     a, b = np.array(pairs).T
     nominal = robot.nominal
@@ -86,17 +86,23 @@ def dense_bound(robot, readings, sigma_joint, pairs, step=1e-6):
         L[:, p.size + k] = sigma_joint * (distances(nominal, readings + h) - distances(nominal, readings - h))
     L[:, p.size :] /= 2 * step
     P = np.diag([1.0 / robot.parameters[k].tolerance ** 2 for k in i])
-    return np.linalg.inv(J.T @ np.linalg.solve(L @ L.T, J) + P)
+    C = L @ L.T
+    weighted = np.linalg.inv(C if pair_errors == "shared" else np.diag(np.diag(C))) @ J
+    K = np.linalg.inv(J.T @ weighted + P)
+    return K @ (weighted.T @ C @ weighted + P) @ K
 
 
-@pytest.mark.parametrize("strategy", ["star", "all"])
-def test_the_bound_is_that_of_a_dense_computation(strategy):
-    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 3e-3))
+@pytest.mark.parametrize(("strategy", "pair_errors"), [("star", "shared"), ("all", "shared"), ("star", "independent")])
+def test_the_bound_is_that_of_a_dense_computation(strategy, pair_errors):
+    """The tool is estimated too, and is not along the last link: its columns are not its parameters."""
+    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta", *TOOL), 3e-3), estimate=TOOL)
+    robot = robot.with_values([*robot.nominal[:-6], 0.1, 0.0, 0.2, 0.3, -0.4, 0.5])
     readings = spread_readings(4, 4)  # six distances: as many as four points have, so that the dense C has an inverse
-    bound = cramer_rao(robot, at(robot, readings, sigma_joint=1e-4), model="distance", pairing=Pairing(strategy))
+    options = {"pairing": Pairing(strategy), "pair_errors": pair_errors}
+    bound = cramer_rao(robot, at(robot, readings, sigma_joint=1e-4), model="distance", **options)
     n = len(readings)
     pairs = [(a, b) for a in range(n) for b in range(a + 1, n) if strategy == "all" or a == 0]
-    expected = dense_bound(robot, readings, 1e-4, pairs)
+    expected = dense_bound(robot, readings, 1e-4, pairs, pair_errors)
     # 1e-3 of a formed pair's variance counts as its own, which moves variances by as much.
     assert bound.covariance == pytest.approx(expected, rel=3e-3, abs=3e-3 * (3e-3) ** 2)
 

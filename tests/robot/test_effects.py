@@ -8,9 +8,15 @@ import pytest
 from fg_calib import InputError, Measurements, Options, calibrate, observe_structure
 from fg_calib.io import Units, quantity
 from fg_calib.robot import PARAMETER_KINDS, Joint, Parameter, RobotBuilder, pose
-from fg_calib.robot.model import ParameterKind
+from fg_calib.robot.model import BASES, ParameterKind
 
 ROWS = {"q1": (0.0, 0.5, 0.4), "q2": (0.5, 0.1, 0.0), "q3": (0.3, 0.2, 0.0)}  # a, alpha, d
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_slopes_of_functions_of_a_reading_are_their_differences(name):
+    (function, slope), q, h = BASES[name], np.linspace(-3.0, 3.0, 8), 1e-6
+    assert slope(q) == pytest.approx((function(q + h) - function(q - h)) / (2.0 * h), abs=1e-8)
 
 
 @pytest.fixture

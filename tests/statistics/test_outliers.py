@@ -64,6 +64,7 @@ def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
     assert "outliers" in verdicts <= {"outliers", "others", "as specified"}
     assert [name.removeprefix("0 and ") for name in found.fit.goodness.gross.names] == [wrong]
     assert found.fit.goodness.gross.ratio < 1.5
+    assert found.fit.goodness.gross_alone
     assert not found.noise_may_be_estimated
 
 
