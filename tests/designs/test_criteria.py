@@ -7,7 +7,7 @@ from tolerances import rounding
 
 from fg_calib.designs import criteria
 from fg_calib.designs.criteria import Measure
-from fg_calib.designs.information import System, build_system
+from fg_calib.designs.information import PoseRows, System, build_system
 
 CRITERIA = ("I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5")
 
@@ -115,6 +115,8 @@ def test_the_task_counts_in_its_own_units_and_without_what_none_determines(lost)
     C = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)[:3, :3] * np.outer(poses.scales[:3], poses.scales[:3])
     found = Measure("I", system).value(system.information(chosen))
     assert system.rows.shape == (15, 2, 4 if lost else 5)
+    exact = PoseRows(1e12 * poses.rows, poses.always, poses.scales, 3, 3)  # what is lost is lost at any noise
+    assert build_system(exact, given, W).rows.shape == system.rows.shape
     assert found == pytest.approx(np.trace(W @ C), rel=1e-4)
     share = 0.0
     if lost:

@@ -295,7 +295,6 @@ def test_what_an_instruments_model_lacks_is_named():
     assert refused(robot, replace(table, measurements=replace(m, readings=q))).startswith(said)
 
 
-@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("instrument", "column", "unit"),
     [("targets stations", "target", "m"), ("anchors", "anchor", "m"), ("pixels", None, "px")],

@@ -108,6 +108,7 @@ def test_leverages_are_those_of_the_hat_matrix():
     expected = table.after / table.sigma / np.sqrt(1.0 + np.where(table.test, 1.0, -1.0) * goodness.leverage)
     assert goodness.studentised == pytest.approx(expected)
     assert {FLAGS[f] for f in goodness.flag[table.test]} == {"test"}
+    assert [kind.n_beyond for kind in goodness.kinds] == [0, 0]
     n_rows, squares, rms = table.of_configurations(solution.problem.measurements.test)
     assert n_rows.tolist() == [6] * 24
     assert squares == pytest.approx(np.bincount(table.a, (table.after / table.sigma) ** 2))

@@ -232,7 +232,6 @@ def estimated(name, own=1 / 3, joint=2.0):
     return estimate_noise(problem), true
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["pose", "tables"])
 def test_own_noise_and_that_of_the_joints_are_told_apart(name):
     """Each within four of its own sigmas; its degrees of freedom are 15 at least, or 5 of lengths."""
