@@ -1,5 +1,6 @@
 """Search against trying every set there is."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -75,6 +76,13 @@ def test_greedy_takes_the_best_in_addition_to_those_before_it():
             each = [value(system, criterion, [*taken[:k], j]) for j in left]
             assert value(system, criterion, taken[: k + 1]) <= min(each) + rounding(each, 1e3)
     assert choose_greedily(Measure("I", system), 5, taken[:2])[:2].tolist() == taken[:2].tolist()
+
+
+def test_exchange_is_the_same_in_any_unit():
+    system, start = random_system(np.random.default_rng(0), 14), np.arange(4)
+    found = exchange(Measure("I", system), start)
+    assert found.tolist() != start.tolist()
+    assert exchange(Measure("I", replace(system, task=1e-8 * system.task)), start).tolist() == found.tolist()
 
 
 # --- as few as reach a target -----------------------------------------------------------------------------------------

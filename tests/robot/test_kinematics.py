@@ -67,7 +67,6 @@ def test_a_urdf_joint_moves_about_its_own_axis(prismatic):
         assert tool_pose(builder.build(), np.array([0.7])) == pytest.approx(frame(**origin) @ motion, abs=rounding(1.0))
 
 
-@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("convention", "n"), diagonal([*CONVENTIONS, "urdf"], [1, 2, 3, 6, 7, 12], every=3))
 def test_derivatives_equal_central_differences(convention, n):
     rng = np.random.default_rng(100 + n)

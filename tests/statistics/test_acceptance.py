@@ -102,7 +102,6 @@ def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
     assert ended.err.startswith("not accepted: NOT EVALUATED: position 0.1")
 
 
-@pytest.mark.sampled(4)
 @pytest.mark.parametrize(
     ("accept", "message"),
     [

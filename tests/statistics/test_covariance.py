@@ -42,7 +42,6 @@ def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
     assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
 
 
-@pytest.mark.sampled(1)
 @pytest.mark.parametrize(
     ("model", "frame", "estimate"),
     [

@@ -22,7 +22,7 @@ from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import variance_components as estimation
-from fg_calib.statistics.variance_components import NoiseComponents, estimate_noise, noise_components
+from fg_calib.statistics.variance_components import estimate_noise, noise_components
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
@@ -191,15 +191,6 @@ def test_without_joint_noise_the_components_are_sums_of_squares_and_redundancies
     assert found.squares == pytest.approx([fit.chi2 for fit in kinds], rel=1e-9)
     assert found.expected == pytest.approx([fit.expected for fit in kinds], rel=1e-9)
     assert JOINT_NOISE not in factors_of(estimate_noise(problem))
-
-
-def test_noise_that_rows_hardly_see_is_as_specified_unless_that_is_three_sigma_off():
-    """Of 3 degrees of freedom next to another kind's factor 2 are left: sums of squares vary by 2."""
-    names = (0, "position"), (0, "orientation")
-    for shown, degrees, expected in ((7.0, 3.0, True), (9.0, 3.0, False), (7.0, 5.0, False)):
-        information = np.array([[degrees, 1.0], [1.0, 1.0]])
-        found = NoiseComponents(names, np.array([shown, 1.0]), np.array([2.0, 1.0]), information)
-        assert estimation._is_indeterminate(found, names[0], names) is expected
 
 
 @pytest.mark.parametrize(("own", "joint", "wrong"), [(1.0, 1.0, ()), (0.1, 1.0, (0, 1)), (1.0, 10.0, (2,))])
