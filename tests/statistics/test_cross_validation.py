@@ -52,6 +52,7 @@ def test_every_configuration_is_predicted_once_by_the_others():
     assert found.kinds["position"].after == pytest.approx(np.sqrt(squares / 40), rel=1e-6)  # both converged: 1e-6 sigma
     jackknife = np.sqrt(3 / 4 * np.sum((np.array(arms) - np.mean(arms, axis=0)) ** 2, axis=0))
     assert list(found.spread.values()) == pytest.approx(jackknife, rel=1e-4, abs=1e-12)
+    assert found.beyond({"a2": 2e-4, "d3": None})[0] == {"a2": found.spread["a2"] / 2e-4}
 
 
 @pytest.mark.slow
