@@ -24,7 +24,7 @@ def design(
     n: Annotated[int | None, option("--n", "N", "How many poses; 30 if neither this nor --target.")] = None,
     target: Annotated[float | None, length_option("--target", "As few as reach this RMS error, such as 0.5mm.")] = None,
     given: Annotated[Path | None, option("--given", "TABLE", "Configurations that are measured in any case.")] = None,
-    candidates: Annotated[str | None, option("--candidates", "N|TABLE|SCENARIO", "How many, or which.")] = None,
+    candidates: Annotated[str | None, option("--candidates", "N|TABLE|SCENARIO|rows", "How many, or which.")] = None,
     task: Annotated[Path | None, option("--task", "TABLE", "Where the tool is to be right; anywhere if none.")] = None,
     criterion: Annotated[Criterion, option("--criterion", None, "What is made small: I, the error.")] = "I",
     error: Annotated[Frame | None, option("--error", None, "In the base frame, or after the best fit.")] = None,
@@ -92,4 +92,4 @@ def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]
         return {"n_candidates": int(given)}
     if given.endswith((".yaml", ".yml")):
         return {"candidates": read_scenario(given).configurations}
-    return {"candidates": GivenReadings(_readings(Path(given), robot, units))}
+    return {"candidates": given if given == "rows" else GivenReadings(_readings(Path(given), robot, units))}

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
-from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Options
+from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
 from fg_calib.measurements import INSTRUMENTS, Landmarks, Table
 from fg_calib.robot import Robot
 from fg_calib.simulation import (
@@ -29,16 +29,25 @@ from fg_calib.simulation import (
     Errors,
     GivenReadings,
     Instrument,
+    Placement,
     Scenario,
     draw_candidates,
     simulate,
 )
 
-REFERENCE = -1
-"""Instead of the number of a pose: the reference of a star."""
+REFERENCE, NONE = -1, -2
+"""Instead of the number of a pose: the reference of a star, and a configuration at which nothing is fitted."""
 
 _ID = re.compile(r"^(?:(\S+) (?:\S+ )?)?p(\d+)$")
 """How a simulation names a configuration: the instrument whose own it is, if any, and its number."""
+
+MEASURED: Mapping[Model, Model] = {"distance": "position", "rotation": "orientation", "distance-rotation": "pose"}
+"""Model to measure for pairs of each model to be formed.
+
+All distances between points determine them but for one motion `x -> U x + t`; all angles of `R_a^T R_b` determine the
+rotations but for `R -> U' R V`. Positions in an unknown frame hold as much as the former. Poses in an unknown frame
+hold more than both together: V is 1 and U' is U, six unknowns fewer. So poses chosen for poses in an unknown frame are
+nearly the best for all pairs formed from them."""
 
 
 @dataclass(frozen=True)
@@ -46,26 +55,28 @@ class Pool(Brief):
     """Candidate poses.
 
     Attributes:
-        scenario: The instruments.
+        scenario: The instruments; None where rows of tables are chosen.
         tables: Tables that it would measure at all candidates.
         problem: The problem of these tables.
         readings: Of each pose, shape (n_poses, n_joints), [rad] (prismatic: [m]).
-        pose_of: The pose of each configuration of the problem, shape (n_configurations,); or `REFERENCE`.
+        pose_of: The pose of each configuration of the problem, shape (n_configurations,); `REFERENCE` or `NONE`.
         rows: Rows that each pose would add.
         given: Poses that were measured already, or will be anyway.
         found: How the candidates of each group were found.
         before: The problem of earlier measurements, at its solution; None without any.
+        formed: By the number of a table of poses that pairs are formed from: their model and pairing.
     """
 
-    scenario: Scenario
+    scenario: Scenario | None
     tables: tuple[Table, ...]
     problem: Problem
     readings: Floats
     pose_of: Integers
     rows: PoseRows
     given: Integers
-    found: Mapping[str, Candidates]
-    before: Problem | None
+    found: Mapping[str, Candidates] = field(default_factory=dict)
+    before: Problem | None = None
+    formed: Mapping[int, tuple[Model, Pairing]] = field(default_factory=dict)
 
     @property
     def robot(self) -> Robot:
@@ -87,23 +98,38 @@ class Pool(Brief):
     def groups_of(self, configurations: Integers) -> NDArray[np.str_]:
         """The instrument whose own some configurations of the problem are; "" for common ones."""
         names = self.problem.data.names
-        return np.array([_split_name(names[k])[0] for k in configurations.tolist()], dtype=np.str_)
+        own = [_split_name(names[k])[0] if self.scenario is not None else "" for k in configurations.tolist()]
+        return np.array(own, dtype=np.str_)
 
-    def select_tables(self, poses: Integers) -> list[Table]:
-        """Select what would be measured at some poses, in their order, after references that have pairs."""
+    def select_tables(self, poses: Integers, pairing: Pairing | None = None) -> list[Table]:
+        """Select what would be measured at some poses, in their order, after references that have pairs.
+
+        Args:
+            poses: The poses.
+            pairing: How pairs are formed instead.
+        """
         names = self.problem.data.names[: self.problem.data.n_configurations]
         wanted = np.concatenate([self.references, *(np.flatnonzero(self.pose_of == number) for number in poses)])
         order = {names[k]: place for place, k in enumerate(wanted.tolist())}
         found = [_between_used(select_rows(table, order), known=self.before is not None) for table in self.tables]
+        for number, table in enumerate(found):
+            if number in self.formed:
+                model, own = self.formed[number]
+                found[number] = replace(table, model=model, frame="known", pairing=pairing or own)
         return [table if _has_rows(table) else select_rows(table, {}) for table in found]
 
-    def posterior(self, poses: Integers) -> Posterior:
-        """Posterior with some poses, given ones included, after the earlier ones, as a calibration would report it."""
+    def posterior(self, poses: Integers, pairing: Pairing | None = None) -> Posterior:
+        """Posterior with some poses measured after the earlier ones, as a calibration would report it.
+
+        Args:
+            poses: The poses, given ones included.
+            pairing: How pairs are formed instead.
+        """
         before = self.before
         problem = None
         if len(poses) or before is None:
             places = places_of(self.problem, self.problem.start)
-            problem = true_problem(self.robot, self.select_tables(poses), self.problem.options, places)
+            problem = true_problem(self.robot, self.select_tables(poses, pairing), self.problem.options, places)
         if before is not None and (problem is None or not problem.rows.parts):  # nothing, or one end of a pair
             return Posterior(before, square_root(before, before.start, with_loss=True)[:, :-1])
         assert problem is not None
@@ -239,14 +265,37 @@ def build_pool(
     among_given = np.array([name == "" and k < n_given for name, k in names])
     if n_given and not among_given.any():
         raise InputError("given", "configurations at which nothing is measured", "a job with what was touched")
-    firsts = [data.places[s.table][s.ends[s.train, 0]] for s in problem.pair_blocks]
-    references = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *firsts]))
-    poses = np.setdiff1d(np.arange(len(names)), references)
-    pose_of = np.full(len(names), REFERENCE)
-    pose_of[poses] = np.arange(len(poses))
-    rows = gather_rows(problem, pose_of, references, alone=before is None)
-    given_poses = pose_of[among_given & (pose_of >= 0)]
-    return Pool(scenario, tables, problem, data.readings[poses], pose_of, rows, given_poses, found, before)
+    formed = {
+        k: (i.model, i.pairing or Pairing())
+        for k, i in enumerate(scenario.instruments)
+        if i.model in PAIR_MODELS and i.sockets is None
+    }
+    more = {"scenario": scenario, "tables": tables, "found": found, "before": before, "formed": formed}
+    pool = pool_of(problem, np.arange(len(names)), scenario.source, alone=before is None, **more)
+    given_poses = pool.pose_of[among_given & (pool.pose_of >= 0)]
+    return replace(pool, given=given_poses)
+
+
+def pool_of(problem: Problem, poses: Integers, source: str, *, alone: bool = True, **more: Any) -> Pool:
+    """The pool of some configurations of a problem, without references that pairs share.
+
+    Args:
+        problem: The problem.
+        poses: The configurations.
+        source: Name of the scenario or the job, for messages.
+        alone: See `gather_rows`.
+        more: Other fields.
+
+    Raises:
+        InputError: Pairs without one reference pose.
+    """
+    references = _find_references(problem, source)
+    poses = np.setdiff1d(poses, references)
+    pose_of = np.full(problem.data.n_configurations, NONE)
+    pose_of[references], pose_of[poses] = REFERENCE, np.arange(len(poses))
+    rows = gather_rows(problem, pose_of, references, alone=alone)
+    fields = {"scenario": None, "tables": problem.data.tables, "given": np.zeros(0, dtype=np.int64)} | more
+    return Pool(problem=problem, readings=problem.data.readings[poses], pose_of=pose_of, rows=rows, **fields)
 
 
 def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Floats | None) -> tuple[Table, ...]:
@@ -264,23 +313,33 @@ def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Flo
     return simulate(_nominal(scenario, readings), exact=True).tables
 
 
+def _find_references(problem: Problem, source: str) -> Integers:
+    """Configurations that all pairs of a table have in common.
+
+    Raises:
+        InputError: Pairs without one reference pose: what other pairs share is not one pose's.
+    """
+    ends = [problem.data.places[s.table][s.ends[s.train, 0]] for s in problem.pair_blocks]
+    if any(len(np.unique(first)) > 1 for first in ends):
+        raise InputError(source, "pairs that are no star", "pairing star, or candidates that are no rows")
+    return np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *ends]))
+
+
 def _with_instruments(scenario: Scenario) -> Scenario:
     """The scenario with what measures poses, where it names no instrument, as one.
 
     Raises:
-        InputError: Pairs are measured directly, or are no star: errors of each belong to two poses.
+        InputError: An instrument measures pairs directly.
     """
-    if not scenario.instruments:
-        model = scenario.job.get("model", "distance-rotation")
-        pairing = scenario.pairing if model in PAIR_MODELS else None
-        scenario = replace(scenario, instruments=(Instrument(model=model, name="poses", pairing=pairing),))
     for instrument in scenario.instruments:
-        star = instrument.pairing is None or instrument.pairing.strategy == "star"
-        if instrument.pairs is not None or not star:
-            found = "pairs that are no star" if instrument.pairs is None else "pairs that are measured directly"
-            expected = "pairing: star, or model: pose with frame: unknown to choose the configurations of pairs"
-            raise InputError(f"instruments: {instrument.name}", found, expected)
-    return scenario
+        if instrument.pairs is not None:
+            expected = "model: pose with frame: unknown to choose the configurations of pairs"
+            raise InputError(f"instruments: {instrument.name}", "pairs that are measured directly", expected)
+    if scenario.instruments:
+        return scenario
+    model = scenario.job.get("model", "distance-rotation")
+    pairing = scenario.pairing if model in PAIR_MODELS else None
+    return replace(scenario, instruments=(Instrument(model=model, name="poses", pairing=pairing),))
 
 
 def _split_name(name: str) -> tuple[str, int]:
@@ -297,7 +356,9 @@ def _nominal(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
         views, changes = i.configurations or scenario.configurations, dict[str, Any]()
         if i.configurations is not None:
             changes["configurations"] = GivenReadings(readings[i.name])
-        if "board" in INSTRUMENTS[i.model].labels and not (i.boards or i.fixed) and isinstance(views, BoardViews):
+        if i.pairing is not None and i.pairing.strategy != "star":
+            changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3)), "pairing": None}
+        elif "board" in INSTRUMENTS[i.model].labels and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))
     return replace(

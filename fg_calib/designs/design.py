@@ -10,22 +10,24 @@ anew from the rows of its poses alone, by the code that assesses a calibration.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
-from fg_calib.designs.from_job import scenario_of, solve_for_design
-from fg_calib.designs.information import N_TASK, Task, build_system
+from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
+from fg_calib.designs.information import N_TASK, Posterior, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.inputs import (
     Floats,
     FrozenArrays,
     InputError,
     Integers,
+    Pairing,
     ProblemError,
     as_floats,
     check_number,
@@ -63,11 +65,13 @@ class Design(FrozenArrays):
         task: Purpose of the calibration.
         readings: The configurations in the order in which to visit them, reference poses first, shape (n, n_joints),
             [rad] (prismatic: [m]).
-        ids: Their names: s1, s2, ... after such names of the job, shape (n,).
+        ids: Their names: those of chosen rows of a job, else s1, s2, ... after such names of the job, shape (n,).
         group: The one instrument that measures at each; "" for all that share their configurations.
         expected: Expected errors of the tool over the task, with these and what was given.
         after_fit: Expected errors after the best rigid fit, where `expected` is in the base frame; else None.
         before: Expected errors with what was given alone; None without it.
+        pairings: Expected position errors by how pairs are formed, [m].
+        random: Median of the expected position errors of as many random poses, [m].
         curve: Expected errors by the number of poses.
         asked: Number of poses that was asked for; None with a target.
         target: Expected position error that was asked for, [m]; None with a number.
@@ -88,6 +92,8 @@ class Design(FrozenArrays):
     expected: PoseRms
     after_fit: PoseRms | None
     before: PoseRms | None
+    pairings: Mapping[str, float]
+    random: float
     curve: tuple[CurvePoint, ...]
     asked: int | None
     target: float | None
@@ -101,11 +107,6 @@ class Design(FrozenArrays):
     def n(self) -> int:
         """Number of poses."""
         return len(self.readings)
-
-    @property
-    def random(self) -> float:
-        """Median of the expected position errors of as many random poses, [m]."""
-        return self.curve[-1].random[1]
 
     def __repr__(self) -> str:
         p = self.expected.position
@@ -122,7 +123,7 @@ def design(
     target: float | None = None,
     criterion: Criterion = "I",
     n_candidates: int = N_CANDIDATES,
-    candidates: Configurations | None = None,
+    candidates: Configurations | Literal["rows"] | None = None,
     given: Floats | None = None,
     task: Floats | None = None,
     fitted: bool | None = None,
@@ -138,7 +139,7 @@ def design(
         target: Expected RMS position error over the task that is to be reached, [m].
         criterion: Minimised value: `I` the mean square error over the task, or D, A, E, O1 to O5.
         n_candidates: Number of candidates to draw; of a table all are candidates.
-        candidates: Where to measure instead.
+        candidates: Where to measure instead: configurations, or with a job `"rows"`, to choose among its train rows.
         given: With a scenario: readings of poses that were measured already, or will be anyway, shape (n, n_joints).
         task: Configurations at which the tool is to be right, shape (n, n_joints); random ones within the joint limits
             if None.
@@ -169,7 +170,7 @@ def design(
 
 def _build_pool(
     of: Scenario | Job,
-    candidates: Configurations | None,
+    candidates: Configurations | Literal["rows"] | None,
     given: Floats | None,
     n: int,
     generator: np.random.Generator,
@@ -179,8 +180,12 @@ def _build_pool(
         if given is not None:
             raise InputError("given", "with a job", "a scenario: what a job measured counts already")
         source, problem = "job" if of.path is None else of.path.name, solve_for_design(of)
+        if isinstance(candidates, str):
+            return pool_of_rows(problem, source)
         scenario = scenario_of(problem, candidates, source)
         return build_pool(scenario, draw_groups(scenario, n, generator), before=problem)
+    if candidates == "rows":
+        raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")
     scenario = of if candidates is None else replace(of, configurations=candidates)
     return build_pool(scenario, draw_groups(scenario, n, generator), given=given)
 
@@ -230,7 +235,7 @@ def design_from_pool(
     if not len(measurable):
         raise InputError("candidates", "none at which anything is measured", "some")
     system = build_system(pool.rows, pool.known, task.quadratic_form(pool.problem)).with_known(pool.given)
-    chooser = Chooser(system.select(measurable), criterion)
+    chooser = Chooser(system.select(measurable), criterion, _error_of_formed_pairs(pool, task, measurable))
     tell("choosing")
     wanted = max(1, min((n or N_POSES) - len(pool.references), len(measurable)))
     found = chooser.best(wanted, generator) if target is None else chooser.reaching(target)
@@ -242,7 +247,7 @@ def design_from_pool(
     configurations = _configurations_of(pool, ordered, tables)
     data = pool.problem.data
     names, readings = [data.names[k] for k in configurations], data.readings[configurations]
-    ids = _new_names(len(names), pool)
+    ids = names if pool.scenario is None else _new_names(len(names), pool)
     expected, curve = posterior.error(task), chooser.curve(found, generator, len(pool.references))
     error = np.inf if expected.position is None else expected.position
     before = pool.posterior(pool.given).error(task) if len(pool.given) or pool.before is not None else None
@@ -258,6 +263,8 @@ def design_from_pool(
         expected=expected,
         after_fit=None if task.fitted else posterior.error(replace(task, fitted=True)),
         before=before,
+        pairings=_compare_pairings(pool, poses, task),
+        random=curve[-1].random[1],
         curve=(*curve[:-1], replace(curve[-1], designed=error)),
         asked=n if target is None else None,
         target=target,
@@ -267,6 +274,35 @@ def design_from_pool(
         travel=joint_travel(pool.robot, readings),
         travel_before=joint_travel(pool.robot, pool.readings[chosen]),
     )
+
+
+def _position_error(posterior: Posterior, task: Task) -> float:
+    """Expected RMS position error, [m]; inf if not determined."""
+    found = posterior.error(task).position
+    return np.inf if found is None else found
+
+
+def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Callable[[Integers], float] | None:
+    """Expected error of a set of candidates whose pairs are no star; None for a star.
+
+    The search takes candidates for poses in an unknown frame, whose information bounds that of pairs (see `MEASURED`).
+    A chain may have far less, so its design is compared with random ones by this error.
+    """
+    if not any(pairing.strategy != "star" for _, pairing in pool.formed.values()):
+        return None
+
+    def error(candidates: Integers) -> float:
+        chosen = measurable[candidates]
+        ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
+        return _position_error(pool.posterior(np.concatenate([pool.given, ordered])), task)
+
+    return error
+
+
+def _compare_pairings(pool: Pool, poses: Integers, task: Task) -> dict[str, float]:
+    """Expected errors by how pairs are formed; none where no pairs are."""
+    strategies: tuple[Literal["star", "chain", "all"], ...] = ("star", "chain", "all")
+    return {one: _position_error(pool.posterior(poses, Pairing(one)), task) for one in strategies if pool.formed}
 
 
 def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> Integers:

@@ -1,4 +1,4 @@
-"""Candidates of a job: its measurements count already, and more are chosen.
+"""Candidates of a job: its measurements count already, and more are chosen, anywhere or among the job's own rows.
 
 A solved job becomes a scenario: each table is an instrument in the frame in which it measured, and landmarks stand
 where they were estimated. Candidates for more rows are then drawn as those of any scenario.
@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.assessment import solve_job
+from fg_calib.designs.candidates import Pool, pool_of
 from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
@@ -23,6 +24,7 @@ from fg_calib.measurements import INSTRUMENTS, Measurements, Noise
 from fg_calib.robot import pose
 from fg_calib.simulation import (
     BoardViews,
+    Candidates,
     Configurations,
     Errors,
     Instrument,
@@ -56,6 +58,20 @@ def solve_for_design(job: Job) -> Problem:
     return relinearized_at(solution.problem, solution.parameters)
 
 
+def pool_of_rows(problem: Problem, source: str) -> Pool:
+    """The pool of a solved problem's train rows.
+
+    Pairs must share one reference pose: the information of any other pair belongs to two poses.
+
+    Raises:
+        InputError: Pairs without one reference pose.
+    """
+    data = problem.data
+    train = np.concatenate([data.places[s.table][s.ends[s.train]].ravel() for s in data.blocks])
+    pool = pool_of(problem, train, source)
+    return replace(pool, found={"": Candidates(pool.readings, len(pool.readings), {})})
+
+
 def scenario_of(problem: Problem, configurations: Configurations | None = None, source: str = "job") -> Scenario:
     """The scenario in which a solved problem's tables were measured.
 
@@ -72,7 +88,8 @@ def scenario_of(problem: Problem, configurations: Configurations | None = None, 
         stem = re.sub("[^A-Za-z0-9_-]", "_", Path(table.measurements.source).stem).strip("_-") or "table"
         names.append(stem if stem not in names else f"{stem}_{len(names) + 1}")
         if table.own or table.model is None:
-            raise InputError(f"{source}: {table.measurements.source}", "custom measurements", "those of instruments")
+            expected = "candidates from the job's own rows: --candidates rows"
+            raise InputError(f"{source}: {table.measurements.source}", "custom measurements", expected)
         instruments.append(_instrument_of(problem, number, names[-1], configurations))
     return Scenario(
         robot=problem.robot.with_values(problem.start[problem.variables.robot_span]),

@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,8 +30,8 @@ MIN_GAIN = 1e-3
 _ROUNDING = 1e-12
 """Share of the criterion that an exchange must gain: less may be rounding."""
 
-N_RANDOM = 100
-"""Number of random sets that a design is compared with."""
+N_RANDOM, N_RANDOM_EXACT = 100, 20
+"""Number of random sets that a design is compared with; where the error of each takes a posterior of its own."""
 
 N_STARTS, SMALL_PROBLEM = 2, 5_000
 """Sets that exchange starts from, and poses times candidates times starts up to which it starts from more."""
@@ -98,10 +99,11 @@ class Chooser:
     Args:
         system: The candidates.
         criterion: Minimised value.
+        error: Expected RMS error with some candidates, [m], where the system does not give it; inf if not determined.
     """
 
-    def __init__(self, system: System, criterion: Criterion) -> None:
-        self.system = system
+    def __init__(self, system: System, criterion: Criterion, error: Callable[[Integers], float] | None = None) -> None:
+        self.system, self._exact = system, error
         self.measure, self._error = Measure(criterion, system), Measure("I", system)
         of_all = Measure("D", replace(system, core=np.eye(system.rows.shape[2])))
         self._orders = [(measure, np.zeros(0, dtype=np.int64)) for measure in (self.measure, of_all)]
@@ -110,6 +112,8 @@ class Chooser:
         """Expected RMS error with some candidates, [m]; inf where no candidates determine it."""
         if self.system.unknown > UNKNOWN_SHARE:
             return float("inf")
+        if self._exact is not None:
+            return self._exact(chosen)
         return float(np.sqrt(self._error.value(self.system.information(chosen))))
 
     def value(self, chosen: Integers) -> float:
@@ -126,7 +130,8 @@ class Chooser:
         random = [self._draw(n, generator) for _ in range(N_RANDOM)]
         starts = sorted([*self.starts(n), *random], key=self.value)
         starts = starts[: max(N_STARTS, SMALL_PROBLEM // (n * self.system.n_candidates))]
-        return min((exchange(self.measure, one) for one in starts), key=self.value)
+        found = min((exchange(self.measure, one) for one in starts), key=self.value)
+        return found if self._exact is None else min((found, *random[:N_RANDOM_EXACT]), key=self.error)
 
     def quickly(self, n: int) -> Integers:
         """Nearly as good a set, in a small part of the time."""
@@ -161,7 +166,8 @@ class Chooser:
         most, points = len(found), []
         numbers = np.round(np.geomspace(MIN_CURVE, max(most + n_references, MIN_CURVE), N_CURVE)).astype(np.int64)
         for k in sorted({n - n_references for n in numbers.tolist() if 0 < n - n_references < most} | {most}):
-            random = [self.error(self._draw(k, generator)) for _ in range(N_RANDOM)]
+            n_random = N_RANDOM if self._exact is None else N_RANDOM_EXACT
+            random = [self.error(self._draw(k, generator)) for _ in range(n_random)]
             low, middle, high = np.quantile(random, [0.1, 0.5, 0.9], method="nearest").tolist()
             designed = self.error(found if k == most else self.quickly(k))
             points.append(CurvePoint(k + n_references, designed, (low, middle, high)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from hashlib import sha256
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from rich.console import Group
 from rich.table import Table as Shown
 
@@ -26,7 +27,7 @@ from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
 from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
-from fg_calib.simulation import instrument_keys, joint_sigma, table_columns, to_fill_in, yaml_text
+from fg_calib.simulation import instrument_keys, table_columns, to_fill_in
 
 MAX_POSES_LISTED = 40
 """Poses that the report lists; the table has all."""
@@ -40,7 +41,7 @@ def design_document(design: Design) -> dict[str, Any]:
     return tables.document_of(
         "design",
         design,
-        "criterion n target reached expected before random travel",
+        "criterion n target reached expected before random pairings travel",
         robot=design.pool.robot.name,
         n_given=len(design.pool.given),
         fitted=design.task.fitted,
@@ -61,6 +62,8 @@ def design_document(design: Design) -> dict[str, Any]:
 
 def build_design_report(design: Design) -> Group:
     """A design for the terminal."""
+    words = {"star": "each with the first", "chain": "each with the one before", "all": "all that can be formed"}
+    pairs = [(name, _size(error), words[name]) for name, error in design.pairings.items()]
     curve = [
         (f"{p.n}", *map(_size, (p.designed, p.random[1])), " to ".join(map(_size, (p.random[0], p.random[2]))))
         for p in design.curve
@@ -70,6 +73,7 @@ def build_design_report(design: Design) -> Group:
         line(_headline(design), "bold"),
         *section("Expected", *_expected(design)),
         *section("Poses and accuracy", table_of(columns, curve)),
+        *section("Which pairs", table_of(("pairs", "expected mm|>", ""), pairs)),
         *section("Where to measure", _poses(design)),
         *section("Notes", *_notes(design)),
     )
@@ -176,14 +180,15 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             have been filled in.
     """
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
+    measured = design.tables if design.pool.scenario is not None else ()
     filled: dict[str, Any] = {}
-    for t in design.tables:
+    for t in measured:
         for name, columns in table_columns(t, robot, units).items():
             rounded = _rounded(t.measurements.readings, robot, units) if "q1" in columns else {}
             filled[name] = to_fill_in({**columns, **rounded}, touched=_is_touched(t))
-    urdf = None if robot.urdf is None else "robot.urdf"
-    job = ("robot.yaml", "calibration.yaml", *([urdf] if urdf else []))
-    names = (_DOCUMENT, CONFIGURATIONS, "design.svg", *filled, *job)
+    urdf = "robot.urdf" if robot.urdf is not None and measured else None
+    job = ("robot.yaml", "calibration.yaml") if measured else ()
+    names = (_DOCUMENT, CONFIGURATIONS, "design.svg", *filled, *job, *([urdf] if urdf else []))
     earlier = _files_before(folder)
     for name, digest in earlier.items():
         if name.endswith(".csv") and exists(folder / name) and _digest(folder / name) != digest:
@@ -196,9 +201,10 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             write_csv(into / name, columns)
         if urdf is not None:
             write_urdf(into / urdf, robot)
-        write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
-        then = _CALIBRATE if design.pool.before is None else _UPDATE
-        write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, units))
+        if measured:
+            write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
+            then = _CALIBRATE if design.pool.before is None else _UPDATE
+            write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, measured, units))
         files = {_DOCUMENT: ""} | {file.name: _digest(file) for file in into.iterdir()}
         write_text(into / _DOCUMENT, tables.json_text(design_document(design) | {"files": files}))
 
@@ -247,9 +253,14 @@ DECIMALS = 7
 """Decimals of joint readings and positions in the tables: far below what encoders and trackers resolve."""
 
 
-def _job_text(design: Design, units: Units) -> str:
+def _job_text(design: Design, measured: Sequence[Table], units: Units) -> str:
     """The job of the tables that are to be filled in."""
-    keys = {k: v for k, v in design.pool.scenario.job.items() if k not in ("model", "pairing", "noise")}
-    noise = {"joint": joint_sigma(design.tables[0].measurements.sigma_joint, design.pool.robot, units)}
-    job = {"robot": "robot.yaml", **keys, "units": asdict(units), "noise": noise}
-    return yaml_text(job | instrument_keys(design.tables, units))
+    scenario = design.pool.scenario
+    assert scenario is not None
+    robot, sigma = design.pool.robot, measured[0].measurements.sigma_joint
+    joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
+    keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
+    job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
+    job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
+    job |= instrument_keys(measured, units)
+    return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)

@@ -17,7 +17,7 @@ from .scenario import (
 )
 from .simulator import Simulation, simulate
 from .views import Candidates, draw_candidates
-from .write import instrument_keys, joint_sigma, table_columns, to_fill_in, write_simulation, yaml_text
+from .write import instrument_keys, table_columns, to_fill_in, write_simulation
 
 __all__ = [
     "MOST_DRAWN",
@@ -37,12 +37,10 @@ __all__ = [
     "TargetViews",
     "draw_candidates",
     "instrument_keys",
-    "joint_sigma",
     "link_points",
     "read_scenario",
     "simulate",
     "table_columns",
     "to_fill_in",
     "write_simulation",
-    "yaml_text",
 ]

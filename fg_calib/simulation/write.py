@@ -53,7 +53,7 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     texts = {"calibration.yaml": _job_text(simulation, units)}
     if simulation.scenario.instruments:
         truth = {kind: {n: _place(one, units) for n, one in found.items()} for kind, found in simulation.truth.items()}
-        texts["truth.yaml"] = yaml_text({"units": asdict(units)} | truth)
+        texts["truth.yaml"] = _yaml({"units": asdict(units)} | truth)
 
     def write(into: Path) -> None:
         for name, robot in robots.items():
@@ -135,21 +135,20 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
 def _job_text(simulation: Simulation, units: Units) -> str:
     scenario, m = simulation.scenario, simulation.measurements
     job: dict[str, Any] = {"robot": "robot_nominal.yaml", "truth": "robot_true.yaml"}
-    noise = {"joint": joint_sigma(m.sigma_joint, simulation.robot, units)}
+    noise = {"joint": joint_noise(m.sigma_joint, simulation.robot, units)}
     if scenario.instruments:
         job |= {**scenario.job, "units": asdict(units), "noise": noise} | instrument_keys(simulation.tables, units)
     else:
         keys = {**scenario.job, "frame": frame_knowledge(scenario.frame)}
         job |= {"measurements": m.source, **keys, "units": asdict(units), "noise": _noise(m, units) | noise}
-    return f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n" + yaml_text(job)
+    return f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n" + _yaml(job)
 
 
-def yaml_text(document: Mapping[str, Any]) -> str:
-    """A job as text."""
+def _yaml(document: Mapping[str, Any]) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
 
 
-def joint_sigma(sigma: Floats, robot: Robot, units: Units) -> float | list[float]:
+def joint_noise(sigma: Floats, robot: Robot, units: Units) -> float | list[float]:
     """Sigma of the joint readings as a job specifies it: one value, or one a joint."""
     values = [units.from_si(s, joint.unit) for s, joint in zip(sigma, robot.joints, strict=True)]
     return values[0] if len(set(values)) == 1 else values

@@ -32,7 +32,7 @@ TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {
     "schema", "version", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before",
-    "random", "undetermined_share", "curve", "candidates", "stops", "undetermined", "travel",
+    "random", "undetermined_share", "curve", "pairings", "candidates", "stops", "undetermined", "travel",
     "travel_unordered",
 }  # fmt: skip
 FEW = ("--candidates", 25)
@@ -71,7 +71,7 @@ def test_the_document_has_its_keys_in_si(plan, fg_calib):
     assert found.keys() == DOCUMENT
     assert (found["schema"], found["robot"], found["criterion"]) == ("fg-calib/design/1", "small-arm", "I")
     assert (found["n"], found["n_given"], found["target"], found["reached"]) == (4, 0, None, True)
-    assert found["before"] is None
+    assert (found["before"], found["pairings"]) == (None, {})
     assert found["expected"].keys() == {"position", "orientation"}
     assert 1e-5 < found["expected"]["position"] < found["random"] < 1e-2
     assert found["candidates"] == {"all": {"asked": 25, "taken": 25, "rejected": {}}}
@@ -183,7 +183,7 @@ def test_the_job_calibrates_when_it_is_filled_in(kind, plan, fg_calib, tmp_path)
 
 @pytest.mark.slow
 def test_more_of_a_job_is_written_as_a_table_to_fill_in(plan, fg_calib, tmp_path):
-    """Of a job made by `simulate`."""
+    """Of a job made by `simulate`; rows of its own are a table of configurations alone."""
     fg_calib("simulate", plan(), "--out", tmp_path / "demo")
     job = tmp_path / "demo" / "calibration.yaml"
     more = fg_calib("design", job, "--n", 5, *FEW, "--out", tmp_path / "more", "--json")
@@ -193,6 +193,11 @@ def test_more_of_a_job_is_written_as_a_table_to_fill_in(plan, fg_calib, tmp_path
     table = pl.read_csv(tmp_path / "more" / "poses.csv")
     assert len(table) == 5
     assert table["x"].null_count() == table["qw"].null_count() == 5
+    rows = fg_calib("design", job, "--n", 5, "--candidates", "rows", "--out", tmp_path / "rows", "--json")
+    assert rows.code == 0, rows.err
+    ids = pl.read_csv(tmp_path / "demo" / "poses.csv")["id"].to_list()
+    assert {stop["id"] for stop in json.loads(rows.out)["stops"]} <= set(ids)
+    assert sorted(f.name for f in (tmp_path / "rows").iterdir()) == ["configurations.csv", "design.json", "design.svg"]
 
 
 # --- what it refuses --------------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ STAR = Instrument(model="distance-rotation", name="it")
 EXPECTED = {name: INSTRUMENTS[name] for name in
             ("pose", "targets", "anchors", "offset", "contact", "planes", "board", "sockets")} | {
     "formed star": STAR,
+    "all formed pairs": replace(STAR, pairing=Pairing("all")),
     "pixels": INSTRUMENTS["pixels"],
 }  # fmt: skip
 
@@ -125,6 +126,19 @@ def test_a_board_seen_from_below_is_seen_from_below_again():
     assert under.expected.position == pytest.approx(above.expected.position, rel=1e-5)
 
 
+def test_rows_of_a_job_are_chosen_among_themselves():
+    q = np.random.default_rng(4).uniform(-1.5, 1.5, (30, 4))
+    job = job_of(Instrument(model="pose", name="it", frame="unknown"), GivenReadings(q))
+    plan = design(job, n=8, candidates="rows")
+    names = job.tables[0].measurements.ids.tolist()
+    rows = np.array([names.index(name) for name in plan.ids.tolist()])
+    assert np.abs(plan.readings - q[rows]).max() == 0.0
+    assert plan.before is None
+    table = replace(job.tables[0], measurements=job.tables[0].measurements.select(np.sort(rows)))
+    expected = error_of(job.robot, [table], plan.task)
+    assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
+
+
 # --- plans of a job, and what a job of all rows says of itself --------------------------------------------------------
 
 
@@ -191,15 +205,20 @@ def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
     assert plan.tables[0].measurements.sigma_position == pytest.approx(np.full((4, 3), found), rel=1e-6)
 
 
+def test_one_more_pose_of_a_chain_can_be_planned():
+    """It makes no pair by itself, and so adds nothing."""
+    chain = Instrument(model="distance", name="it", pairing=Pairing("chain"))
+    plan = design(job_of(chain, RandomReadings(30)), n=1, n_candidates=10)
+    assert plan.expected.position == pytest.approx(plan.before.position, rel=1e-6)
+
+
 # --- pairs ------------------------------------------------------------------------------------------------------------
 
 
-def test_pairs_that_are_no_star_are_refused_in_one_line():
+def test_pairs_that_are_measured_directly_are_refused_in_one_line():
     gauge = Instrument(model="distance", name="it", pairs=Pairing())
-    with pytest.raises(InputError, match=r"^instruments: it: pairs that are measured directly, expected pairing: star"):
+    with pytest.raises(InputError, match=r"^instruments: it: pairs that are measured directly, expected model: pose"):
         planned(gauge)
-    with pytest.raises(InputError, match="pairs that are no star, expected pairing: star, or model: pose with frame"):
-        planned(replace(STAR, pairing=Pairing("chain")))
     with pytest.raises(InputError, match="pairs that are measured directly, expected tables of poses"):
         design(job_of(gauge, RandomReadings(4)), n=4)
 
@@ -225,6 +244,7 @@ def test_the_curve_falls_and_designed_poses_are_better_than_random_ones():
         ({"n": 3, "target": 1e-3}, "target"),
         ({"n": 501}, "n"),
         ({"n_candidates": 1}, "n_candidates"),
+        ({"candidates": "rows"}, "rows of a scenario"),
         ({"criterion": "G"}, "criterion"),
         ({"task": np.zeros((0, 4))}, "task"),
         ({"given": np.zeros((3, 5))}, "given"),

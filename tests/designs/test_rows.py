@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenarios import CAMERA, GRID, INSTRUMENTS, SIGMA, WALL, scenario
+from simulated import measure, small_arm
 from tolerances import rounding
 
+from fg_calib import Pairing
 from fg_calib.designs.candidates import build_pool, draw_groups
-from fg_calib.graph import prior_rows, square_root, true_problem
+from fg_calib.designs.information import gather_rows
+from fg_calib.graph import build_problem, prior_rows, square_root, true_problem
+from fg_calib.inputs import InputError
 from fg_calib.simulation.scenario import Instrument, Placement, RandomReadings
 
 N = 20
@@ -27,6 +31,7 @@ BOARDS = Instrument(model="pixels", name="boards", boards=WALL | FLOOR, camera=C
 ALONE = ("targets", "stations", "anchors", "offset", "contact", "planes", "faces", "pixels", "sockets")
 KINDS = {name: (INSTRUMENTS[name],) for name in ALONE} | {
     "formed star": (STAR,),
+    "formed lengths": (Instrument(model="distance", name="it", pairing=Pairing("all")),),
     "two boards": (BOARDS,),
     "poses and lengths at the same poses": (POSES, ANCHORS),
     "a star whose reference pose others measure": (LENGTHS, POSES),
@@ -83,7 +88,7 @@ def test_all_poses_together_hold_what_their_problem_holds(kind):
     assert len(pool.rows.rows) == len(pool.readings) == pool.pose_of.max() + 1
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [k for k in KINDS if k != "formed lengths"])
 def test_some_poses_hold_what_a_problem_of_them_alone_holds(kind):
     """Of the arm and its frames: landmarks, which may start at other values, are eliminated."""
     pool = pool_with(*KINDS[kind])
@@ -105,3 +110,11 @@ def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     assert most >= len(GRID) / 2
     boards = len(pool.problem.data.landmarks.names) or 1
     assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most
+
+
+def test_pairs_that_share_errors_but_no_reference_pose_are_refused():
+    arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
+    data = measure(arm, 8, np.random.default_rng(0), sigma_joint=1e-3)
+    problem = build_problem(arm, data, model="distance", pairing=Pairing("chain"))
+    with pytest.raises(InputError, match=r"each shares an end with others.*pairing star"):
+        gather_rows(problem, np.arange(8))

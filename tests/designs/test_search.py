@@ -52,6 +52,13 @@ def test_no_random_set_of_a_hundred_is_better(criterion):
         assert gap(criterion, value(system, criterion, found), random) <= share
 
 
+def test_no_random_set_is_better_by_an_error_that_the_system_does_not_give():
+    """As of chains of pairs, for which candidates are chosen as poses; here the error is the sum of their numbers."""
+    system = random_system(np.random.default_rng(2), 40)
+    plain = Chooser(system, "I").best(5, np.random.default_rng(3))
+    assert np.sum(Chooser(system, "I", np.sum).best(5, np.random.default_rng(3))) < np.sum(plain)
+
+
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_exchange_never_makes_worse_and_ends_where_no_single_one_helps(criterion):
     """To the share that a sweep must gain for another one."""
