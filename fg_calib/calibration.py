@@ -9,10 +9,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -341,6 +341,7 @@ class Calibration:
         rows: Given,
         *,
         date: str | None = None,
+        growth: Mapping[str, float] | None = None,
         changed: Sequence[str] = (),
         anchors_stay: bool = False,
         pairs: Path | str | None = None,
@@ -351,6 +352,7 @@ class Calibration:
         Args:
             rows: A table like the calibration's (a file, or measurements), or a job with several.
             date: When they were measured, such as 2026-03-01; now if None.
+            growth: 1 sigma by which parameters wander in a day, by name or kind, [m] and [rad]; as the root of days.
             changed: Parameters, or zeros of joints, that have changed since: nothing is taken over of them.
             anchors_stay: Whether anchors of the same name are where they were.
             pairs: Table of pairs that were measured directly.
@@ -364,9 +366,17 @@ class Calibration:
         """
         self._require_trust()
         history, names = (*self.result.history, self.result.run), listed("changed", changed)
-        new = _later(date, self.result.date)
+        new, days = _date_and_days(date, self.result.date)
+        if growth and days is None:
+            raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
         table, inputs = self._rows(rows, pairs, like)
-        found = updated(self.calibrated, table, changed=names, anchors_stay=anchors_stay)
+        found = updated(
+            self.calibrated,
+            table,
+            growth={name: size * float(np.sqrt(days or 0.0)) for name, size in (growth or {}).items()},
+            changed=names,
+            anchors_stay=anchors_stay,
+        )
         uncertainty = assess(found)
         if uncertainty.acceptance is not None and not names:
             uncertainty = uncertainty.with_held_out(predicted_before(self.calibrated, table), found)
@@ -690,8 +700,8 @@ def _knowledge(robot: Robot, saved: io.Knowledge) -> Knowledge:
     return replace(found, rows=saved.rows.reshape(len(saved.rows), len(found.scales)))
 
 
-def _later(given: str | None, before: str) -> str:
-    """A date, now if None, that is not before another, if that is known.
+def _date_and_days(given: str | None, before: str) -> tuple[str, float | None]:
+    """A date, now if None, and the days to it from the date before; None where that is not known.
 
     Raises:
         InputError: The text is no date, or the date is a day or more before the other.
@@ -702,6 +712,7 @@ def _later(given: str | None, before: str) -> str:
     except ValueError:
         raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
     first, second = (date if date.tzinfo else date.replace(tzinfo=UTC) for date in dates)
-    if second - first <= -timedelta(days=1):  # a date without a time zone may be of the same day
+    days = (second - first).total_seconds() / 86400.0
+    if days <= -1.0:  # a date without a time zone may be of the same day
         raise InputError("date", f"{text} is before the calibration, {before}", "a later one")
-    return text
+    return text, max(days, 0.0) if before else None

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from fg_calib.cli.calibrate import show_calibration
 from fg_calib.cli.check import Like, NewTable, Pairs
 from fg_calib.cli.output import Json, ResultFolder, option
+
+if TYPE_CHECKING:
+    from fg_calib.robot import Robot
+
+Many = list[str] | None
 
 
 def update(
@@ -15,7 +21,8 @@ def update(
     table: NewTable,
     out: Annotated[Path, option("--out", "DIR", "Write the new result there, with its history.")],
     date: Annotated[str | None, option("--date", "DATE", "When the rows were measured; now if left out.")] = None,
-    changed: Annotated[list[str] | None, option("--changed", "NAME", "What has changed: it is estimated anew.")] = None,
+    growth: Annotated[Many, option("--growth", "NAME=FIGURE", "1 sigma of drift in a day: theta=0.001deg.")] = None,
+    changed: Annotated[Many, option("--changed", "NAME", "What has changed since: it is estimated anew.")] = None,
     anchors_stay: Annotated[bool, option("--anchors-stay", None, "Anchors of the same name have not moved.")] = False,
     pairs: Pairs = None,
     like: Like = None,
@@ -34,6 +41,7 @@ def update(
     found = before.update(
         table,
         date=date,
+        growth=_growth(growth or (), before.robot),
         changed=changed or (),
         anchors_stay=anchors_stay,
         pairs=pairs,
@@ -41,3 +49,23 @@ def update(
     )
     found.save(out)
     show_calibration(found, as_json)
+
+
+def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
+    """Growth by name or kind, in [m] and [rad].
+
+    Raises:
+        InputError: One is not `NAME=FIGURE` with a unit.
+    """
+    from fg_calib.inputs import InputError
+    from fg_calib.io import quantity
+    from fg_calib.robot import tolerance_kind
+
+    units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}
+    found = {}
+    for one in given:
+        name, equals, figure = one.partition("=")
+        if not equals:
+            raise InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
+        found[name] = quantity(figure, units.get(name, "rad"), None, f"--growth: {name}")
+    return found

@@ -94,6 +94,7 @@ class Check:
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.
         detectable: Joint offset changes that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
             None where they show none at all.
+        advice: Measurements to distinguish the two likeliest changes; None where there is nothing to.
     """
 
     verdict: Verdict
@@ -110,6 +111,7 @@ class Check:
     gross_rows: tuple[str, ...]
     deploy: bool
     detectable: dict[str, float | None]
+    advice: hypotheses.Advice | None = None
 
 
 def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
@@ -187,6 +189,7 @@ def _judge(
         gross_rows=tuple(gross),
         deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
         detectable=_detectable(calibrated, found),
+        advice=hypotheses.advise_configurations(at, likely),
     )
     return made if explained or verdict != "fail" else _unless_misread(made, at)
 
@@ -199,7 +202,7 @@ def _unless_misread(found: Check, at: Linear) -> Check:
     named = tuple(str(one) for one in reporting(checks) if one.explanations)
     if not named:
         return found
-    nothing = replace(found, cautions=(), explanations=(), gross_rows=())
+    nothing = replace(found, cautions=(), explanations=(), gross_rows=(), advice=None)
     return replace(nothing, verdict="not_evaluated", reasons=named, deploy=False)
 
 

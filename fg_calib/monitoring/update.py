@@ -4,33 +4,36 @@ What the old rows say stands as they were linearised at the old estimate (see `g
 together are as a solution of all rows would have them, but for what is not linear between the old estimate and the new.
 Rows old and new share no errors: encoders, instruments and measured poses of another month are other draws.
 
-Where the arm has changed, tolerances no longer say where it is, but where it was: they become part of what is known,
-of which nothing is left along the change, and are no priors of the new calibration.
+Where the arm may have changed, tolerances no longer say where it is, but where it was: they become part of what is
+known before that grows by the change, and are no priors of the new calibration.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from fg_calib.graph import Knowledge, Problem, Solution, kept_of, solve
-from fg_calib.inputs import InputError, ProblemError, check_names
+from fg_calib.inputs import NEAR, Floats, InputError, ProblemError, did_you_mean, known_names
 from fg_calib.measurements import TARGET, build_dataset
 from fg_calib.monitoring.hypotheses import named_changes
 from fg_calib.monitoring.new_data import Rows, place_new_data, started
 from fg_calib.monitoring.prior_information import Calibrated
-from fg_calib.robot import Robot
+from fg_calib.robot import Robot, tolerance_kind
 from fg_calib.statistics import HeldOut
 
 
-def updated(calibrated: Calibrated, rows: Rows, *, changed: Sequence[str], anchors_stay: bool) -> Solution:
+def updated(
+    calibrated: Calibrated, rows: Rows, *, growth: Mapping[str, float], changed: Sequence[str], anchors_stay: bool
+) -> Solution:
     """The solution of new rows with what is known.
 
     Args:
         calibrated: The arm.
         rows: The rows.
+        growth: 1 sigma by which parameters may have wandered, by name or kind, [m] and [rad].
         changed: Parameters, or zeros of joints, that have changed by nobody knows how much.
         anchors_stay: Whether anchors of the same name are where they were.
 
@@ -46,10 +49,10 @@ def updated(calibrated: Calibrated, rows: Rows, *, changed: Sequence[str], ancho
         raise InputError("update", found, "one that this version of fg-calib wrote, with an arm that was estimated")
     known = known.about([name for name in known.unknowns if name[0] == TARGET.letter or anchors_stay])
     robot = calibrated.robot
-    if changed:
+    if growth or changed:
         information = replace(calibrated, knowledge=known).information
         assert information is not None
-        known = _with_change(information, changed)
+        known = _with_change(information, growth, changed)
         robot = replace(robot, parameters=tuple(replace(p, tolerance=None) for p in robot.parameters))
     fit = place_new_data(replace(calibrated, knowledge=known), rows, calibrated.values).solution
     return solve(_problem(calibrated, robot, known, rows, fit))
@@ -90,10 +93,34 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
     return whole
 
 
-def _with_change(known: Knowledge, changed: Sequence[str]) -> Knowledge:
-    """Information about an arm that has changed since, the tolerances among it."""
-    of = named_changes(known.variables)
-    check_names("changed", changed, list(of))
-    columns = np.pad(np.hstack([of[name] for name in changed]), ((0, len(known.at)), (0, 0)))
-    nominal = None if known.nominal is None else _with_change(known.nominal, changed)
-    return replace(known.grown(columns, np.ones(columns.shape[1], dtype=np.bool_)), nominal=nominal)
+def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequence[str]) -> Knowledge:
+    """Information about an arm that may have changed since, the tolerances among it.
+
+    Growth of a parameter's name counts before that of its kind.
+    """
+    kinds = {p.name: tolerance_kind(p) or "" for p in known.robot.parameters}
+    names, free = known.variables.names, dict.fromkeys(changed, 1.0)
+    of_kinds = sorted({kinds[name] for name in names if kinds[name]})
+    for key, given, possible in (
+        ("growth", growth, [*names, *of_kinds]),
+        ("changed", changed, list(named_changes(known.variables))),
+    ):
+        for name in given:
+            if name not in possible:
+                hint = did_you_mean(name, possible, NEAR)
+                raise InputError(key, f"unknown parameter {name!r}", known_names(possible), hint)
+    sigma = {name: growth.get(name, growth.get(kinds[name], 0.0)) for name in names}
+    wandered = _columns(known, {name: size for name, size in sigma.items() if size > 0.0})
+    columns = np.hstack([wandered, _columns(known, free)])
+    grown = known.grown(columns, np.arange(columns.shape[1]) >= wandered.shape[1])
+    if known.nominal is None:
+        return grown
+    columns = _columns(known.nominal, free)
+    return replace(grown, nominal=known.nominal.grown(columns, np.ones(columns.shape[1], dtype=np.bool_)))
+
+
+def _columns(known: Knowledge, sizes: Mapping[str, float]) -> Floats:
+    """Named changes of some size as columns of what is known, shape (n_columns + len(at), n)."""
+    of, n = named_changes(known.variables), known.variables.n_columns
+    columns = np.hstack([np.zeros((n, 0)), *(size * of[name] for name, size in sizes.items())])
+    return np.pad(columns, ((0, len(known.at)), (0, 0)))

@@ -99,6 +99,7 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "another table to check": (written("x,y\n1,2\n"), ("check", "result", "table.csv"), "table.csv"),
     "a name of no table": (nothing, ("check", "result", POSES, "--like", "x.csv"), "one of poses.csv"),
     "rows that were counted": (nothing, UPDATE, "in the calibration already"),
+    "a bare growth": (nothing, (*UPDATE, "--growth", "theta"), "NAME=FIGURE"),
     "a date before": (nothing, (*UPDATE, "--date", "1999-01-01"), "is before the calibration"),
     "the folder of the result": (nothing, (*UPDATE[:-1], "result"), "the folder of the result"),
     "too many stops": (nothing, (*DESIGN, "--n", 100000), "n: "),

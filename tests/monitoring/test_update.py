@@ -143,6 +143,18 @@ def test_an_update_at_odds_with_what_was_known_points_to_the_check():
     assert not any("parallel" in text for text in updated.findings)
 
 
+def test_growth_is_added_to_what_was_known():
+    """With hardly any new rows, variances are the old ones and the growth, whatever the correlation."""
+    calibration, true, rng = calibrated(7)
+    later = "2100-01-01"
+    days = (np.datetime64("2100-01-01T00:00:00") - np.datetime64(calibration.result.date[:19])) / np.timedelta64(1, "D")
+    coarse = measured(true, 3, rng, sigma=(10.0, 10.0))
+    updated = calibration.update(coarse, growth={"theta": 1e-6, "theta4": 2e-6}, date=later)
+    for name, rate in (("theta2", 1e-6), ("theta4", 2e-6), ("a2", 0.0)):
+        was, now = calibration.parameters[name].sigma, updated.parameters[name].sigma
+        assert now == pytest.approx(np.hypot(was, rate * np.sqrt(days)), rel=1e-4)
+
+
 def test_an_update_says_what_it_came_from():
     calibration, true, rng = calibrated(8)
     updated = calibration.update(measured(true, 6, rng), date="2026-12-24")
@@ -182,12 +194,13 @@ def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
     assert "relative" in classes(updated).values()
 
 
-def test_what_tolerances_alone_say_is_no_data_of_an_update():
-    """With a change they are part of what is known: d2, d3 and d4 of parallel axes were called independent."""
+@pytest.mark.parametrize("change", [{"growth": {"theta": 1e-9, "d": 1e-9}}, {"changed": ["theta3"]}])
+def test_what_tolerances_alone_say_is_no_data_of_an_update(change):
+    """With growth the tolerances are part of what is known: d2, d3 and d4 of parallel axes were called independent."""
     rng = np.random.default_rng(2)
     true = true_robot(arm(), rng)
     old, new = (with_still_joint("pose", n, rng, true) for n in (30, 10))
-    updated = calibrate(arm(), old).update(new, changed=["theta3"])
+    updated = calibrate(arm(), old).update(new, date="2100-01-01", **change)
     assert classes(updated) == classes(calibrate(arm(), [old, new]))
 
 
@@ -245,6 +258,7 @@ def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_
     ("options", "message"),
     [
         ({"changed": "thetta3"}, "did you mean theta3"),
+        ({"growth": {"elbow": 1e-6}}, "growth"),
         ({"date": "yesterday"}, "a date such as"),
     ],
 )
