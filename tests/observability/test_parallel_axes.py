@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from jobs import UR5E, ur5e
-from simulated import measure, true_robot
+from simulated import measure, small_arm, true_robot
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
@@ -95,6 +95,16 @@ def test_what_the_convention_lacks_is_an_error_only_where_it_explains_the_misfit
     verdict = assess(solve(build_problem(ur5e(tmp_path, **DH), m, model=model))).verdict
     assert verdict.errors[0].startswith("reduced chi-square")
     assert (LACKS in verdict.errors, LACKS in verdict.notes) == (tilted, not tilted)
+
+
+@pytest.mark.parametrize(("frame", "axes"), [("base", (0, 1)), ("tool", (4, 5))])
+def test_a_frame_whose_turn_alone_is_estimated_is_named_where_it_is_pitched_by_a_quarter_turn(frame, axes):
+    robot = small_arm(estimate=[f"{frame}.{angle}" for angle in ("roll", "pitch", "yaw")])
+    pitched = robot.nominal
+    pitched[robot.index(f"{frame}.pitch")] = QUARTER
+    assert not missing_motions(robot)
+    (found,) = missing_motions(robot.with_values(pitched))
+    assert (found.axes, found.frame) == (axes, f"the frame {frame}")
 
 
 @pytest.mark.parametrize(("pitch", "told"), [(90.0, True), (-84.0, True), (60.0, False)])
