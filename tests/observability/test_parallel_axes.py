@@ -97,14 +97,12 @@ def test_what_the_convention_lacks_is_an_error_only_where_it_explains_the_misfit
     assert (LACKS in verdict.errors, LACKS in verdict.notes) == (tilted, not tilted)
 
 
-@pytest.mark.parametrize(("frame", "axes"), [("base", (0, 1)), ("tool", (4, 5))])
-def test_a_frame_whose_turn_alone_is_estimated_is_named_where_it_is_pitched_by_a_quarter_turn(frame, axes):
-    robot = small_arm(estimate=[f"{frame}.{angle}" for angle in ("roll", "pitch", "yaw")])
+def test_a_base_whose_turn_alone_is_estimated_is_named_where_it_is_pitched_by_a_quarter_turn():
+    robot = small_arm(estimate=[f"base.{angle}" for angle in ("roll", "pitch", "yaw")])
     pitched = robot.nominal
-    pitched[robot.index(f"{frame}.pitch")] = QUARTER
-    assert not missing_motions(robot)
+    pitched[robot.index("base.pitch")] = QUARTER
     (found,) = missing_motions(robot.with_values(pitched))
-    assert (found.axes, found.frame) == (axes, f"the frame {frame}")
+    assert (found.axes, found.frame) == ((0, 1), "the frame base")
 
 
 @pytest.mark.parametrize(("pitch", "told"), [(90.0, True), (-84.0, True), (60.0, False)])

@@ -203,7 +203,6 @@ def pose_with_coefficients(robot, values, q):
     return T
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("convention", [*CONVENTIONS, "urdf"])
 def test_coefficients_times_functions_of_readings(convention):
     rng = np.random.default_rng(7)
