@@ -263,8 +263,8 @@ def test_a_correction_beyond_its_prior_is_named_and_what_follows_it_is_not():
     assert [(one.name, one.z, one.is_place) for one in found] == [("a", 10.0, False), ("c", 2.5, False)]
     assert found[1].sigma == 0.5
     assert not list(_beyond(("a", "b", "c"), np.array([2.5, 2.5, 1.0]), A, 3))
-    unseen = np.diag([1.0, 1.0, 0.0])  # on an axis that data do not see a place is off by rounding
-    assert not list(_beyond(("a", "a", "a"), np.array([2.5, 0.0, 3e-3]), unseen, 0))
+    # On an axis that data do not see a place is off by rounding.
+    assert not list(_beyond(("a", "a", "a"), np.array([2.5, 0.0, 3e-3]), np.diag([1.0, 1.0, 0.0]), 0))
 
 
 def test_a_correction_is_judged_by_what_it_varies_by_without_the_priors_before_it():
