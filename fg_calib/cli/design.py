@@ -35,7 +35,7 @@ def design(
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
     from fg_calib.designs.design import design as designed
-    from fg_calib.io import require_writable
+    from fg_calib.io import require_absent, require_writable
     from fg_calib.report import build_design_report, design_document, write_design
 
     if n is not None and target is not None:
@@ -43,6 +43,7 @@ def design(
     subject, units, robot = _read(of)
     if out is not None:
         require_writable(out)
+        require_absent(out, ["design.json"])  # before the search, which takes its time
     choices: dict[str, Any] = {
         "n": n,
         "target": target,

@@ -1,21 +1,19 @@
 """Charts as SVG: dots, lines, boxes and words on two axes, in colours that the page's style sheet sets.
 
-A chart is a caption and its SVG. It stands in the page as it is, or in a file of its own (`write_charts`).
+A chart is a caption and its SVG. It stands in the page as it is, or in a file of its own (`standalone`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fg_calib.inputs import Floats, escaped
-from fg_calib.io import write_text
 
 WIDTH, HEIGHT = 360.0, 230.0
 """Size of an ordinary chart, in its own units; the page stretches it."""
@@ -112,12 +110,9 @@ class Plot:
         y: Values from bottom to top, or names from top to bottom.
         names: Titles of the axes, with units.
         height: Of the chart with values from bottom to top.
-        powers: Whether the values from bottom to top are powers of ten.
     """
 
-    def __init__(
-        self, x: Axis, y: Axis, names: tuple[str, str], *, height: float = HEIGHT, powers: bool = False
-    ) -> None:
+    def __init__(self, x: Axis, y: Axis, names: tuple[str, str], *, height: float = HEIGHT) -> None:
         columns, rows = ([short(name, 28) for name in axis if isinstance(name, str)] for axis in (x, y))
         left = 10.0 + LETTER * max(map(len, rows)) if rows else LEFT
         bottom = 8.0 + LETTER * max(map(len, columns)) if columns else BOTTOM
@@ -127,7 +122,7 @@ class Plot:
         self._size = right + RIGHT, foot + bottom
         self.x, self.y = _scale(x, left, right), _scale(y, TOP, foot) if rows else _scale(y, foot, TOP)
         self._elements: list[str] = []
-        for value, word in enumerate(rows) if rows else _labels(self.y, powers):
+        for value, word in enumerate(rows) if rows else _labels(self.y):
             if not rows:
                 self.line((self.x.low, self.x.high), value, "grid")
             self._words(left - 5.0, self.y(value) + 3.5, word, "tick end")
@@ -192,10 +187,9 @@ def _scale(axis: Axis, start: float, end: float) -> Scale:
     return Scale(float(low), float(high), start, end)
 
 
-def _labels(scale: Scale, powers: bool = False) -> list[tuple[float, str]]:
+def _labels(scale: Scale) -> list[tuple[float, str]]:
     """Round values along an axis, and what stands at them."""
-    labels = ((value, f"{value:.6g}" if value else "0") for value in scale.ticks())
-    return [(value, f"1e{value:.3g}" if powers else word.replace("-", "\N{MINUS SIGN}")) for value, word in labels]
+    return [(value, f"{value:.6g}".replace("-", "\N{MINUS SIGN}") if value else "0") for value in scale.ticks()]
 
 
 def short(name: str, most: int) -> str:
@@ -219,13 +213,3 @@ def standalone(charts: Sequence[Chart]) -> str:
 def resource(name: str) -> str:
     """The text of a file of this folder."""
     return files("fg_calib.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def write_charts(folder: Path, figures: Mapping[str, Sequence[Chart]]) -> None:
-    """Write each figure as an SVG file of its name.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    for name, charts in figures.items():
-        write_text(folder / f"{name}.svg", standalone(charts))

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +14,12 @@ from rich.console import Group
 from rich.table import Table as Shown
 
 from fg_calib.designs import Design
-from fg_calib.inputs import Floats, InputError
-from fg_calib.io import Units, exists, fill_folder, read_text, write_csv, write_robot, write_text, write_urdf
+from fg_calib.inputs import Floats
+from fg_calib.io import Units, fill_folder, require_absent, write_csv, write_robot, write_text, write_urdf
 from fg_calib.measurements import Table
 from fg_calib.observability import missing_motions
 from fg_calib.prediction import PoseRms
 from fg_calib.report import tables
-from fg_calib.report.charts import Chart, Plot, limits_of, write_charts
 from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
@@ -139,36 +135,17 @@ def _size(value: float) -> str:
     return _mm(value).removesuffix(" mm")
 
 
-CONFIGURATIONS, _DOCUMENT = "configurations.csv", "design.json"
+CONFIGURATIONS, DESIGN = "configurations.csv", "design.json"
 
 _JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `fg-calib "
 _CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
-
-
-def draw_design(design: Design) -> Chart:
-    """Draw expected errors over the number of poses, with the range of 80 % of the random ones.
-
-    Args:
-        design: The design.
-    """
-    errors = np.array([(p.designed, *p.random) for p in design.curve]).T
-    n, target = np.array([float(p.n) for p in design.curve]), np.log10((design.target or np.nan) * 1e3)
-    designed, low, middle, high = np.log10(np.where(errors < UNKNOWN_ABOVE, 1e3 * errors, np.nan))
-    limits = limits_of(n), limits_of(designed, low, high, target)
-    plot = Plot(*limits, ("poses", "expected RMS error over the task [mm]"), powers=True)
-    if design.target is not None:
-        plot.line((plot.x.low, plot.x.high), float(target), "level")
-    for values, kind in ((low, "b"), (high, "b"), (middle, "large b"), (designed, "large a")):
-        plot.dots(n, values, kind)
-    caption = f"{design.pool.robot.name}: expected error by the number of poses; blue designed, orange random"
-    return plot.chart(f"{caption} (half, and 80 % of them)")
 
 
 def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     """Write where to measure, the job to be filled in, and what to expect.
 
     Args:
-        folder: Where to; files of an earlier design there are replaced, or removed.
+        folder: Where to.
         design: The design.
         units: Of the tables and the job.
 
@@ -176,28 +153,23 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         The names of the files.
 
     Raises:
-        InputError: The folder cannot be written, or holds files of these names that are no design's, or tables that
-            have been filled in.
+        InputError: The folder cannot be written, or holds a file of these names: its tables may have been filled in.
     """
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     measured = design.tables if design.pool.scenario is not None else ()
-    filled: dict[str, Any] = {}
+    files: dict[str, Any] = {CONFIGURATIONS: _configurations(design, robot, units)}
     for t in measured:
         for name, columns in table_columns(t, robot, units).items():
             rounded = _rounded(t.measurements.readings, robot, units) if "q1" in columns else {}
-            filled[name] = to_fill_in({**columns, **rounded}, touched=_is_touched(t))
+            files[name] = to_fill_in({**columns, **rounded}, touched=_is_touched(t))
     urdf = "robot.urdf" if robot.urdf is not None and measured else None
     job = ("robot.yaml", "calibration.yaml") if measured else ()
-    names = (_DOCUMENT, CONFIGURATIONS, "design.svg", *filled, *job, *([urdf] if urdf else []))
-    earlier = _files_before(folder)
-    for name, digest in earlier.items():
-        if name.endswith(".csv") and exists(folder / name) and _digest(folder / name) != digest:
-            raise InputError(str(folder / name), "a table that has been filled in", "another folder")
+    names = (DESIGN, *files, *job, *([urdf] if urdf else []))
+    require_absent(folder, names)
 
     def write(into: Path) -> None:
-        write_csv(into / CONFIGURATIONS, _configurations(design, robot, units))
-        write_charts(into, {"design": [draw_design(design)]})
-        for name, columns in filled.items():
+        write_text(into / DESIGN, tables.json_text(design_document(design)))
+        for name, columns in files.items():
             write_csv(into / name, columns)
         if urdf is not None:
             write_urdf(into / urdf, robot)
@@ -205,26 +177,9 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
             then = _CALIBRATE if design.pool.before is None else _UPDATE
             write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, measured, units))
-        files = {_DOCUMENT: ""} | {file.name: _digest(file) for file in into.iterdir()}
-        write_text(into / _DOCUMENT, tables.json_text(design_document(design) | {"files": files}))
 
-    own = {name: b"" if name in earlier else b"none" for name in dict.fromkeys((*names, *earlier))}
-    fill_folder(folder, write, own)
+    fill_folder(folder, write)
     return names
-
-
-def _digest(path: Path) -> str:
-    return sha256(read_text(path).encode()).hexdigest()
-
-
-def _files_before(folder: Path) -> dict[str, str]:
-    """Names of the files of an earlier design in a folder, with their digests; none where there was none."""
-    path = folder / _DOCUMENT
-    with suppress(ValueError, TypeError, KeyError, AttributeError, InputError):  # none, or changed manually
-        document = json.loads(read_text(path)) if exists(path) else {}
-        if document["schema"] == "fg-calib/design/1":
-            return {name: digest for name, digest in document["files"].items() if Path(name).name == name}
-    return {}
 
 
 def _is_touched(table: Table) -> bool:

@@ -15,7 +15,7 @@ from fg_calib.inputs import Floats
 from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
 from fg_calib.prediction import Correction, PredictedErrors, ToolErrors, summed_up
 from fg_calib.report import tables
-from fg_calib.report.charts import write_charts
+from fg_calib.report.charts import standalone
 from fg_calib.report.figures import error_slices
 from fg_calib.report.tables import POSE_KINDS, figure, in_words, line, section, table_of
 from fg_calib.report.text import verdict_word
@@ -127,7 +127,8 @@ def write_prediction(
         write_text(into / "predict.json", tables.json_text(prediction_document(found, result, ids)))
         write_csv(into / "predict.csv", columns)
         if not found.given and found.unknown < 1.0:
-            write_charts(into, {"predict": error_slices(errors.position, found.expected[:, 0], found.measured)})
+            slices = error_slices(errors.position, found.expected[:, 0], found.measured)
+            write_text(into / "predict.svg", standalone(slices))
 
     fill_folder(folder, write, FILES)
 
