@@ -33,11 +33,11 @@ def bag(
     as_json: Json = False,
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""
-    from fg_calib.importers import TABLE_BEGINNING, average_stops, read_bag, write_stops
-    from fg_calib.io import read_robot, require_own_csv
+    from fg_calib.importers import average_stops, read_bag, write_stops
+    from fg_calib.io import read_robot, require_absent
 
     if out is not None:
-        require_own_csv(out, TABLE_BEGINNING)
+        require_absent(out.parent, [out.name])
     arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
     topics = {"joints": joints, "pose": pose, "parent": parent, "child": child}
     of_joints, of_pose = read_bag(recording, arm, **topics, names=names_in(names))

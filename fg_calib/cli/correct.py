@@ -21,11 +21,11 @@ def correct(
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
     from fg_calib.calibration import Calibration
     from fg_calib.calibration import correct as correct_targets
-    from fg_calib.io import Units, read_targets
-    from fg_calib.report import build_correction_report, correction_document, require_commands, write_commands
+    from fg_calib.io import Units, read_targets, require_absent
+    from fg_calib.report import build_correction_report, correction_document, write_commands
 
     if out is not None:
-        require_commands(out)
+        require_absent(out.parent, [out.name])
     found, units = Calibration.load(result), Units(length, angle)
     wanted = read_targets(targets, found.robot, units)
     commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)

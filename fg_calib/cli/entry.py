@@ -1,7 +1,7 @@
 """The entry point: the commands, and the one door where errors become a line and an exit code.
 
-Exit codes: 0 good; 1 bad input; 2 wrong usage; 3 solved, or to be solved, but not to be trusted; 130 interrupted; 141
-the reader of the output has gone.
+Exit codes: 0 good; 1 bad input, or the reader of the output has gone; 2 wrong usage; 3 solved, or to be solved, but not
+to be trusted; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -50,16 +50,10 @@ def run() -> None:
     try:
         with progress():
             app(prog_name="fg-calib")
-    except SystemExit as ended:
-        if isinstance(ended.__context__, BrokenPipeError):
-            _close_pipe()
-        raise
     except CalibrationError as error:
         _fail(str(error))
     except MemoryError:
         _fail("there is not enough memory for this")
-    except BrokenPipeError:
-        _close_pipe()
     except OSError as error:
         _fail(f"{error.filename or 'the output cannot be written'}: {error.strerror or error}")
 
@@ -68,12 +62,6 @@ def _fail(message: str) -> NoReturn:
     """Say in one line why there is no result."""
     say(f"error: {message}")
     sys.exit(1)
-
-
-def _close_pipe() -> NoReturn:
-    """End after the reader of the output has gone; what is left is not flushed into the pipe."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(141)
 
 
 def _show_version(wanted: bool) -> None:

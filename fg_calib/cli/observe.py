@@ -5,23 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from fg_calib.cli.output import Angle, BaseLink, Json, Length, TipLink, argument, names_in, option, show_result
 from fg_calib.inputs import FrameKnowledge, Model
 
 Sigma = float | None
 Strategy = Literal["star", "chain", "all"]
-OF_TABLE = ("pairing", "length", "angle", "position_noise", "orientation_noise", "joint_noise")
-"""Options that have no effect without a table."""
 
 
 def observe(
-    context: typer.Context,
     robot: Annotated[Path, argument("ROBOT", "The robot: robot.yaml or a URDF.")],
     model: Annotated[Model, option("--model", None, "What is measured.")] = "distance-rotation",
     configurations: Annotated[Path | None, option("--configurations", "TABLE", "Random ones if not given.")] = None,
-    out: Annotated[Path | None, option("--out", "DIR", "Write observability.json and figures there.")] = None,
+    out: Annotated[Path | None, option("--out", "DIR", "Write observability.json there.")] = None,
     frame: Annotated[FrameKnowledge, option("--frame", None, "Whether world_T_base is estimated too.")] = "known",
     pairing: Annotated[Strategy, option("--pairing", None, "Pairs of TABLE's configurations.")] = "star",
     base_link: BaseLink = None,
@@ -42,11 +37,6 @@ def observe(
     from fg_calib.observability import observe_configurations, observe_structure
     from fg_calib.report import build_identifiability_report, observability_document, write_observability
 
-    for name in OF_TABLE if configurations is None else ("seed",):
-        source = context.get_parameter_source(name)
-        if source is not None and source.name != "DEFAULT":
-            circumstance = f"{'without' if configurations is None else 'with'} --configurations"
-            raise typer.BadParameter(f"no effect {circumstance}", param_hint=f"--{name.replace('_', '-')}")
     arm, names = read_robot(robot, base_link=base_link, tip_link=tip_link), names_in(prefer)
     if configurations is None:
         found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)

@@ -1,4 +1,4 @@
-from .bag import TABLE_BEGINNING, JointStream, PoseStream, Stops, average_stops, period, read_bag, write_stops
+from .bag import JointStream, PoseStream, Stops, average_stops, period, read_bag, write_stops
 from .board import (
     BOARD_FILES,
     INTRINSICS,
@@ -16,7 +16,6 @@ from .draft import draft_job
 __all__ = [
     "BOARD_FILES",
     "INTRINSICS",
-    "TABLE_BEGINNING",
     "BoardTables",
     "JointStream",
     "PoseStream",

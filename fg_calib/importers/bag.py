@@ -42,7 +42,7 @@ from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, FrozenArrays, InputError, check_number, checked
-from fg_calib.io import joint_columns, require_own_csv, write_csv
+from fg_calib.io import joint_columns, require_absent, write_csv
 from fg_calib.robot import Robot, build_chain, forward
 
 
@@ -427,10 +427,6 @@ def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
 # --- the table of stops -----------------------------------------------------------------------------------------------
 
 
-TABLE_BEGINNING = b"id,begin,seconds,samples,"
-"""How a table of stops begins."""
-
-
 @checked
 def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
     """Write the table of configurations and poses, in m and rad, whole or not at all.
@@ -440,15 +436,15 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
     where orientations were measured; `sigma_x ...` and `sigma_rx ...`.
 
     Args:
-        path: The CSV; one that was written as such is replaced.
+        path: The CSV, a new file.
         stops: The stops.
         robot: Whose joints they are of.
 
     Raises:
-        InputError: The table cannot be written, or is another file.
+        InputError: The table cannot be written, or is there already.
     """
     path = Path(path)
-    require_own_csv(path, TABLE_BEGINNING)
+    require_absent(path.parent, [path.name])
     columns: dict[str, Any] = {
         "id": np.array(stops.ids),
         "begin": np.round(stops.interval[:, 0], 3),

@@ -66,7 +66,6 @@ from .tables import (
     read_joint_table,
     read_measurements,
     read_targets,
-    require_own_csv,
     write_csv,
 )
 from .yaml import (
@@ -154,7 +153,6 @@ __all__ = [
     "require_absent",
     "require_no_input",
     "require_own",
-    "require_own_csv",
     "require_writable",
     "residual_frame",
     "robot_of",

@@ -42,7 +42,7 @@ from fg_calib.inputs import (
     did_you_mean,
     once,
 )
-from fg_calib.io.atomic import decoded, read_bytes, require_own, write_text
+from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import Units, number_hint, shown
 from fg_calib.measurements import (
     ANGLE_SLACK,
@@ -415,23 +415,6 @@ def _one_line(name: str, what: str) -> Iterator[None]:
     except (Exception, pl.exceptions.PanicException) as error:  # of a frame's objects polars may raise anything
         first = str(error).strip().partition("\n")[0]
         raise InputError(name, f"{what}: {first or type(error).__name__}") from None
-
-
-def require_own_csv(path: Path, beginning: bytes) -> None:
-    """Check that a table can be written: a CSV that is not there yet, or was written as one of that kind.
-
-    Args:
-        path: Where.
-        beginning: How tables of that kind begin.
-
-    Raises:
-        InputError: The table cannot be written.
-    """
-    if path.suffix.lower() != ".csv":
-        raise InputError(str(path), f"ending {path.suffix!r}", ".csv")
-    if not path.parent.is_dir():
-        raise InputError(str(path), f"there is no folder {path.parent}")
-    require_own(path.parent, {path.name: beginning})
 
 
 def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None:

@@ -20,7 +20,6 @@ from .predict import (
     build_prediction_report,
     correction_document,
     prediction_document,
-    require_commands,
     write_commands,
     write_prediction,
 )
@@ -56,7 +55,6 @@ __all__ = [
     "plain",
     "prediction_document",
     "report",
-    "require_commands",
     "section",
     "shortened",
     "shown_in",

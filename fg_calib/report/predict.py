@@ -12,7 +12,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats
-from fg_calib.io import Result, Units, fill_folder, joint_columns, require_own_csv, write_csv, write_text
+from fg_calib.io import Result, Units, fill_folder, joint_columns, require_absent, write_csv, write_text
 from fg_calib.prediction import Correction, PredictedErrors, ToolErrors, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import standalone
@@ -315,19 +315,6 @@ def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[st
         yield "The expected error is unknown where it depends on what the calibration did not determine."
 
 
-_COMMANDS_BEGIN = b"id,reached,"
-"""How a table of commands begins."""
-
-
-def require_commands(path: Path) -> None:
-    """Check that a table of commands can be written: a CSV that is not there yet, or was written as one.
-
-    Raises:
-        InputError: The table cannot be written.
-    """
-    require_own_csv(path, _COMMANDS_BEGIN)
-
-
 def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, robot: Robot, units: Units) -> None:
     """Write a table of commands, whole or not at all.
 
@@ -338,14 +325,14 @@ def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, rob
     in the units given; an empty cell is unknown.
 
     Args:
-        path: The CSV; one that was written as such is replaced.
+        path: The CSV, a new file.
         ids: The targets' names.
         correction: The commands.
         robot: Whose joints they are of.
         units: Of the figures.
 
     Raises:
-        InputError: The table cannot be written, or is another file.
+        InputError: The table cannot be written, or is there already.
     """
     readings = correction.readings / [units.factor(joint.unit) for joint in robot.joints]
     columns: dict[str, Any] = {
@@ -357,5 +344,5 @@ def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, rob
     }
     for of, kinds in _errors(correction).items():
         columns |= {f"{of}_{kind}": values / units.factor(POSE_KINDS[kind]) for kind, values in kinds.items()}
-    require_commands(path)
+    require_absent(path.parent, [path.name])
     write_csv(path, columns)

@@ -81,17 +81,15 @@ def test_a_bag_calibrates_the_arm(tmp_path, fg_calib):
 
 def test_the_table_is_read_as_it_was_averaged(tmp_path):
     stops = average_stops(*record(2, n_stops=4).streams(), arm())
-    for _ in range(2):  # its own table is replaced
-        write_stops(tmp_path / "poses.csv", stops, arm())
+    write_stops(tmp_path / "poses.csv", stops, arm())
     m = read_measurements(tmp_path / "poses.csv", arm())
     assert tuple(m.ids) == stops.ids
     for kind, values, sigma in (("joint", m.readings, None), ("position", m.position, m.sigma_position),
                                 ("orientation", m.rotation, m.sigma_orientation)):  # fmt: skip
         assert values == pytest.approx(stops.means[kind], abs=1e-12)
         assert sigma is None or sigma == pytest.approx(stops.sigmas[kind], abs=0)
-    (tmp_path / "mine.csv").write_text("id,q1\n")
-    with pytest.raises(InputError, match="is there already, not written by this command"):
-        write_stops(tmp_path / "mine.csv", stops, arm())
+    with pytest.raises(InputError, match="is there already, expected a folder without it"):
+        write_stops(tmp_path / "poses.csv", stops, arm())
 
 
 # Topics, frames, stamps and names
