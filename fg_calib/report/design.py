@@ -20,6 +20,7 @@ from fg_calib.measurements import Table
 from fg_calib.observability import missing_motions
 from fg_calib.prediction import PoseRms
 from fg_calib.report import tables
+from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
@@ -141,6 +142,25 @@ _JOB_BEGINS = "# fg-calib design\n# What to measure: fill in the tables, then `f
 _CALIBRATE, _UPDATE = "calibrate` this file.\n", "update RESULT` this file: RESULT is of what there was.\n"
 
 
+def draw_design(design: Design) -> Chart:
+    """Draw expected errors over the number of poses, with the range of 80 % of the random ones.
+
+    Args:
+        design: The design.
+    """
+    errors = np.array([(p.designed, *p.random) for p in design.curve]).T
+    n, target = np.array([float(p.n) for p in design.curve]), np.log10((design.target or np.nan) * 1e3)
+    designed, low, middle, high = np.log10(np.where(errors < UNKNOWN_ABOVE, 1e3 * errors, np.nan))
+    limits = limits_of(n), limits_of(designed, low, high, target)
+    plot = Plot(*limits, ("poses", "log10 of the expected RMS error over the task [mm]"))
+    if design.target is not None:
+        plot.line((plot.x.low, plot.x.high), float(target), "level")
+    for values, kind in ((low, "b"), (high, "b"), (middle, "large b"), (designed, "large a")):
+        plot.dots(n, values, kind)
+    caption = f"{design.pool.robot.name}: expected error by the number of poses; blue designed, orange random"
+    return plot.chart(f"{caption} (half, and 80 % of them)")
+
+
 def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     """Write where to measure, the job to be filled in, and what to expect.
 
@@ -164,11 +184,12 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             files[name] = to_fill_in({**columns, **rounded}, touched=_is_touched(t))
     urdf = "robot.urdf" if robot.urdf is not None and measured else None
     job = ("robot.yaml", "calibration.yaml") if measured else ()
-    names = (DESIGN, *files, *job, *([urdf] if urdf else []))
+    names = (DESIGN, "design.svg", *files, *job, *([urdf] if urdf else []))
     require_absent(folder, names)
 
     def write(into: Path) -> None:
         write_text(into / DESIGN, tables.json_text(design_document(design)))
+        write_text(into / "design.svg", standalone([draw_design(design)]))
         for name, columns in files.items():
             write_csv(into / name, columns)
         if urdf is not None:

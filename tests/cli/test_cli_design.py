@@ -161,6 +161,7 @@ def test_the_job_calibrates_when_it_is_filled_in(kind, plan, fg_calib, tmp_path)
     assert ended.code == 0, ended.err
     assert f"to {out}" in ended.err
     document = json.loads((out / "design.json").read_text())
+    assert (out / "design.svg").read_text().startswith("<svg")
     stops = pl.read_csv(out / "configurations.csv")
     assert stops["id"].to_list() == [stop["id"] for stop in document["stops"]]
     q = readings_in(out / "configurations.csv")
@@ -196,7 +197,7 @@ def test_more_of_a_job_is_written_as_a_table_to_fill_in(plan, fg_calib, tmp_path
     assert rows.code == 0, rows.err
     ids = pl.read_csv(tmp_path / "demo" / "poses.csv")["id"].to_list()
     assert {stop["id"] for stop in json.loads(rows.out)["stops"]} <= set(ids)
-    assert sorted(f.name for f in (tmp_path / "rows").iterdir()) == ["configurations.csv", "design.json"]
+    assert sorted(f.name for f in (tmp_path / "rows").iterdir()) == ["configurations.csv", "design.json", "design.svg"]
 
 
 # --- what it refuses --------------------------------------------------------------------------------------------------
@@ -211,5 +212,5 @@ def test_a_second_design_in_a_folder_is_refused(plan, fg_calib, tmp_path):
         ended = fg_calib("design", plan(), "--n", 3, *FEW, "--out", out)
         assert ended.code == 1
         assert ended.err.splitlines()[-1].endswith(f"{name}: is there already, expected a folder without it")
-        for other in ("design.json", "configurations.csv"):
+        for other in ("design.json", "design.svg", "configurations.csv"):
             (out / other).unlink(missing_ok=True)
