@@ -28,7 +28,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -36,7 +35,7 @@ import numpy as np
 from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check_names, checked
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Chain, Element, Parameter, Robot, build_chain, names_of
+from fg_calib.robot import Chain, Robot, build_chain, names_of
 
 RCOND = 1e-10
 """Singular values of J below this part of the largest count as zero in J^+."""
@@ -233,8 +232,8 @@ class _Rows:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(S)))
 
 
-def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
-    """Every measured train row of all tables."""
+def _train_rows(robot: Robot, data: Dataset, weighted: bool) -> list[_Rows]:
+    """Every measured train row of all tables, without weights of unit variance."""
     found = []
     for s in data.blocks:
         train, h = s.train, s.kind.residual_dim
@@ -249,43 +248,47 @@ def _train_rows(robot: Robot, data: Dataset) -> list[_Rows]:
             sigma = np.where(np.isnan(sigma), 1.0, sigma)
         specified = None if s.formed else s.covariance
         covariance = sigma[:, :, None] ** 2 * np.eye(h) if specified is None else specified
-        found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], covariance[train]))
+        private = covariance[train] if weighted else np.broadcast_to(np.eye(h), (len(train), h, h))
+        found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], private))
+    if not found:
+        models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
+        raise InputError(data.source, "no row left to fit", f"train rows for model {models}")
     return found
 
 
 class _System:
-    """Rows as a function of the unknowns: parameters, unknown frames, landmarks' coordinates."""
+    """Rows as a function of the unknowns: parameters, unknown frames, landmarks' coordinates.
+
+    Unknowns are some of the values that `LeastSquares.parameters` lists; derivatives are taken in all of these.
+    """
 
     def __init__(self, robot: Robot, data: Dataset, chosen: list[int], start: Floats | None, weighted: bool) -> None:
-        self._sigma_joint, self._weighted = data.sigma_joint, weighted
         unknown = np.array([table.unknown_frame for table in data.tables])
-        estimated, n, n_frames = data.estimated(), len(robot.parameters), int(unknown.sum())
-        places = [np.arange(*ends) for ends in pairwise(np.cumsum([0, *data.landmarks.sizes]).tolist())]
-        self._coordinates: Floats = data.landmarks.start
-        items = zip(places, data.landmarks.items, estimated, strict=True)
-        self._priors = [(p, self._coordinates[p], i.tolerance) for p, i, of in items if of and i.tolerance is not None]
-        free = (place for place, of in zip(places, estimated, strict=True) if of)
-        self._estimated = np.concatenate([np.zeros(0, np.int64), *free])
+        n, n_frames, marks, owners = len(robot.parameters), int(unknown.sum()), data.landmarks, data.landmarks.owners
+        self._weighted, self._sigma_joint = weighted, data.sigma_joint if weighted else 0.0 * data.sigma_joint
         self._n, self._edge = n, n + 6 * max(1, n_frames)
-        own = np.concatenate([robot.nominal, np.zeros(self._edge - n), self._coordinates[self._estimated]])
+        self._free = np.flatnonzero(data.estimated()[owners])
+        self._column = np.full(len(marks.start), -1, dtype=np.int64)  # -1: a known coordinate
+        self._column[self._free] = self._edge + np.arange(len(self._free))
+        self._coordinates: Floats = marks.start
+        tolerances = np.array([np.nan if item.tolerance is None else item.tolerance for item in marks.items])
+        sigma = tolerances[owners[self._free]]
+        self._held = np.flatnonzero(np.isfinite(sigma))  # by priors
+        self._prior_sigma = sigma[self._held] if weighted else np.ones(len(self._held))
+        own = np.concatenate([robot.nominal, np.zeros(self._edge - n), marks.start[self._free]])
         start = own if start is None else start
         if start.shape != own.shape or not np.isfinite(start).all():
             raise InputError("start", f"shape {start.shape}", "finite values as `Problem.start`")
-        self._start, self.n_core = start, len(chosen) + 6 * n_frames
-        frames = np.arange(n, n + 6 * n_frames)
+        self._start, frames = start, np.arange(n, n + 6 * n_frames)
         self._index = np.concatenate([chosen, frames, np.arange(self._edge, len(start))]).astype(np.int64)
-        self._column = np.full(len(self._coordinates), -1, dtype=np.int64)  # -1: a known coordinate
-        self._column[self._estimated] = self.n_core + np.arange(len(self._estimated))
-        self._frame_of = np.where(unknown, n + 6 * (np.cumsum(unknown) - 1), -1).tolist()
+        first = n + 6 * (np.cumsum(unknown) - 1)
+        self._frames = [slice(k, k + 6) if own else slice(0) for k, own in zip(first.tolist(), unknown, strict=True)]
         self._chains = []
-        for frame in self._frame_of:
-            columns = {c: k for k, c in enumerate(chosen)}
-            columns |= {n + k: len(chosen) + frame - n + k for k in range(6) if frame >= 0}
-            self._chains.append(replace(build_chain(_with_frame(robot), columns), n_columns=self.n_core))
-        self._rows = _train_rows(robot, data)
-        if not self._rows:
-            models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
-            raise InputError(data.source, "no row left to fit", f"train rows for model {models}")
+        for frame, has_frame in zip(self._frames, unknown.tolist(), strict=True):
+            columns = dict(enumerate([*range(n), *range(len(start))[frame]]))
+            chain = build_chain(robot, columns, frame=has_frame)
+            self._chains.append(replace(chain, n_columns=self._edge))
+        self._rows = _train_rows(robot, data, weighted)
 
     def parameters(self, x: Floats) -> Floats:
         """Values of the robot, the frames and the landmarks at the unknowns x: see `LeastSquares.parameters`."""
@@ -293,59 +296,38 @@ class _System:
         out[self._index] = x
         return out
 
-    def _chain(self, table: int, x: Floats) -> Chain:
-        """The arm in a table's measurement frame at the unknowns x."""
-        values, frame = self.parameters(x), self._frame_of[table]
-        of_frame = values[frame : frame + 6] if frame >= 0 else np.zeros(6)
-        return self._chains[table].at(np.append(values[: self._n], of_frame))
-
-    def _landmarks(self, x: Floats) -> Floats:
-        """Coordinates of all landmarks at the unknowns x."""
-        out = self._coordinates.copy()
-        out[self._estimated] = self.parameters(x)[self._edge :]
-        return out
+    def _at(self, x: Floats) -> tuple[list[Chain], Floats]:
+        """The arm in each table's measurement frame, and coordinates of all landmarks, at the unknowns x."""
+        values, coordinates = self.parameters(x), self._coordinates.copy()
+        coordinates[self._free] = values[self._edge :]
+        pairs = zip(self._chains, self._frames, strict=True)
+        return [chain.at(np.append(values[: self._n], values[frame])) for chain, frame in pairs], coordinates
 
     def evaluate(self, x: Floats, weights: Weights) -> tuple[Floats, Floats]:
         """Whitened residuals, shape (m,), and their derivatives, shape (m, n_unknowns)."""
-        coordinates, found_r, found_J = self._landmarks(x), [], []
+        (chains, coordinates), found_r, found_J = self._at(x), [], []
         for W, rows in zip(weights, self._rows, strict=True):
             block = replace(rows.block, nuisances=coordinates[rows.landmarks])
-            r, J = residuals.linearise(block, self._chain(rows.table, x))
-            r = (W @ np.where(rows.use, r, 0.0)[:, :, None])[:, :, 0][rows.use]
-            J, of = (W @ (J * rows.use[:, :, None]))[rows.use], np.nonzero(rows.use)[0]
-            wide = np.zeros((len(r), len(x) + 1))  # the last column for known coordinates
-            wide[:, : self.n_core] = J[:, : self.n_core]
-            for k, columns in enumerate(self._column[rows.landmarks[of]].T):
-                wide[np.arange(len(r)), columns] = J[:, self.n_core + k]
-            found_r.append(r)
-            found_J.append(wide[:, :-1])
-        for place, mean, sigma in self._priors:
-            found_r.append((coordinates[place] - mean) / (sigma if self._weighted else 1.0))
-            found_J.append(np.eye(len(x) + 1)[self._column[place], :-1] / (sigma if self._weighted else 1.0))
+            r, J = residuals.linearise(block, chains[rows.table])
+            wide = np.zeros((*r.shape, len(self._start) + 1))  # the last column for known coordinates
+            wide[:, :, : self._edge] = J[:, :, : self._edge]
+            for k, columns in enumerate(self._column[rows.landmarks].T):
+                wide[np.arange(len(r)), :, columns] = J[:, :, self._edge + k]
+            found_r.append((W @ np.where(rows.use, r, 0.0)[:, :, None])[:, :, 0][rows.use])
+            found_J.append((W @ (wide[:, :, self._index] * rows.use[:, :, None]))[rows.use])
+        held = self._edge + self._held
+        found_r.append((coordinates - self._coordinates)[self._free[self._held]] / self._prior_sigma)
+        found_J.append(np.eye(len(self._start))[held][:, self._index] / self._prior_sigma[:, None])
         return np.concatenate(found_r), np.concatenate(found_J)
-
-    def _weights(self, x: Floats) -> Weights:
-        coordinates = self._landmarks(x)
-        if not self._weighted:
-            return tuple(np.broadcast_to(np.eye(r.use.shape[1]), r.covariance.shape) for r in self._rows)
-        return tuple(r.whitening(self._chain(r.table, x), coordinates, self._sigma_joint) for r in self._rows)
 
     def solve(self) -> tuple[Fit, Weights]:
         """The fit and its weights: those at the estimate, where joint noise makes them depend on it."""
         x, iterations, moved = self._start[self._index], 0, np.inf
-        reweighted = self._weighted and bool(np.any(self._sigma_joint > 0.0))
         for _ in range(_ROUNDS):
-            weights = self._weights(x)
+            chains, coordinates = self._at(x)
+            weights = tuple(r.whitening(chains[r.table], coordinates, self._sigma_joint) for r in self._rows)
             fit = (scipy_fit if self._weighted else gauss_newton)(partial(self.evaluate, weights=weights), x)
             moved, x, iterations = float(np.linalg.norm(fit.x - x)), fit.x, iterations + fit.iterations
-            if not fit.converged or moved <= REWEIGHTED or not reweighted:
+            if not fit.converged or moved <= REWEIGHTED or not np.any(self._sigma_joint > 0.0):
                 return replace(fit, iterations=iterations), weights
         return Fit(x, False, f"not converged: new weights still move it by {moved:.1e}", iterations), weights
-
-
-def _with_frame(robot: Robot) -> Robot:
-    """The robot after a frame, whose six parameters come last."""
-    n = len(robot.parameters)
-    frame = [Element(PARAMETER_KINDS[kind].axis, parameter=n + i) for i, kind in enumerate(FRAME_KINDS)]
-    parameters = (Parameter(f"frame.{kind}", kind, 0, 0.0) for kind in FRAME_KINDS)
-    return replace(robot, parameters=(*robot.parameters, *parameters), elements=(*frame, *robot.elements))

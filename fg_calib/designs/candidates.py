@@ -101,35 +101,25 @@ class Pool(Brief):
         own = [_split_name(names[k])[0] if self.scenario is not None else "" for k in configurations.tolist()]
         return np.array(own, dtype=np.str_)
 
-    def select_tables(self, poses: Integers, pairing: Pairing | None = None) -> list[Table]:
-        """Select what would be measured at some poses, in their order, after references that have pairs.
-
-        Args:
-            poses: The poses.
-            pairing: How pairs are formed instead.
-        """
+    def select_tables(self, poses: Integers) -> list[Table]:
+        """Select what would be measured at some poses, in their order, after references that have pairs."""
         names = self.problem.data.names[: self.problem.data.n_configurations]
         wanted = np.concatenate([self.references, *(np.flatnonzero(self.pose_of == number) for number in poses)])
         order = {names[k]: place for place, k in enumerate(wanted.tolist())}
         found = [_between_used(select_rows(table, order), known=self.before is not None) for table in self.tables]
         for number, table in enumerate(found):
             if number in self.formed:
-                model, own = self.formed[number]
-                found[number] = replace(table, model=model, frame="known", pairing=pairing or own)
+                model, pairing = self.formed[number]
+                found[number] = replace(table, model=model, frame="known", pairing=pairing)
         return [table if _has_rows(table) else select_rows(table, {}) for table in found]
 
-    def posterior(self, poses: Integers, pairing: Pairing | None = None) -> Posterior:
-        """Posterior with some poses measured after the earlier ones, as a calibration would report it.
-
-        Args:
-            poses: The poses, given ones included.
-            pairing: How pairs are formed instead.
-        """
+    def posterior(self, poses: Integers) -> Posterior:
+        """Posterior with some poses, given ones included, after the earlier ones, as a calibration would report it."""
         before = self.before
         problem = None
         if len(poses) or before is None:
             places = places_of(self.problem, self.problem.start)
-            problem = true_problem(self.robot, self.select_tables(poses, pairing), self.problem.options, places)
+            problem = true_problem(self.robot, self.select_tables(poses), self.problem.options, places)
         if before is not None and (problem is None or not problem.rows.parts):  # nothing, or one end of a pair
             return Posterior(before, square_root(before, before.start, with_loss=True)[:, :-1])
         assert problem is not None

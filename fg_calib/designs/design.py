@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
-from fg_calib.designs.information import N_TASK, Posterior, Task, build_system
+from fg_calib.designs.information import N_TASK, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.inputs import (
     Floats,
     FrozenArrays,
     InputError,
     Integers,
-    Pairing,
     ProblemError,
     as_floats,
     check_number,
@@ -70,7 +69,6 @@ class Design(FrozenArrays):
         expected: Expected errors of the tool over the task, with these and what was given.
         after_fit: Expected errors after the best rigid fit, where `expected` is in the base frame; else None.
         before: Expected errors with what was given alone; None without it.
-        pairings: Expected position errors by how pairs are formed, [m].
         random: Median of the expected position errors of as many random poses, [m].
         curve: Expected errors by the number of poses.
         asked: Number of poses that was asked for; None with a target.
@@ -92,7 +90,6 @@ class Design(FrozenArrays):
     expected: PoseRms
     after_fit: PoseRms | None
     before: PoseRms | None
-    pairings: Mapping[str, float]
     random: float
     curve: tuple[CurvePoint, ...]
     asked: int | None
@@ -263,7 +260,6 @@ def design_from_pool(
         expected=expected,
         after_fit=None if task.fitted else posterior.error(replace(task, fitted=True)),
         before=before,
-        pairings=_compare_pairings(pool, poses, task),
         random=curve[-1].random[1],
         curve=(*curve[:-1], replace(curve[-1], designed=error)),
         asked=n if target is None else None,
@@ -274,12 +270,6 @@ def design_from_pool(
         travel=joint_travel(pool.robot, readings),
         travel_before=joint_travel(pool.robot, pool.readings[chosen]),
     )
-
-
-def _position_error(posterior: Posterior, task: Task) -> float:
-    """Expected RMS position error, [m]; inf if not determined."""
-    found = posterior.error(task).position
-    return np.inf if found is None else found
 
 
 def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Callable[[Integers], float] | None:
@@ -294,15 +284,10 @@ def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Call
     def error(candidates: Integers) -> float:
         chosen = measurable[candidates]
         ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
-        return _position_error(pool.posterior(np.concatenate([pool.given, ordered])), task)
+        found = pool.posterior(np.concatenate([pool.given, ordered])).error(task).position
+        return np.inf if found is None else found
 
     return error
-
-
-def _compare_pairings(pool: Pool, poses: Integers, task: Task) -> dict[str, float]:
-    """Expected errors by how pairs are formed; none where no pairs are."""
-    strategies: tuple[Literal["star", "chain", "all"], ...] = ("star", "chain", "all")
-    return {one: _position_error(pool.posterior(poses, Pairing(one)), task) for one in strategies if pool.formed}
 
 
 def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> Integers:

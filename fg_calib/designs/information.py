@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from fg_calib.graph import SIGNAL_FLOOR, Problem, eliminate, prior_rows, unknown_prior_rows
-from fg_calib.inputs import Brief, Floats, FrozenArrays, InputError, Integers
+from fg_calib.inputs import Brief, Floats, FrozenArrays, Integers
 from fg_calib.observability import Observability, observability_of_rows
 from fg_calib.prediction import PoseRms, errors_at
 from fg_calib.robot import forward, without_rigid_motion
@@ -66,22 +66,16 @@ class PoseRows(FrozenArrays):
     n_arm: int
 
 
-def gather_rows(
-    problem: Problem, pose_of: Integers, references: Integers | None = None, *, alone: bool = True
-) -> PoseRows:
+def gather_rows(problem: Problem, pose_of: Integers, references: Integers, *, alone: bool) -> PoseRows:
     """Gather the rows of a problem by pose.
 
     Args:
         problem: The problem, linearised at its start.
         pose_of: The pose of each configuration, shape (n_configurations,); below 0 for none and for a reference.
-        references: Configurations whose errors many pairs share; none if None.
+        references: Configurations whose errors many pairs share; no other pose's errors reach another's rows.
         alone: Whether nothing was measured before; else that says what is known of landmarks.
-
-    Raises:
-        InputError: Errors of one pose reach the rows of another that is no reference.
     """
     v = problem.variables
-    references = np.zeros(0, dtype=np.int64) if references is None else references
     n_columns, n_poses = v.n_columns + v.n_nuisance, int(pose_of.max(initial=-1)) + 1
     whole, private, which = _derivatives(problem, pose_of, references)
     n_shared = whole.shape[1] - n_columns
@@ -111,9 +105,6 @@ def _derivatives(problem: Problem, pose_of: Integers, references: Integers) -> t
             mask = configuration == reference
             of_references[L.row[mask], number * width + k[mask]] = L.data[mask]
         mask = ~np.isin(configuration, references)
-        if np.any(pose_of[configuration[mask]] != which[L.row[mask]]):
-            found = "pairs of which each shares an end with others, and its errors"
-            raise InputError(problem.data.source, found, "pairing star")
         private[L.row[mask], k[mask]] = L.data[mask]
     return np.hstack([J, of_references]), private, which
 
@@ -162,7 +153,6 @@ class System(FrozenArrays):
         task: W, of which `tr(W C)` is the mean square error of the task, C the covariance, shape (n, n).
         core: P, functions of the arm's parameters that can be determined, orthonormal in changes of ordinary size,
             shape (p, n).
-        basis: Determined directions, in the columns of rows, shape (n_columns, n).
         unknown: Share of the task's mean square that no candidate determines, in [0, 1].
     """
 
@@ -170,7 +160,6 @@ class System(FrozenArrays):
     known: Floats
     task: Floats
     core: Floats
-    basis: Floats
     unknown: float
 
     @property
@@ -219,7 +208,6 @@ def build_system(poses: PoseRows, given: Floats, task: Floats) -> System:
         known=(before @ Q).T @ (before @ Q) + np.diag(weak),
         task=Q[:n].T @ W @ Q[:n],
         core=determined.T @ Q[:n_arm],
-        basis=scales[:, None] * Q,
         unknown=float(np.trace(lost.T @ W @ lost)) / total if total > 0.0 else 0.0,
     )
 

@@ -160,16 +160,9 @@ def export(
         "yaml": lambda: _yaml(found),
     }
     part = formats[to]() if to in formats else _table(found, to, far)
-    if not isinstance(arm, Calibration):
+    if isinstance(arm, Robot):
         return part
-    return replace(part, findings=_findings(arm), not_accepted=arm.not_accepted)
-
-
-def _findings(calibration: Calibration) -> tuple[str, ...]:
-    """Why it is not to be trusted."""
-    if calibration.trustworthy is not False or calibration.findings:
-        return calibration.findings
-    return ("the solver did not converge",)
+    return replace(part, findings=arm.findings, not_accepted=arm.not_accepted)
 
 
 def _arm_of(arm: Robot | Calibration, nominal: Robot | None) -> _Arm:
@@ -179,21 +172,16 @@ def _arm_of(arm: Robot | Calibration, nominal: Robot | None) -> _Arm:
         InputError: The nominal robot is one of other parameters.
     """
     comments = [f"by fg-calib {__version__}"]
+    robot = arm if isinstance(arm, Robot) else arm.robot
     if isinstance(arm, Calibration):
-        robot = arm.robot
-        comments += [f"NOT TO BE TRUSTED: {finding}" for finding in _findings(arm)]
+        comments += [f"NOT TO BE TRUSTED: {finding}" for finding in arm.findings]
         comments += [f"not accepted: {reason}" for reason in arm.not_accepted]
-        drawn_arm = robot.with_values([p.nominal for p in arm.result.parameters])
-    elif isinstance(arm, Robot):
-        robot, drawn_arm = arm, None
-    else:
-        raise InputError("arm", f"found {shown(arm)}", "a Robot or a Calibration")
+        nominal = nominal or arm.nominal
     if nominal is not None:
         kinds = [(joint.name, joint.prismatic) for joint in robot.joints]
         if [(joint.name, joint.prismatic) for joint in nominal.joints] != kinds:
             raise InputError("nominal", f"{nominal.name} has other joints", ", ".join(name for name, _ in kinds))
-        drawn_arm = nominal
-    return _Arm(robot, drawn_arm, tuple(comments))
+    return _Arm(robot, nominal, tuple(comments))
 
 
 _FORMATS_OF: Mapping[str, tuple[str, ...]] = {
@@ -242,7 +230,7 @@ def _ur(arm: _Arm, base: UrBase | None, word: str | None) -> Export:
     urdf = arm.robot.urdf
     drawn_base: UrBase = "base_link" if urdf is not None and urdf.base_link.endswith("base_link") else "base"
     base = base or drawn_base
-    if word is not None and (not isinstance(word, str) or not word.isprintable() or " " in word or not word):
+    if word is not None and (not word.isprintable() or " " in word or not word):
         raise InputError("ur_hash", f"found {shown(word)}", "a word such as calib_12788084448423163542")
     kinematics, tool = ur_kinematics(arm.robot, base)
     own = f"fg_calib_{sha256(repr(kinematics).encode()).hexdigest()[:16]}"  # which no controller has

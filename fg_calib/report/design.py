@@ -38,7 +38,7 @@ def design_document(design: Design) -> dict[str, Any]:
     return tables.document_of(
         "design",
         design,
-        "criterion n target reached expected before random pairings travel",
+        "criterion n target reached expected before random travel",
         robot=design.pool.robot.name,
         n_given=len(design.pool.given),
         fitted=design.task.fitted,
@@ -59,8 +59,6 @@ def design_document(design: Design) -> dict[str, Any]:
 
 def build_design_report(design: Design) -> Group:
     """A design for the terminal."""
-    words = {"star": "each with the first", "chain": "each with the one before", "all": "all that can be formed"}
-    pairs = [(name, _size(error), words[name]) for name, error in design.pairings.items()]
     curve = [
         (f"{p.n}", *map(_size, (p.designed, p.random[1])), " to ".join(map(_size, (p.random[0], p.random[2]))))
         for p in design.curve
@@ -70,7 +68,6 @@ def build_design_report(design: Design) -> Group:
         line(_headline(design), "bold"),
         *section("Expected", *_expected(design)),
         *section("Poses and accuracy", table_of(columns, curve)),
-        *section("Which pairs", table_of(("pairs", "expected mm|>", ""), pairs)),
         *section("Where to measure", _poses(design)),
         *section("Notes", *_notes(design)),
     )

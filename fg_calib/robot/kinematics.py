@@ -131,7 +131,8 @@ def build_chain(
 
     Args:
         robot: The robot.
-        columns: Jacobian column of each parameter that has one, by the parameter's index.
+        columns: Jacobian column of each parameter that has one, by the parameter's index; of the frame's six values
+            by further ones.
         tool_tangent: First of six columns for a small motion of the tool frame in itself, rotation first
             (GTSAM's tangent of a Pose3); None if there are none.
         base_tangent: Such columns for the base frame.
@@ -145,7 +146,8 @@ def build_chain(
     end_of_base = max((i for i, e in enumerate(robot.elements) if e.parameter in base), default=-1)
     elements: list[tuple[Element, int, int]] = []  # element, source, column
     if frame:
-        elements += [(Element(PARAMETER_KINDS[k].axis), n_parameters + i, -1) for i, k in enumerate(FRAME_KINDS)]
+        values = enumerate(FRAME_KINDS, start=n_parameters)
+        elements += [(Element(PARAMETER_KINDS[kind].axis), i, columns.get(i, -1)) for i, kind in values]
         elements += _tangent(frame_tangent)
     for i, element in enumerate(robot.elements):
         source = -1 if element.parameter is None else element.parameter

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fg_calib.inputs import Booleans, Floats
-from fg_calib.robot import Axis, Robot
+from fg_calib.robot import Axis, Element, Robot, build_chain, forward
 
 if TYPE_CHECKING:  # pages draw arms without reading scenarios
     from fg_calib.simulation.scenario import Box
@@ -21,29 +22,19 @@ MAX_CONTACT_M = 1e-9
 def link_points(robot: Robot, readings: Floats) -> Floats:
     """Points along the arm from the base to the tool, where straight pieces begin and end, shape (n, m, 3), [m].
 
+    Some points are the same: the arm turns there more than once.
+
     Args:
         robot: The robot.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
     """
-    n, values = len(readings), robot.nominal
-    R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
-    points, moved = [p.copy()], False
-    for e in robot.elements:
-        if e.basis is not None:
-            continue  # what gravity and gears add is not visible at this size
-        value = np.full(n, 0.0 if e.parameter is None else values[e.parameter])
-        value = e.constant + e.sign * (value + (0.0 if e.joint is None else readings[:, e.joint]))
-        if e.axis < Axis.RX:
-            p = p + R[:, :, int(e.axis)] * value[:, None]
-            moved = moved or bool(np.any(value != 0.0))
-            continue
-        if moved:
-            points.append(p.copy())
-            moved = False
-        i, j = (int(e.axis) + 1) % 3, (int(e.axis) + 2) % 3
-        c, s = np.cos(value)[:, None], np.sin(value)[:, None]
-        R[:, :, i], R[:, :, j] = c * R[:, :, i] + s * R[:, :, j], c * R[:, :, j] - s * R[:, :, i]
-    return np.stack([*points, p], axis=1)
+    elements = [e for e in robot.elements if e.basis is None]  # what gravity and gears add is not visible at this size
+    corners = [k for k, e in enumerate(elements) if e.axis >= Axis.RX]
+    trigs, found = robot.trig(readings), []
+    for k in (0, *corners, len(elements)):
+        part = replace(robot, elements=(Element(Axis.TX), *elements[:k]))  # a chain has at least one
+        found.append(forward(build_chain(part), trigs).position)
+    return np.stack(found, axis=1)
 
 
 def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:

@@ -210,13 +210,10 @@ def view_board(views: BoardViews, generator: np.random.Generator) -> tuple[Float
     drawn_roll = rolls.uniform(-np.pi, np.pi, len(board_p_tool))
     roll = drawn_roll if views.roll is None else np.full(len(drawn_roll), views.roll)
     # At A the camera is the board's frame turned about its x axis by half a turn; from there the shortest way.
-    up, away = np.array([0.0, 0.0, 1.0]), np.linalg.norm(board_p_tool, axis=1, keepdims=True)
-    axis = np.cross(up, board_p_tool / away)  # (n, 3), of length sin(tilt)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    tilt = np.arctan2(sine, board_p_tool[:, 2:] / away)
-    turn = Rotation.from_rotvec(axis * np.where(sine > 0.0, tilt / np.where(sine > 0.0, sine, 1.0), 0.0))
-    over = Rotation.from_rotvec([np.pi, 0.0, 0.0])
-    aimed = turn * over * Rotation.from_rotvec(roll[:, None] * up)
+    x, y, z = board_p_tool.T
+    azimuth, tilt = np.arctan2(y, x), np.arctan2(np.hypot(x, y), z)
+    turn = Rotation.from_euler("ZYZ", np.stack([azimuth, tilt, -azimuth], axis=1))
+    aimed = turn * Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", roll[:, None])
     board_R_tool = aimed.as_matrix()
     if views.field_of_view > 0.0:  # from the centre, by a turn that brings it to a direction in the field of view
         cosine, azimuth = _in_cone(turns, len(roll), views.field_of_view)

@@ -32,7 +32,7 @@ TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {
     "schema", "version", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before",
-    "random", "undetermined_share", "curve", "pairings", "candidates", "stops", "undetermined", "travel",
+    "random", "undetermined_share", "curve", "candidates", "stops", "undetermined", "travel",
     "travel_unordered",
 }  # fmt: skip
 FEW = ("--candidates", 25)
@@ -71,7 +71,7 @@ def test_the_document_has_its_keys_in_si(plan, fg_calib):
     assert found.keys() == DOCUMENT
     assert (found["schema"], found["robot"], found["criterion"]) == ("fg-calib/design/1", "small-arm", "I")
     assert (found["n"], found["n_given"], found["target"], found["reached"]) == (4, 0, None, True)
-    assert (found["before"], found["pairings"]) == (None, {})
+    assert found["before"] is None
     assert found["expected"].keys() == {"position", "orientation"}
     assert 1e-5 < found["expected"]["position"] < found["random"] < 1e-2
     assert found["candidates"] == {"all": {"asked": 25, "taken": 25, "rejected": {}}}

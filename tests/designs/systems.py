@@ -13,7 +13,7 @@ def random_system(rng, n_candidates=12, h=2, p=4, nuisances=2, floor=0.1) -> Sys
     task = np.zeros((n, n))
     task[:p, :p] = X @ X.T
     known = floor**2 * np.eye(n)
-    return System(rows, known, task, np.eye(p, n), np.eye(n), 0.0)
+    return System(rows, known, task, np.eye(p, n), 0.0)
 
 
 def random_poses(rng, n_candidates=15, lost=True):

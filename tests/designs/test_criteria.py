@@ -94,7 +94,7 @@ def test_candidates_that_say_little_are_ordered_by_the_derivative(monkeypatch, c
     """Of variances 1 and 100 two candidates see one each: traces fall by w^2, roots by w^1.5, logarithms by w."""
     monkeypatch.setattr(criteria, "N_TRIED", 1)
     one = np.eye(2)
-    system = System(np.array([[[-1e-3, 0.0]], [[0.0, size]]]), np.diag([1.0, 0.01]), one, one, one, 0.0)
+    system = System(np.array([[[-1e-3, 0.0]], [[0.0, size]]]), np.diag([1.0, 0.01]), one, one, 0.0)
     assert Measure(criterion, system).best(system.known, np.ones(2, dtype=np.bool_))[0] == best
 
 

@@ -5,14 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scenarios import CAMERA, GRID, INSTRUMENTS, SIGMA, WALL, scenario
-from simulated import measure, small_arm
 from tolerances import rounding
 
 from fg_calib import Pairing
 from fg_calib.designs.candidates import build_pool, draw_groups
-from fg_calib.designs.information import gather_rows
-from fg_calib.graph import build_problem, prior_rows, square_root, true_problem
-from fg_calib.inputs import InputError
+from fg_calib.graph import prior_rows, square_root, true_problem
 from fg_calib.simulation.scenario import Instrument, Placement, RandomReadings
 
 N = 20
@@ -110,11 +107,3 @@ def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     assert most >= len(GRID) / 2
     boards = len(pool.problem.data.landmarks.names) or 1
     assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most
-
-
-def test_pairs_that_share_errors_but_no_reference_pose_are_refused():
-    arm = small_arm(tolerance={"a": 2e-3, "theta": 2e-3})
-    data = measure(arm, 8, np.random.default_rng(0), sigma_joint=1e-3)
-    problem = build_problem(arm, data, model="distance", pairing=Pairing("chain"))
-    with pytest.raises(InputError, match=r"each shares an end with others.*pairing star"):
-        gather_rows(problem, np.arange(8))
