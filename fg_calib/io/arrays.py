@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib.inputs import (
-    Booleans,
-    Floats,
     InputError,
     as_array,
     as_floats,
@@ -31,7 +28,7 @@ from fg_calib.io.yaml import Units
 from fg_calib.measurements import Column, Measurements, Noise
 
 if TYPE_CHECKING:
-    import polars as pl
+    pass
 
 COLUMNS: Mapping[str, str] = {
     "ids": "id",
@@ -101,33 +98,10 @@ def read_arrays(
     if rotation is not None and (other := given.keys() & {"quaternion", "roll_pitch_yaw"}):
         raise InputError(f"rotation and {min(other)}", "both were given", "one of the two")
     each = {name: (OF_CONFIGURATIONS[COLUMNS.get(name, name)], values) for name, values in given.items()}
-    table, between = _table_of(source, each, len(q)), None if pairs is None else _pairs_of(pairs)
+    table = _table_of(source, each, len(q), **{f"q{i + 1}": joint for i, joint in enumerate(q.T)})
+    between = None if pairs is None else _pairs_of(pairs)
     found = measurements_of(table, q, between, Units(), Noise(joint=sigma_joint))
     return found if rotation is None else found.with_values({"rotation": as_rotations("rotation", rotation, len(q))})
-
-
-@dataclass(frozen=True)
-class _Arrays(Table):
-    """Arrays as columns: numbers and sigmas that are checked already, names as they were given."""
-
-    @property
-    def n_rows(self) -> int:
-        """Number of rows."""
-        return len(self.lines)
-
-    def numbers(self, columns: Sequence[str], *, optional: bool = False) -> Floats:
-        """See `Table.numbers`."""
-        return np.stack([self.frame[column] for column in columns], axis=1)
-
-    def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
-        """See `Table.names`."""
-        import polars as pl
-
-        return pl.Series(as_names(f"{self.name}: {column}", self.frame[column], missing=optional), dtype=pl.String)
-
-    def test_rows(self) -> Booleans:
-        """See `Table.test_rows`."""
-        return np.array(self.frame.get("split", np.zeros(self.n_rows, dtype=np.bool_)))
 
 
 def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any]:
@@ -143,7 +117,7 @@ def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any
         require(off <= ROUNDED * np.abs(C).max(axis=(1, 2)), place, C, "symmetric matrices")
         values: Any = C[:, *np.triu_indices(6)]
     elif first == "split":
-        values = as_mask(place, given, n)
+        values = np.where(as_mask(place, given, n), "test", "train")
     elif first.startswith("sigma_"):
         values = np.broadcast_to(as_sigmas(place, given, shape), shape)
     elif column.unit or column.generic or len(shape) == 2:
@@ -151,8 +125,9 @@ def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any
         values = as_floats(place, given, expected, missing=column.generic or first in ("distance", "angle"))
     elif (found := shape_of(place, given, "names")) != shape:
         raise InputError(place, f"shape {found}", f"({n},), one a row")
-    else:
-        return {first: given}
+    else:  # whole numbers, of a million pairs, stay as they are
+        whole = isinstance(given, np.ndarray) and given.dtype.kind in "iu"
+        return {first: given if whole else as_names(place, given, missing=True)}
     return dict(zip(column.names, values.reshape(n, -1).T, strict=True))
 
 
@@ -171,12 +146,11 @@ def _pairs_of(given: Any) -> Table:
     known |= {key: Column((key,), "", "") for key in ("a", "b")}
     check_names("pairs", arrays, list(known), "key")
     arrays |= {key: as_array(f"pairs: {key}", arrays[key], "iuUO", "ids") for key in ("a", "b") if key in arrays}
-    return _table_of("pairs", {f"pairs: {key}": (known[key], values) for key, values in arrays.items()})
+    n = max((np.size(values) for values in arrays.values()), default=0)
+    return _table_of("pairs", {f"pairs: {key}": (known[key], values) for key, values in arrays.items()}, n)
 
 
-def _table_of(name: str, arrays: Mapping[str, tuple[Column, Any]], n: int | None = None) -> Table:
-    """A table of arrays, each with the columns that it holds; of n rows, or as many as the longest has."""
-    n = max((np.size(values) for _, values in arrays.values()), default=0) if n is None else n
+def _table_of(name: str, arrays: Mapping[str, tuple[Column, Any]], n: int, **more: Any) -> Table:
+    """A table of arrays of n rows, each with the columns that it holds, and of more columns."""
     each = [_columns_of(place, column, values, n) for place, (column, values) in arrays.items()]
-    columns = {column: values for of in each for column, values in of.items()}
-    return _Arrays(name, tuple(columns), columns, lines=range(n))
+    return Table.read({column: values for of in (more, *each) for column, values in of.items()}, name)

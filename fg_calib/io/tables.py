@@ -816,8 +816,9 @@ def _ends(table: Table, ids: NDArray[np.str_], groups: Sequence[str]) -> tuple[I
     numbers = not any(word.isdigit() for word in (groups if by_row else place))
     found = []
     for key in ("a", "b"):
-        if numbers and getattr(table.frame[key].dtype, "kind", "") in ("i", "u"):
-            end = np.where(table.frame[key] < n, table.frame[key], -1).astype(np.int64)
+        if numbers and table.frame[key].dtype.is_integer():
+            end = table.frame[key].to_numpy()
+            end = np.where(end < n, end, -1).astype(np.int64)
         else:
             end = _places(table.names(key, "a configuration"), place)
         table.require(end >= 0, key, expected, "names of both stand for neither" * bool(both))
