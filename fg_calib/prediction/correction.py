@@ -4,9 +4,8 @@ The controller is given joint values with which the calibrated arm is at the tar
 pose for which its own model finds these joint values.
 
 An arm of fewer than six joints, or at a limit, may reach the point of a target but not its orientation. Then the point
-is kept, and the orientation is brought as near as the remaining freedom allows, by Gauss-Newton steps in the
-null space of the point's derivative Jv: q + Jv^+ p + N (Jw N)^+ (w - Jw Jv^+ p), with p and w what is missing of
-position and orientation, and N a basis of that null space.
+is kept, and the orientation is brought as near as the remaining freedom allows, by least squares in which the point
+counts far more.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations
 from fg_calib.measurements import check_readings
@@ -26,17 +26,11 @@ from fg_calib.statistics import TangentCovariance
 LARGE_CHANGE = 0.1
 """Change of a joint, [rad] (prismatic: [m]), which only a singularity or another branch of solutions explains."""
 
-_N_STEPS = 30
-"""Steps that rotate the tool; they converge in a few, linearly where the pose is far out of reach."""
-
-_N_HALVINGS = 8
-"""How often such a step is halved."""
-
 _N_NEAR = 20
 """Starts near where the arm is to stay."""
 
-_RCOND = 1e-6
-"""Singular values of the point's derivative below this share of the largest do not move it."""
+_WEIGHT = 100.0
+"""Weight [1/m] of the point against a turn [rad] where the tool is turned about it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -227,27 +221,14 @@ def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | 
 
 def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats) -> Floats:
     """The configuration nearest in orientation with the tool point in place, from one whose point is there."""
-    chain = build_chain(robot).with_joint_columns()
-    lower, upper = robot.limits.T
+    chain = build_chain(robot)
 
-    def step(q: Floats) -> tuple[Floats, float]:
+    def misses(q: Floats) -> Floats:
         at = forward(chain, robot.trig(q[None]))
-        p, w = position - at.position[0], rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))[0]
-        Jw, Jv = at.jacobian[0, :3], at.jacobian[0, 3:]
-        _, size, Vt = np.linalg.svd(Jv)
-        free = Vt[int(np.sum(size > _RCOND * size[0])) :].T  # (n_joints, n_free)
-        back = np.linalg.pinv(Jv, rcond=_RCOND) @ p
-        turn: Floats = back + free @ (np.linalg.pinv(Jw @ free, rcond=_RCOND) @ (w - Jw @ back))
-        return turn, float(np.linalg.norm(w))
+        turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
+        return np.concatenate([(at.position - position)[0] * _WEIGHT, turn[0]])
 
-    best, (dq, left) = q, step(q)
-    for _ in range(_N_STEPS):
-        for halving in range(_N_HALVINGS):
-            at_point = solve_inverse(robot, position, near=np.clip(best + 0.5**halving * dq, lower, upper), n_starts=1)
-            moved, (further, now) = at_point.readings[0], step(at_point.readings[0])
-            if at_point.reached[0] and now < left - REACHED * 1e-3:
-                break
-        else:
-            return best
-        best, dq, left = moved, further, now
-    return best
+    limits = tuple(robot.limits.T)
+    best = least_squares(misses, q, jac="3-point", bounds=limits, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+    found = solve_inverse(robot, position, near=best, n_starts=1)
+    return found.readings[0] if found.reached[0] else q
