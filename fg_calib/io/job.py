@@ -37,7 +37,6 @@ from fg_calib.io.yaml import (
     UnitsOfFile,
     quantity,
     read_yaml,
-    refuse_unknown_keys,
     shown,
     validate,
     within,
@@ -62,14 +61,7 @@ class _JointNoises(Schema):
     joint: tuple[NotNegative, ...]
 
 
-_Columns = dict[
-    str,
-    Annotated[
-        Column,
-        BeforeValidator(refuse_unknown_keys("name", "scale", "zero")),
-        BeforeValidator(lambda one: {"name": one} if isinstance(one, str) else one),
-    ],
-]
+_Columns = dict[str, Annotated[Column, BeforeValidator(lambda one: {"name": one} if isinstance(one, str) else one)]]
 """A table's own names of columns, by the name that is known here."""
 
 

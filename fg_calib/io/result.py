@@ -178,21 +178,11 @@ class Carried(Section):
     knowledge: Knowledge | None = None
 
 
-def _dated(date: str) -> str:
-    if date:
-        datetime.fromisoformat(str(date))
-    return date
-
-
-Date = Annotated[str, BeforeValidator(_dated)]
-"""A date as ISO 8601 has it; empty if it is unknown."""
-
-
 class Run(Section):
     """One run of a history.
 
     Attributes:
-        date: When its rows were measured.
+        date: When its rows were measured, as ISO 8601 has it; empty if it is unknown.
         n_residuals: Number of fitted residuals.
         chi2: Chi-square of its rows and the information before.
         dof: Its degrees of freedom.
@@ -203,7 +193,7 @@ class Run(Section):
         rows: Fingerprints of its rows.
     """
 
-    date: Date
+    date: str
     n_residuals: int
     chi2: Figure
     dof: int
@@ -279,7 +269,7 @@ class Result(Section):
     versions: dict[str, str] = {}
     files: dict[str, str] = {}
     inputs: dict[str, str]
-    date: Date = ""
+    date: str = ""
     history: tuple[Run, ...] = ()
     carried: Carried = Carried()
 

@@ -506,12 +506,9 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
     Raises:
         InputError: The mapping does not describe a robot.
     """
-    if "urdf" in mapping:
-        return _build_urdf(validate(_UrdfRobot, dict(mapping), place), place, folder)
-    return _build_dh(validate(_DhRobot, dict(mapping), place), place)
-
-
-def _build_urdf(file: _UrdfRobot, place: str, folder: Path) -> Robot:
+    if "urdf" not in mapping:
+        return _build_dh(validate(_DhRobot, dict(mapping), place), place)
+    file = validate(_UrdfRobot, dict(mapping), place)
     return read_urdf(
         folder / file.urdf,
         base_link=file.base_link,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import logging
-import math
 import os
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
@@ -43,7 +42,7 @@ from fg_calib.inputs import (
     once,
 )
 from fg_calib.io.atomic import decoded, read_bytes, write_text
-from fg_calib.io.yaml import Units, number_hint, shown
+from fg_calib.io.yaml import Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import (
     ANGLE_SLACK,
     GENERIC_COLUMNS,
@@ -100,30 +99,18 @@ KNOWN = names_of(OF_CONFIGURATIONS.values())
 """Names of the columns of a table of configurations, besides the joint readings."""
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(Schema):
     """A table's own name of a column, and how its values convert: (value - zero) * scale, as encoder counts do.
 
     Attributes:
         name: In the table's header.
         scale: One of its units, in the unit of the table.
         zero: The value that means 0.
-
-    Raises:
-        InputError: The name is empty, a number is not finite, or the scale is 0.
     """
 
     name: str
-    scale: float = 1.0
-    zero: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise InputError("columns: name", f"found {shown(self.name)}", "the name of a column")
-        for key in ("scale", "zero"):
-            check_number(f"columns: {self.name}: {key}", getattr(self, key), least=-math.inf)
-        if not self.scale:
-            raise InputError(f"columns: {self.name}: scale", "found 0", "a number other than 0")
+    scale: Number = 1.0
+    zero: Number = 0.0
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ TWO_JOINTS = "convention: mdh\njoints:\n" + ROW + "  - {a: 0, alpha: 0, d: 0, th
 ONE_JOINT = "convention: mdh\njoints:\n" + ROW
 JOB = "robot: robot.yaml\nmeasurements: poses.csv\nmodel: pose\n"
 JOBS = [
-    (JOB + "columns: {q1: {name: x, scale: 0}}\n", 'job.yaml: columns: x: scale: found 0, expected a number other than 0'),
+    (JOB + "columns: {q1: {name: x, scale: a}}\n", "job.yaml: columns: q1: scale: found 'a', expected a finite number"),
     (JOB + "prior: false\ngauge: prior\n", "job.yaml: prior: found False with gauge: prior, expected gauge alone"),
     (JOB.replace("robot.yaml","\"a\\0b\""), '{folder}/a\\x00b: cannot be read: ...'),
     (JOB+"pairs: poses.csv\n", "poses.csv: no a, expected a and b, the two configurations of a pair, and distance or angle"),

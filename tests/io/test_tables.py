@@ -133,13 +133,17 @@ def test_cells_may_have_semicolons_or_tabs_between_and_numbers_decimal_commas(wr
     assert read_measurements(write(SPREADSHEET), ARM).ids.tolist() == ["p1", "a;b"]
 
 
-OWN = {"q1": Column("J1 [counts]", scale=0.001, zero=32768), "q2": Column(" A2 "), "q3": Column("lift axis")}
+OWN = {
+    "q1": Column(name="J1 [counts]", scale=0.001, zero=32768),
+    "q2": Column(name=" A2 "),
+    "q3": Column(name="lift axis"),
+}
 
 
 def test_columns_have_names_of_their_own_and_figures_their_scale(write):
     """Counts of an encoder, whose zero and size the user knows; a column that a name would have meant is not used."""
     text = "J1 [counts],A2,lift axis,x,y,z,X\n33268,0.2,0.1,1,2,3,9\n32768,0.3,0.2,4,5,6,8\n"
-    found = read_measurements(write(text), ARM, columns=OWN | {"x": Column("X", scale=-2.0)})
+    found = read_measurements(write(text), ARM, columns=OWN | {"x": Column(name="X", scale=-2.0)})
     exact = rounding(np.array([[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]]))
     np.testing.assert_allclose(found.readings, [[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]], rtol=0, atol=exact)
     assert found.position.tolist() == [[-18.0, 2.0, 3.0], [-16.0, 5.0, 6.0]]
