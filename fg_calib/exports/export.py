@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
@@ -34,7 +34,7 @@ from fg_calib.exports.urdf import (
     tesseract_text,
     ur_kinematics,
 )
-from fg_calib.inputs import InputError, as_floats, checked, printable, shown
+from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
 from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, Robot, frame_values
 
@@ -105,15 +105,6 @@ class Export:
         return self.text
 
 
-@dataclass(frozen=True)
-class _Arm:
-    """Data to export: the calibrated arm, its nominal robot where that is known, and comments for the file."""
-
-    robot: Robot
-    nominal: Robot | None
-    comments: tuple[str, ...]
-
-
 @checked
 def export(
     arm: Robot | Calibration,
@@ -146,43 +137,35 @@ def export(
         InputError: The format cannot hold the arm, the nominal robot is not known or another one, or an option means
             nothing for the format.
     """
-    found = _arm_of(arm, nominal)
     given: dict[str, Any] = {"configurations": configurations is not None, "tool": tool != "calibrated", "far": far}
     given |= {"ur_base": ur_base, "ur_hash": ur_hash}
     for name, value in given.items():
         if value not in (None, False) and to not in _FORMATS_OF[name]:
             raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
-    formats: dict[str, Callable[[], Export]] = {
-        "urdf": lambda: _urdf(found),
-        "ur": lambda: _ur(found, ur_base, ur_hash),
-        "tesseract": lambda: _tesseract(found),
-        "zeros": lambda: _zeros(found, tool, configurations),
-        "yaml": lambda: _yaml(found),
-    }
-    part = formats[to]() if to in formats else _table(found, to, far)
-    if isinstance(arm, Robot):
-        return part
-    return replace(part, findings=arm.findings, not_accepted=arm.not_accepted)
-
-
-def _arm_of(arm: Robot | Calibration, nominal: Robot | None) -> _Arm:
-    """The arm that is meant.
-
-    Raises:
-        InputError: The nominal robot is one of other parameters.
-    """
-    comments = [f"by fg-calib {__version__}"]
-    robot = arm if isinstance(arm, Robot) else arm.robot
     if isinstance(arm, Calibration):
-        comments += [f"NOT TO BE TRUSTED: {finding}" for finding in arm.findings]
-        comments += [f"not accepted: {reason}" for reason in arm.not_accepted]
-        nominal = nominal or arm.nominal
-    if nominal is not None:
-        kinds = [(joint.name, joint.prismatic) for joint in robot.joints]
-        if [(joint.name, joint.prismatic) for joint in nominal.joints] != kinds:
-            raise InputError("nominal", f"{nominal.name} has other joints", ", ".join(name for name, _ in kinds))
-    return _Arm(robot, nominal, tuple(comments))
+        robot, nominal, doubts = arm.robot, nominal or arm.nominal, (arm.findings, arm.not_accepted)
+    else:
+        robot, doubts = arm, ((), ())
+    kinds = [(joint.name, joint.prismatic) for joint in robot.joints]
+    if nominal is not None and [(joint.name, joint.prismatic) for joint in nominal.joints] != kinds:
+        raise InputError("nominal", f"{nominal.name} has other joints", ", ".join(name for name, _ in kinds))
+    comments = [f"by fg-calib {__version__}", *(f"NOT TO BE TRUSTED: {finding}" for finding in doubts[0])]
+    comments += [f"not accepted: {reason}" for reason in doubts[1]]
+    formats: dict[str, Callable[[], _Content]] = {
+        "urdf": lambda: _urdf(robot, comments),
+        "ur": lambda: _ur(robot, ur_base, ur_hash),
+        "tesseract": lambda: _tesseract(robot),
+        "zeros": lambda: _zeros(robot, nominal, tool, configurations),
+        "yaml": lambda: _yaml(robot),
+    }
+    text, notes, details = formats[to]() if to in formats else _table(robot, to, far)
+    if to != "urdf":
+        text = "".join(f"# {printable(comment)}\n" for comment in (*comments, *notes)) + text
+    return Export(to, robot.name, text, tuple(notes), *doubts, details)
 
+
+_Content = tuple[str, Sequence[str], dict[str, Any]]
+"""Text of a format, without comments unless it is XML; notes, and details as in `Export`."""
 
 _FORMATS_OF: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(("configurations", "tool"), ("zeros",)),
@@ -192,11 +175,6 @@ _FORMATS_OF: Mapping[str, tuple[str, ...]] = {
 """The formats for which an option means something."""
 
 
-def _commented(comments: tuple[str, ...], text: str) -> str:
-    """YAML with lines of comment before it."""
-    return "".join(f"# {printable(comment)}\n" for comment in comments) + text
-
-
 def _frame_words(robot: Robot, owner: int) -> str:
     """A frame of an arm in words; empty where it is none."""
     own = [robot.parameters[i] for i in robot.owned_by(owner)]
@@ -204,57 +182,51 @@ def _frame_words(robot: Robot, owner: int) -> str:
     return ", ".join(figures)
 
 
-def _frames_outside(robot: Robot, start: str, end: str) -> tuple[str, ...]:
+def _frames_outside(robot: Robot, start: str, end: str) -> list[str]:
     """Notes that a format has no place for the arm's base and tool, if any."""
-    notes = []
-    for owner, name, where in ((0, "base", f"before {start}"), (robot.n_joints + 1, "tool", f"behind {end}")):
-        if words := _frame_words(robot, owner):
-            notes.append(f"it has no place for the frame {name}, which is {where}: {words} (mm, deg)")
-    return tuple(notes)
+    found = {f"base, which is before {start}": _frame_words(robot, 0)}
+    found[f"tool, which is behind {end}"] = _frame_words(robot, robot.n_joints + 1)
+    return [f"it has no place for the frame {name}: {words} (mm, deg)" for name, words in found.items() if words]
 
 
-def _urdf(arm: _Arm) -> Export:
-    robot = arm.robot
+def _urdf(robot: Robot, comments: Sequence[str]) -> _Content:
     if robot.urdf is not None:
         notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
-        return Export("urdf", robot.name, urdf_text(robot.urdf.text, joint_origins(robot)), notes)
-    notes = (
+        return urdf_text(robot.urdf.text, joint_origins(robot)), notes, {}
+    notes = [
         f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",
         "URDF knows no slide without limits, which has 1000 m here, and no turn with one limit, which has none",
         "effort and velocity in <limit> are 0: they are not known",
-    )
-    return Export("urdf", robot.name, new_urdf(robot, [printable(c) for c in (*arm.comments, *notes)]), notes)
+    ]
+    return new_urdf(robot, [printable(c) for c in (*comments, *notes)]), notes, {}
 
 
-def _ur(arm: _Arm, base: UrBase | None, word: str | None) -> Export:
-    urdf = arm.robot.urdf
+def _ur(robot: Robot, base: UrBase | None, word: str | None) -> _Content:
+    urdf = robot.urdf
     drawn_base: UrBase = "base_link" if urdf is not None and urdf.base_link.endswith("base_link") else "base"
     base = base or drawn_base
     if word is not None and (not word.isprintable() or " " in word or not word):
         raise InputError("ur_hash", f"found {shown(word)}", "a word such as calib_12788084448423163542")
-    kinematics, tool = ur_kinematics(arm.robot, base)
+    kinematics, tool = ur_kinematics(robot, base)
     own = f"fg_calib_{sha256(repr(kinematics).encode()).hexdigest()[:16]}"  # which no controller has
-    notes = [f"kinematics_parameters_file of ur_description; its frame {base} is the base of {arm.robot.name}"]
+    notes = [f"kinematics_parameters_file of ur_description; its frame {base} is the base of {robot.name}"]
     values = frame_values("tool", tool)
     if max(map(abs, values.values())) > EXACT:
         words = ", ".join(f"{k} {_MM_DEG.from_si(v, 'm' if k in 'xyz' else 'rad'):.9g}" for k, v in values.items())
         notes.append(f"the tool is not in it: from tool0 it is at {words} (mm, deg; Rz(yaw) Ry(pitch) Rx(roll))")
     if word is None:
         notes.append("the driver will say that the controller's hash is another: its own kinematics are")
-    text = _commented((*arm.comments, *notes), dumped({"kinematics": {**kinematics, "hash": word or own}}))
     details = {"base": base, "hash": word or own, "tool0_T_tool": tool.tolist()}
-    return Export("ur", arm.robot.name, text, tuple(notes), details=details)
+    return dumped({"kinematics": {**kinematics, "hash": word or own}}), notes, details
 
 
-def _tesseract(arm: _Arm) -> Export:
-    robot = arm.robot
+def _tesseract(robot: Robot) -> _Content:
     text, joints = tesseract_text(robot)
     if robot.urdf is not None:
         notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
     else:
-        notes = (f"joints of the URDF that `export --to urdf` makes; {joints[0]} and {joints[-1]} are base and tool",)
-    notes = (*notes, 'named in the SRDF: <calibration_config filename="..."/>')
-    return Export("tesseract", robot.name, _commented((*arm.comments, *notes), text), notes, details={"joints": joints})
+        notes = [f"joints of the URDF that `export --to urdf` makes; {joints[0]} and {joints[-1]} are base and tool"]
+    return text, [*notes, 'named in the SRDF: <calibration_config filename="..."/>'], {"joints": joints}
 
 
 def _error_words(found: PoseErrors) -> str:
@@ -264,9 +236,8 @@ def _error_words(found: PoseErrors) -> str:
     return f"position {position}; orientation {rotation}"
 
 
-def _table(arm: _Arm, to: str, far: bool) -> Export:
+def _table(robot: Robot, to: str, far: bool) -> _Content:
     convention, words = _TABLES[to]
-    robot = arm.robot
     table = in_table(robot, convention, np.inf) if far else in_table(robot, convention)
     found = table.robot
     if table.nearly:
@@ -281,55 +252,47 @@ def _table(arm: _Arm, to: str, far: bool) -> Export:
     else:
         notes += [f"NOT EXACT: {reason}" for reason in reasons]
         notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")
-    text = _commented((*arm.comments, *notes), robot_text(found, units=_MM_DEG))
     details = {"convention": convention, "exact": exact, "reasons": reasons, "error": asdict(error)}
-    return Export(to, robot.name, text, tuple(notes), details=details)
+    return robot_text(found, units=_MM_DEG), notes, details
 
 
 _ELEMENTS = {"a": "Tx", "alpha": "Rx", "d": "Tz", "theta": "Rz", "beta": "Ry"}
 
 
-def _yaml(arm: _Arm) -> Export:
-    robot, notes = arm.robot, list[str]()
-    if robot.convention not in CONVENTIONS:
-        robot = in_table(robot, "dh-hayati").robot
-        notes.append("the same arm as rows of dh-hayati, as it came from a URDF: `--to urdf` writes that")
-    return Export("yaml", robot.name, _commented((*arm.comments, *notes), robot_text(robot)), tuple(notes))
+def _yaml(robot: Robot) -> _Content:
+    if robot.convention in CONVENTIONS:
+        return robot_text(robot), [], {}
+    note = "the same arm as rows of dh-hayati, as it came from a URDF: `--to urdf` writes that"
+    return robot_text(in_table(robot, "dh-hayati").robot), [note], {}
 
 
-def _zeros(arm: _Arm, tool: ToolOfZeros, configurations: ArrayLike | None) -> Export:
-    robot, start = arm.robot, arm.nominal
+def _zeros(robot: Robot, start: Robot | None, tool: ToolOfZeros, configurations: ArrayLike | None) -> _Content:
     if start is None:
         raise InputError("zeros", "an arm without its nominal robot", "a RESULT of calibrate, or a nominal robot")
     nominal = with_frames_of(start, robot, (robot.n_joints + 1,)) if tool == "calibrated" else start
-    at = {"workspace": drawn(robot, N_JUDGED, 1)}
-    fitted = drawn(robot, N_FITTED, 0)
+    fitted, given = drawn(robot, N_FITTED, 0), dict[str, Floats]()
     if configurations is not None:
-        fitted = as_floats("configurations", configurations, f"(n, {robot.n_joints})")
+        given["measured"] = fitted = as_floats("configurations", configurations, f"(n, {robot.n_joints})")
         if not len(fitted):
             raise InputError("configurations", "none", "at least one")
-        at = {"measured": fitted} | at
     zeros = fit_zeros(nominal, robot, fitted)
-    before = {name: errors(nominal, robot, q) for name, q in at.items()}
-    after = {name: errors(nominal, robot, q, zeros) for name, q in at.items()}
     notes = [
         "joint zeros, all else nominal: zero is what to add to a joint's reading (angle = reading + zero);",
         "it is subtracted from what is commanded, and from a stored encoder offset (angle = encoder - offset)",
-        f"fitted at {len(fitted)} configurations {'within the joint limits' if configurations is None else 'given'}",
+        f"fitted at {len(fitted)} configurations {'given' if given else 'within the joint limits'}",
     ]
     tools = {which: _frame_words(one, robot.n_joints + 1) for which, one in (("nominal", start), ("calibrated", robot))}
     if tools["nominal"] != tools["calibrated"]:
         notes.append(f"with the {tool} tool: {tools[tool] or 'none'} (mm, deg)")
-    for name in at:
+    details: dict[str, Any] = {"zeros": {}, "before": {}, "after": {}}
+    for name, q in (given | {"workspace": drawn(robot, N_JUDGED, 1)}).items():
         where = "over the joint limits" if name == "workspace" else "at the configurations given"
-        notes += [f"before, {where}: {_error_words(before[name])}", f"after, {where}: {_error_words(after[name])}"]
-    pairs = list(zip(robot.joints, zeros.tolist(), strict=True))
-    rows = {j.name: {"zero": _MM_DEG.from_si(z, j.unit), "unit": _MM_DEG.name(j.unit)} for j, z in pairs}
-    document = {"robot": robot.name, "zeros": rows}
-    details = {
-        "zeros": {j.name: {"reading": z, "unit": j.unit} for j, z in pairs},
-        "before": {name: asdict(found) for name, found in before.items()},
-        "after": {name: asdict(found) for name, found in after.items()},
-    }
-    text = _commented((*arm.comments, *notes), dumped(document))
-    return Export("zeros", robot.name, text, tuple(notes), details=details)
+        for when, offsets in (("before", None), ("after", zeros)):
+            error = errors(nominal, robot, q, offsets)
+            details[when][name] = asdict(error)
+            notes.append(f"{when}, {where}: {_error_words(error)}")
+    rows = {}
+    for joint, zero in zip(robot.joints, zeros.tolist(), strict=True):
+        details["zeros"][joint.name] = {"reading": zero, "unit": joint.unit}
+        rows[joint.name] = {"zero": _MM_DEG.from_si(zero, joint.unit), "unit": _MM_DEG.name(joint.unit)}
+    return dumped({"robot": robot.name, "zeros": rows}), notes, details

@@ -24,7 +24,7 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -130,11 +130,6 @@ def _limit(joint: Joint) -> list[dict[str, str]]:
     return [{"lower": lower, "upper": upper, "effort": "0", "velocity": "0"}]
 
 
-def frame_matrix(values: Mapping[str, float]) -> Floats:
-    """A frame from its values by kind, shape (4, 4)."""
-    return transform(**{kind: values.get(kind, 0.0) for kind in FRAME_KINDS})
-
-
 # --- ROS and Tesseract ------------------------------------------------------------------------------------------------
 
 UrBase = Literal["base", "base_link"]
@@ -171,7 +166,7 @@ def ur_kinematics(robot: Robot, base: UrBase) -> tuple[dict[str, dict[str, float
 
 def _frame_of(robot: Robot, name: str) -> Floats:
     values = {p.name: p.nominal for p in robot.parameters}
-    return frame_matrix({kind: values[f"{name}.{kind}"] for kind in FRAME_KINDS})
+    return transform(**{kind: values[f"{name}.{kind}"] for kind in FRAME_KINDS})
 
 
 def tesseract_text(robot: Robot) -> tuple[str, tuple[str, ...]]:
