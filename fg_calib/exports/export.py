@@ -13,18 +13,7 @@ from numpy.typing import ArrayLike
 
 from fg_calib import __version__
 from fg_calib.calibration import Calibration
-from fg_calib.exports.dh import (
-    N_FITTED,
-    N_JUDGED,
-    PoseErrors,
-    TableConvention,
-    drawn,
-    errors,
-    fit_parameters,
-    fit_zeros,
-    in_table,
-    with_frames_of,
-)
+from fg_calib.exports import dh
 from fg_calib.exports.urdf import (
     BASE_LINK,
     TOOL_LINK,
@@ -46,7 +35,7 @@ EXACT = 1e-9
 
 _MM_DEG = Units("mm", "deg")
 
-_TABLES: Mapping[str, tuple[TableConvention, str]] = {
+_TABLES: Mapping[str, tuple[dh.TableConvention, str]] = {
     "dh": ("dh", "Denavit and Hartenberg"),
     "mdh": ("mdh", "Craig (modified Denavit-Hartenberg)"),
     "hayati": ("dh-hayati", "Hayati: rows of Denavit and Hartenberg, with beta in place of d between parallel axes"),
@@ -229,7 +218,7 @@ def _tesseract(robot: Robot) -> _Content:
     return text, [*notes, 'named in the SRDF: <calibration_config filename="..."/>'], {"joints": joints}
 
 
-def _error_words(found: PoseErrors) -> str:
+def _error_words(found: dh.PoseErrors) -> str:
     """Errors in mm and deg."""
     position = f"{1e3 * found.position_rms:.4g} mm RMS, {1e3 * found.position_max:.4g} at most"
     rotation = f"{np.rad2deg(found.rotation_rms):.4g} deg RMS, {np.rad2deg(found.rotation_max):.4g} at most"
@@ -238,11 +227,11 @@ def _error_words(found: PoseErrors) -> str:
 
 def _table(robot: Robot, to: str, far: bool) -> _Content:
     convention, words = _TABLES[to]
-    table = in_table(robot, convention, np.inf) if far else in_table(robot, convention)
+    table = dh.in_table(robot, convention, np.inf) if far else dh.in_table(robot, convention)
     found = table.robot
     if table.nearly:
-        found = fit_parameters(found, robot, drawn(robot, N_FITTED, 0))
-    error = errors(found, robot, drawn(robot, N_JUDGED, 1))
+        found = dh.fit_parameters(found, robot, dh.drawn(robot, dh.N_FITTED, 0))
+    error = dh.errors(found, robot, dh.drawn(robot, dh.N_JUDGED, 1))
     exact = max(error.position_max, error.rotation_max) <= EXACT
     reasons = [] if exact else [str(nearly) for nearly in table.nearly] or ["figures too large for their digits"]
     order = " ".join(f"{_ELEMENTS[kind]}({kind})" for kind in CONVENTIONS[convention])
@@ -263,19 +252,19 @@ def _yaml(robot: Robot) -> _Content:
     if robot.convention in CONVENTIONS:
         return robot_text(robot), [], {}
     note = "the same arm as rows of dh-hayati, as it came from a URDF: `--to urdf` writes that"
-    return robot_text(in_table(robot, "dh-hayati").robot), [note], {}
+    return robot_text(dh.in_table(robot, "dh-hayati").robot), [note], {}
 
 
 def _zeros(robot: Robot, start: Robot | None, tool: ToolOfZeros, configurations: ArrayLike | None) -> _Content:
     if start is None:
         raise InputError("zeros", "an arm without its nominal robot", "a RESULT of calibrate, or a nominal robot")
-    nominal = with_frames_of(start, robot, (robot.n_joints + 1,)) if tool == "calibrated" else start
-    fitted, given = drawn(robot, N_FITTED, 0), dict[str, Floats]()
+    nominal = dh.with_frames_of(start, robot, (robot.n_joints + 1,)) if tool == "calibrated" else start
+    fitted, given = dh.drawn(robot, dh.N_FITTED, 0), dict[str, Floats]()
     if configurations is not None:
         given["measured"] = fitted = as_floats("configurations", configurations, f"(n, {robot.n_joints})")
         if not len(fitted):
             raise InputError("configurations", "none", "at least one")
-    zeros = fit_zeros(nominal, robot, fitted)
+    zeros = dh.fit_zeros(nominal, robot, fitted)
     notes = [
         "joint zeros, all else nominal: zero is what to add to a joint's reading (angle = reading + zero);",
         "it is subtracted from what is commanded, and from a stored encoder offset (angle = encoder - offset)",
@@ -285,10 +274,10 @@ def _zeros(robot: Robot, start: Robot | None, tool: ToolOfZeros, configurations:
     if tools["nominal"] != tools["calibrated"]:
         notes.append(f"with the {tool} tool: {tools[tool] or 'none'} (mm, deg)")
     details: dict[str, Any] = {"zeros": {}, "before": {}, "after": {}}
-    for name, q in (given | {"workspace": drawn(robot, N_JUDGED, 1)}).items():
+    for name, q in (given | {"workspace": dh.drawn(robot, dh.N_JUDGED, 1)}).items():
         where = "over the joint limits" if name == "workspace" else "at the configurations given"
         for when, offsets in (("before", None), ("after", zeros)):
-            error = errors(nominal, robot, q, offsets)
+            error = dh.errors(nominal, robot, q, offsets)
             details[when][name] = asdict(error)
             notes.append(f"{when}, {where}: {_error_words(error)}")
     rows = {}

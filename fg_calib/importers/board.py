@@ -33,26 +33,9 @@ from pydantic import Field, StrictBool
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from fg_calib import __version__
+from fg_calib import __version__, io
 from fg_calib.initialization import Camera
 from fg_calib.inputs import Floats, InputError, Integers, check
-from fg_calib.io import (
-    KNOWN,
-    Count,
-    NotNegative,
-    Positive,
-    Schema,
-    Table,
-    Units,
-    UnitsOfFile,
-    fill_folder,
-    read_bytes,
-    read_yaml,
-    shown,
-    validate,
-    write_csv,
-    write_text,
-)
 from fg_calib.measurements import COVARIANCE, Frames, RoomPixel
 from fg_calib.parallel import tell
 
@@ -77,7 +60,7 @@ MIN_CORNERS = 6
 """Corners of a ChArUco board: four determine its pose, and more its accuracy."""
 
 
-class CalibrationBoard(Schema):
+class CalibrationBoard(io.Schema):
     """A checkerboard, or a ChArUco board, whose white squares hold markers that say which ones they are.
 
     The board's frame has its origin at the first corner of a checkerboard, between whose first four corners is a
@@ -100,15 +83,15 @@ class CalibrationBoard(Schema):
     """
 
     type: Literal["checkerboard", "charuco"]
-    columns: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
-    rows: Annotated[Count, Field(ge=3, le=MAX_COUNT)]
-    square: Positive
-    marker: NotNegative = 0.0
+    columns: Annotated[io.Count, Field(ge=3, le=MAX_COUNT)]
+    rows: Annotated[io.Count, Field(ge=3, le=MAX_COUNT)]
+    square: io.Positive
+    marker: io.NotNegative = 0.0
     dictionary: str = ""
     legacy: StrictBool = False
     upright: StrictBool = False
     name: str = ""
-    units: UnitsOfFile = Field(Units(), exclude=True)
+    units: io.UnitsOfFile = Field(io.Units(), exclude=True)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -525,19 +508,19 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
             does not say `upright: true`.
     """
     place = path.name
-    file = validate(CalibrationBoard, read_yaml(path), place)
+    file = io.validate(CalibrationBoard, io.read_yaml(path), place)
     scaled = {key: getattr(file, key) * file.units.factor("m") for key in ("square", "marker")}
     board = file.model_copy(update=scaled)
     if board.square > MAX_SQUARE_M:
-        found = f"found {shown(file.square)} {file.units.length}"
+        found = f"found {io.shown(file.square)} {file.units.length}"
         raise InputError(f"{place}: square", found, f"at most {MAX_SQUARE_M:g} m", "is it in mm? units: {length: mm}")
     if file.type == "charuco":
         for key in ("marker", "dictionary"):
             if not getattr(file, key):
                 raise InputError(place, f"missing key {key!r}")
         if board.marker >= board.square:
-            expected = f"a side shorter than a square's, {shown(file.square)}"
-            raise InputError(f"{place}: marker", f"found {shown(file.marker)}", expected)
+            expected = f"a side shorter than a square's, {io.shown(file.square)}"
+            raise InputError(f"{place}: marker", f"found {io.shown(file.marker)}", expected)
         known = [name for name in dir(load_opencv().aruco) if name.startswith("DICT_")]
         check(f"{place}: dictionary", board.dictionary, known)
         charuco_board(board, place)
@@ -597,7 +580,7 @@ def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners
     size: tuple[int, int] | None = None
     for k, file in enumerate(files):
         tell("looking for corners", k, len(files))
-        image = decode(read_bytes(file), file.name)
+        image = decode(io.read_bytes(file), file.name)
         height, width = image.shape
         size = size or (width, height)
         if size != (width, height):
@@ -646,11 +629,11 @@ def read_readings(path: Path) -> Readings:
     Raises:
         InputError: The table cannot be used.
     """
-    table = Table.read(path, "configurations")
-    columns = {name.lower() if name.lower() in KNOWN else name: name for name in table.columns}
+    table = io.Table.read(path, "configurations")
+    columns = {name.lower() if name.lower() in io.KNOWN else name: name for name in table.columns}
     if "id" not in columns:
         raise InputError(table.name, "no column id", "the name of each row's image without its ending")
-    kept = [name for name in columns if name not in KNOWN]
+    kept = [name for name in columns if name not in io.KNOWN]
     if not kept:
         raise InputError(table.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
     ids = table.texts(columns["id"], "the name of an image without its ending")
@@ -676,7 +659,7 @@ class BoardTables:
     fit: BoardFit
     without: Mapping[str, str]
     readings: Readings | None
-    units: Units
+    units: io.Units
     camera_file: bytes | None
 
     def __post_init__(self) -> None:
@@ -750,19 +733,19 @@ def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
     names: list[str] = []
 
     def write(into: Path) -> None:
-        write_text(into / "board.json", json.dumps(tables.document(), indent=1, allow_nan=False) + "\n")
-        write_csv(into / "pixels.csv", _pixel_columns(tables))
+        io.write_text(into / "board.json", json.dumps(tables.document(), indent=1, allow_nan=False) + "\n")
+        io.write_csv(into / "pixels.csv", _pixel_columns(tables))
         if tables.posed:
-            write_csv(into / "board.csv", _pose_columns(tables))
+            io.write_csv(into / "board.csv", _pose_columns(tables))
         if tables.camera_file is not None:
             (into / "camera.yaml").write_bytes(tables.camera_file)
         else:
             fit, words = tables.fit, "# fg-calib board: estimated from the images, in px; 1 sigma\n"
             values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
-            write_text(into / "camera.yaml", words + yaml.safe_dump(values, sort_keys=False))
+            io.write_text(into / "camera.yaml", words + yaml.safe_dump(values, sort_keys=False))
         names.extend(sorted(file.name for file in into.iterdir()))
 
-    fill_folder(folder, write, BOARD_FILES)
+    io.fill_folder(folder, write, BOARD_FILES)
     return tuple(names)
 
 

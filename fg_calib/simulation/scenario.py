@@ -91,6 +91,7 @@ import pydantic
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
 from scipy.spatial.transform import Rotation
 
+from fg_calib import io
 from fg_calib.initialization import Camera
 from fg_calib.inputs import (
     PAIR_MODELS,
@@ -107,31 +108,6 @@ from fg_calib.inputs import (
     check,
     check_names,
     checked,
-)
-from fg_calib.io import (
-    NOISE_UNITS,
-    Bound,
-    FilePath,
-    FrameValues,
-    NotNegative,
-    Number,
-    Positive,
-    Schema,
-    Units,
-    UnitsOfFile,
-    camera_in,
-    check_choices,
-    exists,
-    first_misfit,
-    is_folder,
-    joint_noise,
-    pairing_of,
-    read_measurements,
-    read_yaml,
-    refuse_unknown_keys,
-    robot_of,
-    shown,
-    validate,
 )
 from fg_calib.measurements import Noise
 from fg_calib.robot import Robot, names_of, tolerance_kind, unit_of
@@ -158,7 +134,7 @@ class FileContext:
         robot: The nominal robot.
     """
 
-    units: Units
+    units: io.Units
     folder: Path
     robot: Robot
 
@@ -194,7 +170,7 @@ def _fit(read: Callable[[], Any], place: str) -> Any:
     try:
         return read()
     except ValidationError as error:
-        misfit, context = first_misfit(error, place), error.errors(include_url=False)[0].get("ctx", {})
+        misfit, context = io.first_misfit(error, place), error.errors(include_url=False)[0].get("ctx", {})
         if "error" not in context:
             raise misfit from None
         of: InputError = context["error"].args[0]
@@ -215,7 +191,9 @@ def _read(kind: Any, given: object, place: str, context: FileContext | None) -> 
 def schema(cls: type[Class]) -> type[Class]:
     """Make a frozen dataclass whose fields are validated: from Python in SI, from a file in the file's units."""
     keys = dict.fromkeys(key for c in reversed(cls.__mro__) for key in vars(c).get("__annotations__", {}))
-    refuse: Any = refuse_unknown_keys(*("pose" if cls.__name__ == "BoardViews" and k == "board" else k for k in keys))
+    refuse: Any = io.refuse_unknown_keys(
+        *("pose" if cls.__name__ == "BoardViews" and k == "board" else k for k in keys)
+    )
     unknown: Any = classmethod(lambda _, value: refuse(value))
     cls.refuse_unknown = pydantic.model_validator(mode="before")(unknown)  # type: ignore[attr-defined]
     config = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True)
@@ -234,17 +212,17 @@ def schema(cls: type[Class]) -> type[Class]:
 def _array(given: Any, context: FileContext | None) -> Floats:
     """Three numbers; in a file those of x, y and z, or a list."""
     if context is not None and isinstance(given, Mapping):
-        refuse_unknown_keys(*"xyz")(given)
+        io.refuse_unknown_keys(*"xyz")(given)
         given = [given.get(axis, 0.0) for axis in "xyz"]
     return as_floats("", given, "(3,)")
 
 
-Length = Annotated[Number, _scale("m")]
-PositiveLength = Annotated[Positive, _scale("m")]
-LengthFromZero = Annotated[NotNegative, _scale("m")]
-Angle = Annotated[Number, _scale("rad")]
-PositiveAngle = Annotated[Positive, _scale("rad")]
-AngleFromZero = Annotated[NotNegative, _scale("rad")]
+Length = Annotated[io.Number, _scale("m")]
+PositiveLength = Annotated[io.Positive, _scale("m")]
+LengthFromZero = Annotated[io.NotNegative, _scale("m")]
+Angle = Annotated[io.Number, _scale("rad")]
+PositiveAngle = Annotated[io.Positive, _scale("rad")]
+AngleFromZero = Annotated[io.NotNegative, _scale("rad")]
 Count = Annotated[int, Field(ge=0, le=MOST_DRAWN, strict=True)]
 CountFromOne = Annotated[int, Field(gt=0, le=MOST_DRAWN, strict=True)]
 Direction = Annotated[Floats, _convert(_array)]
@@ -262,7 +240,7 @@ def _require(fits: bool, place: str, found: str, expected: str) -> None:
 
 
 def _require_order(distance: tuple[float, float]) -> None:
-    _require(distance[0] <= distance[1], "distance", f"found {shown(list(distance))}", "the smaller one first")
+    _require(distance[0] <= distance[1], "distance", f"found {io.shown(list(distance))}", "the smaller one first")
 
 
 # --- frames and where the arm goes ------------------------------------------------------------------------------------
@@ -282,7 +260,7 @@ class Placement:
 
 
 def _placement(given: Any, context: FileContext) -> Placement:
-    si = validate(FrameValues, given, "").si(context.units, "")
+    si = io.validate(io.FrameValues, given, "").si(context.units, "")
     rotation = Rotation.from_euler("xyz", [si["roll"], si["pitch"], si["yaw"]])  # about fixed axes: Rz(yaw) Ry Rx
     return Placement(rotation.as_matrix(), np.array([si["x"], si["y"], si["z"]]))
 
@@ -393,7 +371,7 @@ class TargetViews(Conditions):
     count: CountFromOne = 50
     axis: Direction = Field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     acceptance: PositiveAngle = math.pi / 6.0
-    distance: tuple[LengthFromZero, Annotated[Bound, _scale("m")]] = (0.0, math.inf)
+    distance: tuple[LengthFromZero, Annotated[io.Bound, _scale("m")]] = (0.0, math.inf)
     region: Box | None = None
 
     def __post_init__(self) -> None:
@@ -428,7 +406,7 @@ class _ConfigurationsInFile:
     board: BoardViews | None = None
     tracker: TargetViews | None = None
     random: RandomReadings | None = None
-    table: FilePath | None = None
+    table: io.FilePath | None = None
     keep_out: tuple[Box, ...] = ()
     apart: PositiveAngle | None = None
 
@@ -437,7 +415,7 @@ def _configurations(given: Any, context: FileContext) -> Configurations:
     file = _read(_ConfigurationsInFile, given, "", context)
     key, found = _the_one_of({key: getattr(file, key) for key in ("board", "tracker", "random", "table")})
     if key == "table":
-        found = GivenReadings(read_measurements(context.folder / found, context.robot, units=context.units).readings)
+        found = GivenReadings(io.read_measurements(context.folder / found, context.robot, units=context.units).readings)
     return cast("Configurations", replace(found, keep_out=file.keep_out, apart=file.apart))
 
 
@@ -453,21 +431,21 @@ def _the_one_of(given: Mapping[str, Any]) -> tuple[str, Any]:
     return next(iter(found.items()))
 
 
-InPairing = Annotated[Pairing, _in_file(lambda given, _: pairing_of(given, ""))]
+InPairing = Annotated[Pairing, _in_file(lambda given, _: io.pairing_of(given, ""))]
 InConfigurations = Annotated[Configurations, _in_file(_configurations)]
 
 
 # --- noise and landmarks ----------------------------------------------------------------------------------------------
 
-_SIGMAS: dict[str, Any] = dict.fromkeys(NOISE_UNITS, (NotNegative | None, None))
-_NoiseInFile: Any = pydantic.create_model("_NoiseInFile", __base__=Schema, joint=(Any, 0.0), **_SIGMAS)
+_SIGMAS: dict[str, Any] = dict.fromkeys(io.NOISE_UNITS, (io.NotNegative | None, None))
+_NoiseInFile: Any = pydantic.create_model("_NoiseInFile", __base__=io.Schema, joint=(Any, 0.0), **_SIGMAS)
 
 
 def _noise(given: Any, context: FileContext) -> Noise:
-    file = validate(_NoiseInFile, given, "")
-    specified = {kind: (getattr(file, kind), context.units.factor(unit)) for kind, unit in NOISE_UNITS.items()}
+    file = io.validate(_NoiseInFile, given, "")
+    specified = {kind: (getattr(file, kind), context.units.factor(unit)) for kind, unit in io.NOISE_UNITS.items()}
     values = {kind: sigma * factor for kind, (sigma, factor) in specified.items() if sigma is not None}
-    return Noise(joint=joint_noise(file.joint, context.units, context.robot, "")).updated(**values)
+    return Noise(joint=io.joint_noise(file.joint, context.units, context.robot, "")).updated(**values)
 
 
 InNoise = Annotated[Noise, _in_file(_noise)]
@@ -529,10 +507,10 @@ Planes = Annotated[Mapping[str, Plane] | int, _by_name(Plane)]
 Boards = Annotated[Mapping[str, Placement], _by_name(Board, number=False)]
 
 
-class _CornersInFile(Schema):
+class _CornersInFile(io.Schema):
     columns: CountFromOne
     rows: CountFromOne
-    square: Positive
+    square: io.Positive
 
 
 def board_corners(columns: int, rows: int, square: float) -> Floats:
@@ -548,7 +526,7 @@ def board_corners(columns: int, rows: int, square: float) -> Floats:
 
 
 def _corners(given: Any, context: FileContext) -> Floats:
-    file = validate(_CornersInFile, given, "")
+    file = io.validate(_CornersInFile, given, "")
     return board_corners(file.columns, file.rows, file.square * context.units.factor("m"))
 
 
@@ -637,7 +615,7 @@ class Instrument:
 
 def override_noise(noise: Noise, more: Noise | None) -> Noise:
     """A noise with the values of another where it has some; the joints' stay."""
-    values = {} if more is None else {kind: more.get(kind) for kind in NOISE_UNITS}
+    values = {} if more is None else {kind: more.get(kind) for kind in io.NOISE_UNITS}
     return noise.updated(**{kind: value for kind, value in values.items() if value is not None})
 
 
@@ -661,7 +639,7 @@ class Errors:
     """
 
     law: Literal["uniform", "normal", "values"]
-    values: Mapping[str, Number]
+    values: Mapping[str, io.Number]
 
 
 def _errors(given: Any, context: FileContext) -> Errors:
@@ -671,9 +649,9 @@ def _errors(given: Any, context: FileContext) -> Errors:
                 raise InputError("normal", f"{p.name} of the robot has no tolerance", "one for all that is estimated")
         return Errors("normal", {p.name: p.tolerance for p in context.robot.parameters if p.tolerance is not None})
     laws = ("uniform", "normal", "values")
-    given = refuse_unknown_keys(*laws)(_read(dict[str, Any], given, "", context))
+    given = io.refuse_unknown_keys(*laws)(_read(dict[str, Any], given, "", context))
     law, values = _the_one_of({key: given.get(key) for key in laws})
-    values = _read(dict[str, Number], values, law, context)
+    values = _read(dict[str, io.Number], values, law, context)
     values = {key: value * context.units.factor(unit_of(key)) for key, value in values.items()}
     return Errors(cast("Any", law), values_by_name(context.robot, values, law))
 
@@ -743,13 +721,13 @@ class Scenario(Brief):
     @property
     def pairing(self) -> Pairing:
         """How pairs of the default instrument's poses are formed."""
-        return pairing_of(self.job.get("pairing", "star"), f"{self.source}: job: pairing")
+        return io.pairing_of(self.job.get("pairing", "star"), f"{self.source}: job: pairing")
 
 
-class _ScenarioInFile(Schema):
+class _ScenarioInFile(io.Schema):
     name: str | None = None
     robot: Any  # a path, or the mapping of a robot file
-    units: UnitsOfFile = Units()
+    units: io.UnitsOfFile = io.Units()
     errors: Any = None
     configurations: Any
     noise: Any
@@ -772,12 +750,12 @@ def read_scenario(path: Path | str) -> Scenario:
     path = Path(path)
     known = sorted(folder.name for folder in SCENARIOS.iterdir() if folder.is_dir())
     source = path.name
-    if str(path) in known and (is_folder(path) or not exists(path)):
+    if str(path) in known and (io.is_folder(path) or not io.exists(path)):
         path = SCENARIOS / path / "scenario.yaml"
-    elif not exists(path) and path.suffix not in {".yaml", ".yml"}:
+    elif not io.exists(path) and path.suffix not in {".yaml", ".yml"}:
         raise InputError("scenario", f"found {str(path)!r}", f"a file, or one of {', '.join(known)}")
-    file = validate(_ScenarioInFile, read_yaml(path), source)
-    robot = robot_of(file.robot, f"{source}: robot", path.parent, file.units)
+    file = io.validate(_ScenarioInFile, io.read_yaml(path), source)
+    robot = io.robot_of(file.robot, f"{source}: robot", path.parent, file.units)
     context = FileContext(file.units, path.parent, robot)
     job, specified = _read_job(file, source, context)
     given = {
@@ -788,7 +766,7 @@ def read_scenario(path: Path | str) -> Scenario:
     }
     scenario: Scenario = _read(Scenario, given, source, context)
     model = {"model": scenario.instruments[0].model} if scenario.instruments else {}
-    check_choices({**job, **model}, robot, f"{source}: job")
+    io.check_choices({**job, **model}, robot, f"{source}: job")
     return scenario
 
 
@@ -818,5 +796,5 @@ def _complete(entries: Sequence[dict[str, Any]], source: str, folder: Path) -> l
         found.append({"name": name} | entry)
         if "camera" in entry:
             place = f"{source}: instrument {number}: camera"
-            found[-1]["camera"], found[-1]["fixed"] = camera_in(entry["camera"], place, folder)
+            found[-1]["camera"], found[-1]["fixed"] = io.camera_in(entry["camera"], place, folder)
     return found
