@@ -25,7 +25,7 @@ from fg_calib.exports.urdf import (
 )
 from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
 from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text
-from fg_calib.robot import CONVENTIONS, Robot, frame_values
+from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, frame_values
 
 ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
 ToolOfZeros = Literal["nominal", "calibrated"]
@@ -234,7 +234,7 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
     error = dh.errors(found, robot, dh.drawn(robot, dh.N_JUDGED, 1))
     exact = max(error.position_max, error.rotation_max) <= EXACT
     reasons = [] if exact else [str(nearly) for nearly in table.nearly] or ["figures too large for their digits"]
-    order = " ".join(f"{_ELEMENTS[kind]}({kind})" for kind in CONVENTIONS[convention])
+    order = " ".join(f"{PARAMETER_KINDS[kind].axis.name.capitalize()}({kind})" for kind in CONVENTIONS[convention])
     notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
     if exact:
         notes.append("the same arm: base and tool below hold what rows do not")
@@ -243,9 +243,6 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
         notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")
     details = {"convention": convention, "exact": exact, "reasons": reasons, "error": asdict(error)}
     return robot_text(found, units=_MM_DEG), notes, details
-
-
-_ELEMENTS = {"a": "Tx", "alpha": "Rx", "d": "Tz", "theta": "Rz", "beta": "Ry"}
 
 
 def _yaml(robot: Robot) -> _Content:

@@ -95,7 +95,7 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
         parent = BASE_LINK
         for joint in urdf_joints(robot):
             etree.SubElement(root, "link", name=joint.child)
-            kind = "fixed" if joint.moving is None else _type(joint.moving)
+            kind, limit = _type_and_limit(joint.moving)
             element = etree.SubElement(root, "joint", name=joint.name, type=kind)
             origin = frame_values("origin", joint.origin)
             xyz, rpy = (numbers([origin[kind] for kind in kinds]) for kinds in ("xyz", ("roll", "pitch", "yaw")))
@@ -104,8 +104,8 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
             etree.SubElement(element, "child", link=joint.child)
             if joint.moving is not None:
                 etree.SubElement(element, "axis", xyz="0 0 1")
-                for limit in _limit(joint.moving):
-                    etree.SubElement(element, "limit", limit)
+            if limit:
+                etree.SubElement(element, "limit", limit)
             parent = joint.child
     except ValueError:
         hint = "rename robot or joint"
@@ -115,19 +115,16 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
     return "\n".join(['<?xml version="1.0"?>', *lines, etree.tostring(root, encoding="unicode"), ""])
 
 
-def _type(joint: Joint) -> str:
-    if joint.prismatic:
-        return "prismatic"
-    return "revolute" if np.isfinite([joint.lower, joint.upper]).all() else "continuous"
-
-
-def _limit(joint: Joint) -> list[dict[str, str]]:
-    """The attributes of a joint's `<limit>`, where it has one; nobody has said what effort and velocity it allows."""
-    if _type(joint) == "continuous":
-        return []
+def _type_and_limit(joint: Joint | None) -> tuple[str, dict[str, str]]:
+    """A joint's type, and the attributes of its `<limit>`; nobody has said what effort and velocity it allows."""
+    if joint is None:
+        return "fixed", {}
+    if not joint.prismatic and not np.isfinite([joint.lower, joint.upper]).all():
+        return "continuous", {}
     farthest = FARTHEST_SLIDE if joint.prismatic else np.inf
     lower, upper = (repr(float(np.clip(end, -farthest, farthest))) for end in (joint.lower, joint.upper))
-    return [{"lower": lower, "upper": upper, "effort": "0", "velocity": "0"}]
+    limit = {"lower": lower, "upper": upper, "effort": "0", "velocity": "0"}
+    return "prismatic" if joint.prismatic else "revolute", limit
 
 
 # --- ROS and Tesseract ------------------------------------------------------------------------------------------------

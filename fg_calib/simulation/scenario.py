@@ -402,13 +402,11 @@ Configurations = BoardViews | TargetViews | RandomReadings | GivenReadings
 
 
 @schema
-class _ConfigurationsInFile:
+class _ConfigurationsInFile(Conditions):
     board: BoardViews | None = None
     tracker: TargetViews | None = None
     random: RandomReadings | None = None
     table: io.FilePath | None = None
-    keep_out: tuple[Box, ...] = ()
-    apart: PositiveAngle | None = None
 
 
 def _configurations(given: Any, context: FileContext) -> Configurations:
