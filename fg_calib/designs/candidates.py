@@ -87,8 +87,11 @@ class Pool(Brief):
     @property
     def known(self) -> Floats:
         """Whitened rows of earlier measurements, in the columns of the poses' rows, shape (m, n_columns)."""
+        n = len(self.rows.scales)
+        if self.before is None:
+            return np.zeros((0, n))
         wide = rows_in_columns_of(self.before, self.problem)
-        return np.pad(wide, ((0, 0), (0, len(self.rows.scales) - wide.shape[1])))
+        return np.pad(wide, ((0, 0), (0, n - wide.shape[1])))
 
     @property
     def references(self) -> Integers:
@@ -115,20 +118,14 @@ class Pool(Brief):
 
     def posterior(self, poses: Integers) -> Posterior:
         """Posterior with some poses, given ones included, after the earlier ones, as a calibration would report it."""
-        before = self.before
-        problem = None
-        if len(poses) or before is None:
-            places = places_of(self.problem, self.problem.start)
-            problem = true_problem(self.robot, self.select_tables(poses), self.problem.options, places)
-        if before is not None and (problem is None or not problem.rows.parts):  # nothing, or one end of a pair
-            return Posterior(before, square_root(before, before.start, with_loss=True)[:, :-1])
-        assert problem is not None
-        rows = square_root(problem, problem.start)[:, :-1]
-        if before is None:
-            return Posterior(problem, rows)
-        # Priors of landmarks are in the rows of earlier measurements, and count once.
-        rows = rows[len(unknown_prior_rows(problem.variables, problem.start)[0]) :]
-        return Posterior(problem, np.vstack([rows, rows_in_columns_of(before, problem)]), count_measurements(before))
+        here, measured = self.problem, [] if self.before is None else [self.before]
+        if len(poses) or not measured:
+            new = true_problem(self.robot, self.select_tables(poses), here.options, places_of(here, here.start))
+            measured += [new] * bool(new.rows.parts or not measured)  # one end of a pair measures nothing
+        rows = [rows_in_columns_of(problem, here) for problem in measured]
+        if len(measured) == 2:  # priors of landmarks are in the rows of earlier measurements, and count once
+            rows[1] = rows[1][len(unknown_prior_rows(new.variables, new.start)[0]) :]
+        return Posterior(here, np.vstack(rows), sum(map(count_measurements, measured)))
 
 
 def select_rows(table: Table, order: Mapping[str, int]) -> Table:
@@ -158,8 +155,8 @@ def _has_rows(table: Table) -> bool:
     return table.model not in PAIR_MODELS or m.groups is not None or m.n_configurations > 1
 
 
-def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
-    """Whitened rows of earlier measurements in the columns of another problem of the same arm and tables.
+def rows_in_columns_of(before: Problem, problem: Problem) -> Floats:
+    """Whitened rows of a problem, at its start, in the columns of another one of the same arm and tables.
 
     Landmarks that the other problem does not have are eliminated.
 
@@ -167,9 +164,6 @@ def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
         Shape (m, n_columns + n_nuisance) of the other problem.
     """
     v = problem.variables
-    n = v.n_columns + v.n_nuisance
-    if before is None:
-        return np.zeros((0, n))
     A = square_root(before, before.start, with_loss=True)[:, :-1]
     columns = _columns_by_name(v, problem.data.landmarks)
     own = _columns_by_name(before.variables, before.data.landmarks)
@@ -177,7 +171,7 @@ def rows_in_columns_of(before: Problem | None, problem: Problem) -> Floats:
     shared = np.concatenate([own[name] for name in both])
     others = np.setdiff1d(np.arange(A.shape[1]), shared)
     Q = np.linalg.qr(A[:, others])[0] if len(others) else np.zeros((len(A), 0))
-    out = np.zeros((len(A), n))
+    out = np.zeros((len(A), v.n_columns + v.n_nuisance))
     out[:, np.concatenate([columns[name] for name in both])] = A[:, shared] - Q @ (Q.T @ A[:, shared])
     return out
 

@@ -250,14 +250,14 @@ class Posterior(Brief):
     """Posterior of the arm after some rows were measured.
 
     Attributes:
-        problem: Their problem, at its start.
+        problem: A problem of the arm, at its start.
         rows: Whitened derivatives in all its columns, with those of earlier measurements, shape (m, n).
-        n_before: Number of earlier measurements.
+        n_measurements: Number of measurements that the rows are of.
     """
 
     problem: Problem
     rows: Floats
-    n_before: int = 0
+    n_measurements: int = 0
 
     @cached_property
     def covariance(self) -> TangentCovariance:
@@ -280,7 +280,7 @@ class Posterior(Brief):
             left.A @ v.tangent_derivative(p.start)[: v.n_robot_columns, : v.n_robot_columns],
             p.estimated,
             scales=np.array([p.robot.scale_of(one.unit) for one in p.estimated]),
-            n_measurements=self.n_before + count_measurements(p),
+            n_measurements=self.n_measurements,
         )
 
 
