@@ -70,8 +70,6 @@ from fg_calib.robot import (
     build_chain,
     forward,
     frame_values,
-    inverse_right_jacobian,
-    pose,
     random_readings,
 )
 
@@ -426,11 +424,7 @@ def fit_zeros(nominal: Robot, calibrated: Robot, readings: Floats) -> Floats:
     Returns:
         Shape (n_joints,), [rad] (prismatic: [m]).
     """
-    at = poses(calibrated, readings)
-    joints = slice(len(nominal.parameters), None)
-    return _least_squares(
-        lambda zeros: pose(nominal, readings + zeros), joints, np.zeros(nominal.n_joints), at, calibrated.reach, 0.0
-    )
+    return _fit(lambda zeros: poses(nominal, readings + zeros), np.zeros(nominal.n_joints), calibrated, readings, 0.0)
 
 
 def fit_parameters(start: Robot, calibrated: Robot, readings: Floats) -> Robot:
@@ -441,31 +435,18 @@ def fit_parameters(start: Robot, calibrated: Robot, readings: Floats) -> Robot:
         calibrated: Where the tool truly is.
         readings: To fit at, shape (n, n_joints), [rad] (prismatic: [m]).
     """
-    at = poses(calibrated, readings)
-    columns = slice(0, len(start.parameters))
-    values = _least_squares(
-        lambda x: pose(start.with_values(x), readings), columns, start.nominal, at, calibrated.reach, HOLD
-    )
+    values = _fit(lambda x: poses(start.with_values(x), readings), start.nominal, calibrated, readings, HOLD)
     return start.with_values(values)
 
 
-def _least_squares(
-    predict: Callable[[Floats], Poses], columns: slice, start: Floats, at: Poses, length: float, hold: float
-) -> Floats:
-    """The values that bring predicted poses nearest to given ones."""
-    weight = np.array([length] * 3 + [1.0] * 3)
-    held = hold * np.eye(len(start))
+def _fit(predict: Callable[[Floats], Poses], start: Floats, wanted: Robot, readings: Floats, hold: float) -> Floats:
+    """The values that bring predicted poses nearest to those of an arm."""
+    weight, at = np.repeat([wanted.reach, 1.0], 3), poses(wanted, readings)
 
     def residual(x: Floats) -> Floats:
-        return np.concatenate([(weight * _miss(predict(x), at)).ravel(), held @ (x - start)])
+        return np.concatenate([(weight * _miss(predict(x), at)).ravel(), hold * (x - start)])
 
-    def jacobian(x: Floats) -> Floats:
-        found = predict(x)
-        J = found.jacobian[:, :, columns].copy()
-        J[:, :3] = np.swapaxes(inverse_right_jacobian(_miss(found, at)[:, :3]), 1, 2) @ J[:, :3]
-        return np.vstack([(weight[:, None] * J).reshape(-1, len(start)), held])
-
-    found = least_squares(residual, start, jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
+    found = least_squares(residual, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
     values: Floats = found.x
     return values
 
