@@ -308,12 +308,12 @@ class Table(Brief):
 
 
 def by_station(table: Table) -> tuple[Table, ...]:
-    """A table apart by the stations that its rows were measured from, if their frames are unknown: each has its own.
+    """A table apart by the stations that its rows were measured from: each has a frame, or pairs, of its own.
 
     A station that rows might have been measured from, but none were, has none.
     """
     m, stations = table.measurements, table.measurements.labels.get("station")
-    if stations is None or not table.unknown_frame:
+    if stations is None or not (table.unknown_frame or (table.uses_pairs and m.pairs is None)):
         return (table,)
     rest = replace(m, labels={what: of for what, of in m.labels.items() if what != "station"})
     each = [(name, np.flatnonzero(stations.index == k)) for k, name in enumerate(stations.names)]

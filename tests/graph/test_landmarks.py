@@ -330,10 +330,15 @@ def test_rows_of_the_tool_itself_are_of_no_target():
     assert set(target[rows.table_row % 3 == 2]) == {"t2"}
 
 
-def test_a_station_without_rows_has_no_frame():
+def test_a_station_without_rows_has_no_frame_and_pairs_are_of_one_station():
     robot, _, table = measured_by("targets stations", np.random.default_rng(5))
     m = table.measurements
     first = m.select(np.flatnonzero(m.labels["station"].index == 0))
     both, alone = (build_problem(robot, replace(table, measurements=x)) for x in (m, first))
+    of_pairs = build_problem(robot, replace(m, labels={"station": m.labels["station"]}), model="distance")
+    assert {t.measurements.source for t in of_pairs.data.tables} == {
+        "measurements, station s0",
+        "measurements, station s1",
+    }
     assert [t.measurements.source for t in alone.data.tables] == ["measurements, station s0"]
     assert len(both.variables.frames) - len(alone.variables.frames) == 1
