@@ -81,7 +81,8 @@ class Assessment(FrozenArrays):
         kinds = {held.kind for held in tested}
         held_out = (*tested, *(held for held in others if held.kind not in kinds))
         limits = solution.problem.options.accept
-        return replace(self, acceptance=statistics.accept(limits, held_out, self.verdict.errors))
+        tool = {} if self.expected_error is None else vars(self.expected_error.measured)
+        return replace(self, acceptance=statistics.accept(limits, held_out, self.verdict.errors, tool))
 
     def __repr__(self) -> str:
         known = sum(p.sigma is not None for p in self.estimates.parameters if p.identifiability != "fixed")
@@ -188,7 +189,8 @@ def assess(solution: Solution) -> Assessment:
 
     The covariance comes from a singular value decomposition of the whitened Jacobian of data and priors, its
     columns scaled, at the estimate. Directions that `determined` does not count are undetermined: a parameter with a
-    share in one has unknown sigma (None, nan in the covariance). It is not rescaled by chi-square.
+    share in one has unknown sigma (None, nan in the covariance). It is by the noise as specified, but for what the
+    verdict inflates it by where residuals are systematic or significantly larger (`Verdict.variance`).
 
     Note:
         Away from the nominal parameters undetermined directions turn, by about as many radians as the angles were
@@ -198,7 +200,6 @@ def assess(solution: Solution) -> Assessment:
     """
     problem = solution.problem
     spread = statistics.spread_of(solution)
-    whole = statistics.with_left_out(solution, spread)
     identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
     table = residual_table(solution)
     goodness = statistics.judge_without_outliers(solution, table, statistics.judge_fit(solution, spread, table))
@@ -206,7 +207,9 @@ def assess(solution: Solution) -> Assessment:
     chi_square, priors = statistics.chi_square(solution, spread), statistics.judge_priors(solution, spread)
     fit = statistics.Fit(chi_square, table, goodness, priors)
     verdict = judge(solution, spread, fit, identifiability.missing)
-    return Assessment(
+    spread = spread.inflated(verdict.variance)
+    whole = statistics.with_left_out(solution, spread)
+    assessment = Assessment(
         robot=problem.robot.with_values(solution.parameters[problem.variables.robot_span]),
         estimates=statistics.estimates_at(solution, spread, whole, identifiability.observability),
         names=whole.variables.names[: whole.variables.n_robot_columns],
@@ -217,5 +220,5 @@ def assess(solution: Solution) -> Assessment:
         identifiability=identifiability,
         verdict=verdict,
         expected_error=None if problem.evaluated else expected_error(problem, whole),
-        acceptance=statistics.accept(problem.options.accept, table.held_out(problem.data.labels), verdict.errors),
     )
+    return assessment.with_held_out((), solution)

@@ -14,7 +14,7 @@ lies on a ring about the vector's axis, and the estimate may be opposite it, wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -55,8 +55,8 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     problem, rank, n = solution.problem, spread.rank, spread.variables.n_columns
     if not rank:
         return Nonlinearity()
-    if problem.n_residuals > MAX_ROWS:
-        problem = subsampled(replace(problem, start=solution.parameters), MAX_ROWS / problem.n_residuals) or problem
+    if problem.n_residuals > MAX_ROWS and problem.is_exchangeable:
+        problem = subsampled(problem, MAX_ROWS / problem.n_residuals, solution.parameters)
     scales, rng = spread.variables.prior_scales, np.random.default_rng(0)
     root = spread.root[:, :rank]
     scaled = root / scales[:, None]

@@ -34,14 +34,14 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.graph import Problem, Solution, build_variables, prior_rows, unknown_prior_rows
+from fg_calib.graph import Problem, Solution, build_variables, prior_rows, subsampled, unknown_prior_rows
 from fg_calib.inputs import Floats
 from fg_calib.measurements import Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
 from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Chain, Element, Parameter, Robot, pose
 
 MAX_ROWS = 10_000
-"""Rows up to which residuals are tested: more would take long, and are seldom needed."""
+"""Rows by which residuals are tested: more would take long, and are not needed."""
 
 LEAST_LEFT = 10
 """Degrees of freedom that a test must leave: else what it does is left to chance."""
@@ -61,11 +61,42 @@ _RANK = 1e-8
 _NOTHING = 1e-10
 """Size of a column over the largest below which it is rounding errors."""
 
-LINK, OFFSET, STAGE = "small motion of link ", "offset ", "joint errors of stage "
+LINK, OFFSET = "2 small motion of link ", "offset "
 """How names of columns that a model does not have begin: see `regress`."""
 
-_STAGES = (1, 1, 2, 2, 2, 2, 2, 3, 3, 3, 3)
-"""The stages of `_joint_errors`."""
+_STAGES = ("1 ", "2 ", "3 ")
+"""How names of the columns of each stage begin."""
+
+_JOINT_ERRORS = ("1 gravity", "1 gravity", "2 reach", *["2 position"] * 4, *["3 side load"] * 4)
+"""Names of the columns of `_joint_errors`, before the number of the joint."""
+
+_WORDS = {
+    "1 gravity": "yields to gravity",
+    "2 reach": "errs with the reach of the tool",
+    "2 position": "errs with its position (gear, encoder)",
+    "3 side load": "yields to loads along x and y of the base",
+}
+
+LEAST_SHARE = 1e-3
+"""Share of the information below which a region of joint space says nothing of a direction."""
+
+MOST_TYPICAL = 4.0
+"""Size in robust sigmas beyond which a residual is a gross error."""
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """How systematic residuals are.
+
+    Attributes:
+        p_value: P-value of residuals as systematic, were there noise alone.
+        cause: The single effect that explains them best, in words; empty where none explains any.
+        variance: Variance of differences between regions of joint space, over that by the noise alone.
+    """
+
+    p_value: float
+    cause: str = ""
+    variance: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -106,11 +137,13 @@ class LinearFit:
         r: Residuals of the fit, rows first, then priors, shape (n,).
         fitted: Orthonormal basis of its columns, shape (n, rank).
         dof: Degrees of freedom.
+        variance: Of the noise: what a fit with all columns leaves.
     """
 
     r: Floats
     fitted: Floats
     dof: int
+    variance: float = 1.0
 
     def padded(self, columns: Floats) -> Floats:
         """Columns of the rows, shape (n_rows, m), of the priors too."""
@@ -120,17 +153,55 @@ class LinearFit:
         """A score test of more columns of the rows, shape (n_rows, m).
 
         Returns:
-            The p-value of what they explain, the part of the excess of chi-square that they leave, and the fit with
+            The p-value of what they explain, the part of what is more than noise that they leave, and the fit with
             them; 1, 1 and this fit where they add nothing, or leave too few degrees of freedom.
         """
         new = basis_of(self.padded(columns), self.fitted)
-        after = LinearFit(self.r - new @ (new.T @ self.r), np.hstack([self.fitted, new]), self.dof - new.shape[1])
-        total, rest, m = float(self.r @ self.r), float(after.r @ after.r), new.shape[1]
+        r, m = self.r - new @ (new.T @ self.r), new.shape[1]
+        after = replace(self, r=r, fitted=np.hstack([self.fitted, new]), dof=self.dof - m)
+        total, rest = float(self.r @ self.r), float(r @ r)
         if not m or after.dof < LEAST_LEFT:
             return 1.0, 1.0, self
         ratio = ((total - rest) / m) / max(rest / after.dof, 1e-300)
-        left = max(rest - after.dof, 0.0) / max(total - self.dof, 1e-300)
+        left = max(rest - after.dof * self.variance, 0.0) / max(total - self.dof * self.variance, 1e-300)
         return float(special.fdtrc(m, after.dof, ratio)), left, after
+
+    def clipped(self) -> LinearFit:
+        """The fit of residuals that are cut at `MOST_TYPICAL` robust sigmas: gross errors hide effects."""
+        free = 1.0 - np.sum(self.fitted**2, axis=1)
+        size, seen = np.sqrt(np.maximum(free, 0.0)), free > LEAST_SHARE
+        most = MOST_TYPICAL * 1.4826 * float(np.median(np.abs(self.r[seen]) / size[seen])) * size
+        r = np.clip(self.r, -most, most)
+        return replace(self, r=r - self.fitted @ (self.fitted.T @ r))
+
+    @property
+    def information(self) -> float:
+        """Schwarz's criterion, whose least value chooses among models."""
+        return float(len(self.r) * np.log(self.r @ self.r) + self.fitted.shape[1] * np.log(len(self.r)))
+
+
+@dataclass(frozen=True)
+class Regression:
+    """The fit of a solution, linearised, and columns that it does not have.
+
+    These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of
+    tables that were not estimated (`OFFSET`, the number of the table), and joint errors (see `_JOINT_ERRORS`).
+
+    Attributes:
+        problem: The problem of the rows, which count as their noise says: at most `MAX_ROWS`, evenly drawn.
+        fit: Their fit.
+        columns: The columns of the rows, shape (n_rows, m).
+        names: Their names, shape (m,).
+    """
+
+    problem: Problem
+    fit: LinearFit
+    columns: Floats
+    names: NDArray[np.str_]
+
+    def named(self, *begin: str) -> Floats:
+        """The columns whose names begin so, shape (n_rows, k)."""
+        return self.columns[:, [name.startswith(begin) for name in self.names.tolist()]]
 
 
 def of_several(p: float, n: int) -> float:
@@ -138,46 +209,75 @@ def of_several(p: float, n: int) -> float:
     return -float(np.expm1(n * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
-def probability_of_noise(solution: Solution) -> float | None:
-    """P-value of residuals as systematic as those of a solution, were there noise alone.
+def find_systematic(regression: Regression) -> Systematic | None:
+    """Systematic residuals, of all rows whatever their robust weights, and the single effect that explains them best.
 
     Returns:
-        None where it cannot be told: too few rows or too many, a robust loss, landmarks (also known ones), joint values
-        estimated, rows that share errors but are weighted as independent.
+        None where it cannot be told: too few rows, or rows that share errors but are weighted as independent.
     """
-    problem = solution.problem
-    if problem.data.landmarks.names or not _is_plain(problem) or problem.rows.counted_as_private:
+    problem, whole = regression.problem, regression.fit
+    if problem.rows.counted_as_private or whole.dof < 2 * LEAST_LEFT:
         return None
-    fit, J, names = regress(solution)
+    clipped = fit = whole.clipped()
     least, n = 1.0, 0
-    for stage in range(1, max(_STAGES) + 1):
-        links = np.char.startswith(names, LINK) & (stage == 2)
-        p, _, after = fit.test(J[:, links | (names == f"{STAGE}{stage}")])
+    for stage in _STAGES:
+        p, _, after = fit.test(regression.named(stage))
         if after is not fit:
             least, n, fit = min(least, p), n + 1, after
-    return of_several(least, n) if n else None
+    if not n:
+        return None
+    best, cause, gain = clipped, "", clipped.information - fit.information
+    for words, name in _causes(problem.robot).items():
+        after = clipped.test(regression.named(name))[2]
+        if after.information < best.information:
+            best, cause = after, words
+    others = " and others" * (clipped.information - best.information < 0.5 * gain)
+    return Systematic(of_several(least, n), cause and cause + others, _regional_variance(problem, whole))
 
 
-def _is_plain(problem: Problem) -> bool:
-    """Whether there are few enough rows, each of which counts as its noise says."""
-    weighted = problem.state.weights is not None or problem.joints_estimated
-    return not (problem.has_more or weighted or problem.n_residuals > MAX_ROWS)
+def _regional_variance(problem: Problem, fit: LinearFit) -> float:
+    """Variance by which fits without one region of joint space differ from that of all rows, over that by the noise.
+
+    The regions are quarters of each joint's range, by rows. In an orthonormal basis Q of the fit's columns all rows
+    have the information 1 and those of a region H = Q_b^T Q_b. With h and u its eigenvalues and vectors, the estimate
+    without them differs along u by u . Q_b^T r / (1 - h), which noise alone gives the variance h / (1 - h).
+    """
+    places = [(problem.data.places[p.table][p.block.ends[:, -1:]].ravel(), p.block) for p in problem.rows.parts]
+    ends = np.concatenate([np.repeat(place, block.residual_dim) for place, block in places])
+    squares = list[float]()
+    for readings in problem.data.readings[ends].T:
+        edges = np.quantile(readings, [0.25, 0.5, 0.75])
+        for k in range(len(edges) + 1):
+            rows = np.flatnonzero(np.searchsorted(edges, readings) == k)
+            Q = fit.fitted[rows]
+            h, U = np.linalg.eigh(Q.T @ Q)
+            seen = (h > LEAST_SHARE) & (h < 1.0 - LEAST_SHARE)
+            squares += ((U.T @ (Q.T @ fit.r[rows]))[seen] ** 2 / (h * (1.0 - h))[seen]).tolist()
+    return float(np.mean(squares)) if squares else 1.0
 
 
-def find_change(solution: Solution) -> Change | None:
+def _causes(robot: Robot) -> dict[str, str]:
+    """How the names of the columns of each single effect begin, by what it is in words."""
+    found = {f"{joint.name} {_WORDS[e]}": f"{e} {k}," for k, joint in enumerate(robot.joints) for e in _WORDS}
+    for link in range(robot.n_joints + 1):
+        where = {0: "the base", robot.n_joints: "the tool"}.get(link, f"the link after {robot.joints[link - 1].name}")
+        found[f"{where} is off as no parameter that is estimated tells"] = f"{LINK}{link}."
+    return found
+
+
+def find_change(regression: Regression) -> Change | None:
     """The change point of a table: what moved between two of its rows; None without, or where it cannot be told.
 
     Note:
-        It is looked for in one table of poses, positions or orientations, without robust losses.
+        It is looked for in one table of poses, positions or orientations.
     """
-    problem = solution.problem
+    problem, fit = regression.problem, regression.fit
     blocks = [part.block for part in problem.rows.parts]
     several = len(problem.data.tables) > 1 or problem.rows.states.n_states > 0
-    if several or not _is_plain(problem) or problem.data.landmarks.names or any(b.kind.ends != 1 for b in blocks):
+    if several or problem.data.landmarks.names or any(b.kind.ends != 1 for b in blocks):
         return None
-    fit, J, names = regress(solution)
     links = {"tool": problem.robot.n_joints, "base": 0}
-    motions = {what: J[:, np.char.startswith(names, f"{LINK}{link}.")] for what, link in links.items()}
+    motions = {what: regression.named(f"{LINK}{link}.") for what, link in links.items()}
     at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in blocks])
     first = np.unique(at)[LEAST_SIDE : 1 - LEAST_SIDE]
     first = first[np.unique(np.linspace(0, len(first) - 1, min(MAX_TRIED, len(first))).astype(np.int64))]
@@ -186,32 +286,25 @@ def find_change(solution: Solution) -> Change | None:
         return None
     p, left, what, k = min(found)
     moved = motions[what] * (at >= k)[:, None]
-    p_with, left_with, _ = fit.test(J[:, np.char.startswith(names, LINK)])[2].test(moved)
+    p_with, left_with, _ = fit.test(regression.named(LINK))[2].test(moved)
     if max(of_several(p, len(found)), p_with) >= P_VALUE or max(left, left_with) > CHANGE_LEFT:
         return None
     return Change(what, k, float(np.sum(fit.test(moved)[2].r ** 2) / np.sum(fit.r**2)))
 
 
-def explains_misfit(solution: Solution, motion: MissingMotion) -> bool:
-    """Whether a motion that the convention has no parameter for explains a part of the misfit; assumed of many rows."""
-    problem = solution.problem
-    if problem.n_residuals > MAX_ROWS:
-        return True
+def explains_misfit(regression: Regression, motion: MissingMotion) -> bool:
+    """Whether a motion that the convention has no parameter for explains a part of the misfit."""
     kinds = {PARAMETER_KINDS[kind].axis: kind for kind in FRAME_KINDS}
     wanted = [f"{LINK}{axis}.{kinds[one]}" for axis in motion.axes[:-1] for one in motion.motions]
-    fit, J, names = regress(solution)
-    p, left, _ = fit.test(J[:, np.isin(names, wanted)])
+    p, left, _ = regression.fit.test(regression.named(*wanted))
     return p < P_VALUE and left <= MISSING_LEFT
 
 
-def forgotten_offsets(solution: Solution) -> tuple[Offset, ...]:
-    """Offsets of instruments that were not estimated and are significant; none of more rows than `MAX_ROWS`."""
-    problem, found = solution.problem, list[Offset]()
-    if not _offsets(problem) or problem.n_residuals > MAX_ROWS or problem.has_more:
-        return ()
-    fit, J, names = regress(solution)
-    for table in _offsets(problem).values():
-        column = fit.padded(J[:, names == f"{OFFSET}{table}"])[:, 0]
+def forgotten_offsets(regression: Regression) -> tuple[Offset, ...]:
+    """Offsets of instruments that were not estimated and are significant."""
+    fit, found = regression.fit, list[Offset]()
+    for table in _offsets(regression.problem).values():
+        column = fit.padded(regression.named(f"{OFFSET}{table},"))[:, 0]
         p, _, after = fit.test(column[:, None])
         if p < P_VALUE:
             new = column - fit.fitted @ (fit.fitted.T @ column)
@@ -232,17 +325,13 @@ def _offsets(problem: Problem) -> dict[int, int]:
     }
 
 
-def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
-    """The fit of a solution, linearised, and columns that it does not have, by name.
-
-    These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of
-    tables that were not estimated (`OFFSET`, the number of the table), and joint errors (`STAGE` and the stage).
-
-    Returns:
-        The fit, the columns of the rows, shape (n_rows, m), and their names, shape (m,).
-    """
-    problem, at = solution.problem, solution.problem.variables.at(solution.parameters)
-    (chains, core), offsets = with_link_motions(problem, solution.parameters), _offsets(problem)
+def regress(solution: Solution) -> Regression:
+    """Linearise the fit of a solution, and what it does not have."""
+    problem, parameters = solution.problem, solution.parameters
+    if problem.state.weights is not None or problem.n_residuals > MAX_ROWS:
+        problem = subsampled(problem, min(1.0, MAX_ROWS / problem.n_residuals), parameters)
+    at = problem.variables.at(parameters)
+    (chains, core), offsets = with_link_motions(problem, parameters), _offsets(problem)
     errors = [_joint_errors(problem.robot, t.measurements.readings) for t in problem.data.tables]
     columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)
     columns[list(offsets)] = len(core) + at.n_nuisance + np.arange(len(offsets))
@@ -251,17 +340,20 @@ def regress(solution: Solution) -> tuple[LinearFit, Floats, NDArray[np.str_]]:
     of_joints = [_by_joint_errors(part.at(wide), chains[part.table], errors[part.table]) for part in rows.parts]
     private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
     J, r = np.split(rows.states.whiten(private), [-1], axis=1)
-    names = [f"{STAGE}{stage}" for stage in np.repeat(_STAGES, problem.robot.n_joints)]
+    names = [f"{effect} {k}," for effect in _JOINT_ERRORS for k in range(problem.robot.n_joints)]
     names += [name if name.startswith(LINK) else "" for name in core] + [""] * at.n_nuisance
-    all_names = np.array(names + [f"{OFFSET}{table}" for table in offsets.values()])
+    all_names = np.array(names + [f"{OFFSET}{table}," for table in offsets.values()])
     more = all_names != ""
-    r_prior, J_prior = prior_rows(problem.variables, solution.parameters)
-    r_unknown, J_unknown = unknown_prior_rows(problem.variables, solution.parameters)
+    r_prior, J_prior = prior_rows(problem.variables, parameters)
+    r_unknown, J_unknown = unknown_prior_rows(problem.variables, parameters)
     J_prior = np.pad(J_prior, ((0, 0), (0, problem.variables.n_nuisance)))
     n = problem.n_independent + len(r_prior) + len(r_unknown)
     columns = np.concatenate([J[:, ~more], J_prior, J_unknown])
     fitted, r = basis_of(columns), np.concatenate([r[:, 0], r_prior, r_unknown])
-    return LinearFit(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1]), J[:, more], all_names[more]
+    fit = LinearFit(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1])
+    with_all = fit.test(J[:, more])[2]
+    variance = 1.0 if with_all is fit else float(with_all.r @ with_all.r) / with_all.dof
+    return Regression(problem, replace(fit, variance=variance), J[:, more], all_names[more])
 
 
 def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:
@@ -302,7 +394,7 @@ def _by_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:
 
 
 def _joint_errors(robot: Robot, readings: Floats) -> Floats:
-    """Effects that a joint's error may follow, shape (n, len(_STAGES), n_joints).
+    """Effects that a joint's error may follow, shape (n, len(_JOINT_ERRORS), n_joints).
 
     Loads along z; how far the tool reaches out; harmonics of one and two periods a turn (of a prismatic joint its
     position and the square of that); loads along x and y.

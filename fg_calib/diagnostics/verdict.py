@@ -17,7 +17,8 @@ import numpy as np
 from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
-from fg_calib.graph import JOINT_NOISE, Problem, Solution
+from fg_calib.graph import JOINT_NOISE, Problem, Solution, mahalanobis_distances, solve, with_factors
+from fg_calib.inputs import Floats
 from fg_calib.measurements import missing_values
 from fg_calib.observability import MissingMotion
 from fg_calib.robot import SCALES, pose
@@ -36,9 +37,8 @@ from fg_calib.statistics import (
 
 Severity = Literal["error", "warning", "note"]
 
-LIKE_NOISE, NOT_NOISE = 1e-3, 1e-6
-"""P-value below which residuals are systematic, and below which true errors are several times those that sigmas claim;
-between the two they may be twice as large (`tests/diagnostics/test_unmodelled_effects.py`)."""
+LIKE_NOISE = 1e-4
+"""P-value below which residuals are systematic."""
 
 SIGNIFICANT = (1.0 - CONFIDENCE) / 2.0
 """P-value below which chi-square, and the outliers of test rows, are significant."""
@@ -54,6 +54,9 @@ AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
 
 LARGE_NOISE, MOST_READINGS = 0.2, 1000
 """Estimated noise over the tool's motion, beyond which it is no noise; and configurations of which that is taken."""
+
+LEAST_GAIN = 1.05
+"""Error of test rows with a robust loss, over that of least squares, above which the loss does harm."""
 
 MAX_OUTLIER_SHARE = 0.5
 """Share of measurements beyond which they are not outliers but the majority."""
@@ -86,17 +89,23 @@ class Verdict:
         warnings: Why sigmas may be too small although it is.
         notes: Other notes for its reader.
         setup: The set-up, by residuals before the calibration.
-        noise_like: P-value of residuals as systematic as these by noise alone; None where that was not tested, because
-            they are as small as specified, or cannot be told.
+        systematic: How systematic residuals are; None where that cannot be told.
         change: Change while a table was measured; None if nothing did.
+        variance: Variance that the noise is taken to have for the covariance, in that specified.
     """
 
     errors: tuple[str, ...]
     warnings: tuple[str, ...]
     notes: tuple[str, ...]
     setup: SetupCheck = field(default_factory=SetupCheck)
-    noise_like: float | None = None
+    systematic: effects.Systematic | None = None
     change: effects.Change | None = None
+    variance: float = 1.0
+
+    @property
+    def noise_like(self) -> float | None:
+        """P-value of residuals as systematic as these by noise alone; None where `systematic` is."""
+        return None if self.systematic is None else self.systematic.p_value
 
     @property
     def cautions(self) -> tuple[str, ...]:
@@ -113,8 +122,9 @@ class Case:
         spread: The covariance of what was estimated.
         fit: How well it fits.
         missing: Motions that the robot's convention has no parameter for.
+        regression: Its rows, linearised, with what the model does not have; None where the arm was evaluated.
         change: Change while a table was measured.
-        noise_like: See `Verdict`.
+        systematic: See `Verdict`.
         setup: The set-up, which is checked after all else.
     """
 
@@ -122,8 +132,9 @@ class Case:
     spread: Spread
     fit: Fit
     missing: Sequence[MissingMotion] = ()
+    regression: effects.Regression | None = None
     change: effects.Change | None = None
-    noise_like: float | None = None
+    systematic: effects.Systematic | None = None
     setup: SetupCheck = field(default_factory=SetupCheck)
 
     @property
@@ -134,7 +145,16 @@ class Case:
     @property
     def gross(self) -> GrossErrors | None:
         """The gross errors that are all that is wrong; None if there are none, or more than these is."""
-        return self.fit.goodness.gross if self.fit.goodness.gross_alone and self.change is None else None
+        alone = self.fit.goodness.gross_alone and self.change is None and not self.effect
+        return self.fit.goodness.gross if alone else None
+
+    @property
+    def effect(self) -> str:
+        """What systematic residuals follow, with the p-value; empty where residuals are not systematic."""
+        found = self.systematic
+        if found is None or found.p_value >= LIKE_NOISE or self.setup.explanations:
+            return ""
+        return f"{found.cause or 'unmodelled effects'} (p = {max(found.p_value, 1e-300):.1g})"
 
     @property
     def too_large(self) -> bool:
@@ -146,10 +166,17 @@ class Case:
         return rest > max(chi2.bounds[1] * dof, 0.0) or any(k.verdict == "too small" for k in self.fit.goodness.kinds)
 
     @property
+    def variance(self) -> float:
+        """Variance that the noise is taken to have for the covariance, in that specified; at least 1."""
+        chi2, found = self.fit.chi_square, self.systematic
+        significant = chi2.p_value is not None and chi2.p_value < SIGNIFICANT and not chi2.too_large
+        of_regions = found.variance if found is not None and self.effect else 1.0
+        return max(1.0, of_regions, chi2.ratio if significant and self.gross is None else 1.0)
+
+    @property
     def high(self) -> bool:
         """Whether residuals are larger than the noise, or systematic, and not by gross errors alone."""
-        systematic = self.noise_like is not None and self.noise_like < LIKE_NOISE
-        return self.gross is None and (self.fit.chi_square.too_large or systematic)
+        return self.gross is None and (self.fit.chi_square.too_large or bool(self.effect))
 
 
 def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
@@ -161,22 +188,27 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
         fit: How well it fits.
         missing: Motions that the robot's convention has no parameter for.
     """
-    problem, verdicts = solution.problem, {kind.verdict for kind in fit.goodness.kinds}
-    tested = not problem.evaluated and ("too small" in verdicts or solution.estimated_noise is not None)
-    change = effects.find_change(solution) if tested or ("outliers" in verdicts and not problem.evaluated) else None
-    noise_like = effects.probability_of_noise(solution) if tested and change is None else None
-    case = Case(solution, spread, fit, missing, change, noise_like)
-    statements = [statement for check in CHECKS for statement in check(case) if statement.applies]
-    statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
-    doubts = any(s.severity == "error" for s in statements)
+    problem = solution.problem
+    regression = None if problem.evaluated else effects.regress(solution)
+    change = None if regression is None else effects.find_change(regression)
+    systematic = None if regression is None or change is not None else effects.find_systematic(regression)
+    case = Case(solution, spread, fit, missing, regression, change, systematic)
+    found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}
+    doubts = any(s.severity == "error" for each in found.values() for s in each)
     if not problem.evaluated:
         much = any(kind.factor > MOST_ESTIMATED for kind in fit.goodness.kinds)
         case = replace(case, setup=check_problem(problem, solution.before, doubtful=doubts or much))
     fits = not (doubts or solution.estimated_noise is not None)
-    statements = [*check_setup(case, fits=fits), *check_optima(case), *statements]
-    statements += [*check_systematic(case), *check_offsets(case), *check_missing(case)]
+    found[check_fit] = list(check_fit(case))  # which names an effect only if the set-up is right
+    lacking = list(check_missing(case))
+    explained = any(s.severity == "error" for s in lacking)  # why residuals are systematic
+    statements = [*check_setup(case, fits=fits), *check_optima(case)]
+    statements += () if explained else check_systematic(case, doubts=doubts)
+    statements += [s for each in found.values() for s in each]
+    statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
+    statements += [*check_offsets(case), *lacking]
     errors, warnings, notes = (texts(statements, severity) for severity in ("error", "warning", "note"))
-    return Verdict(errors, warnings, notes, case.setup, noise_like, change)
+    return Verdict(errors, warnings, notes, case.setup, systematic, change, case.variance)
 
 
 def texts(statements: Sequence[Statement], severity: str) -> tuple[str, ...]:
@@ -208,15 +240,19 @@ def check_fit(case: Case) -> Iterator[Statement]:
     """Check chi-square, but where only the corrections make it too large."""
     chi2, problem = case.fit.chi_square, case.problem
     if case.fit.priors is None or case.too_large or not chi2.too_large:
-        yield from check_chi_square(
-            chi2, case.gross, evaluated=problem.evaluated, updated=problem.knowledge is not None
-        )
+        updated, effect = problem.knowledge is not None, case.effect
+        yield from check_chi_square(chi2, case.gross, evaluated=problem.evaluated, updated=updated, effect=effect)
         text = "outliers were not searched for: there are too many rows; let a robust loss do so (loss: gnc)"
-        yield Statement("warning", text, chi2.too_large and not case.fit.goodness.searched)
+        yield Statement("warning", text, chi2.too_large and not case.effect and not case.fit.goodness.searched)
 
 
 def check_chi_square(
-    chi2: ChiSquare, gross: GrossErrors | None = None, *, evaluated: bool = False, updated: bool = False
+    chi2: ChiSquare,
+    gross: GrossErrors | None = None,
+    *,
+    evaluated: bool = False,
+    updated: bool = False,
+    effect: str = "",
 ) -> Iterator[Statement]:
     """Check chi-square of the fitted rows and priors.
 
@@ -225,6 +261,7 @@ def check_chi_square(
         gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
         evaluated: Whether the arm was evaluated as it is.
         updated: Whether the rows were added to an earlier calibration.
+        effect: What systematic residuals follow.
     """
     if chi2.dof <= 0:
         text = "no degree of freedom is left: nothing says whether the fit is right, or the noise; measure more"
@@ -239,13 +276,15 @@ def check_chi_square(
         cause += " loss do so (loss: gnc)"
     elif updated:
         cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
+    elif effect:
+        cause = "residuals are systematic"
     cause = cause or "noise specified too small, unmodelled effects, or outliers"
     yield Statement("error", f"{outside}: {cause}", reduced > high)
     text = f"{outside}: noise specified too large; sigmas are larger than they need be"
     yield Statement("note", text, reduced < low)
     significant = low <= reduced <= high and chi2.p_value is not None and chi2.p_value < SIGNIFICANT
     text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
-    text += f" ({ratio:.2f} times); sigmas may be too small by as much or more"
+    text += f" ({ratio:.2f} times), and sigmas are shown larger by as much"
     yield Statement("note", text, significant and ratio > NOTABLE_RATIO)
 
 
@@ -276,6 +315,30 @@ def check_test_rows(case: Case) -> Iterator[Statement]:
         text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
         text += f"; suspicious: {listed(worst)}" if worst else ""
         yield Statement("error" if ratio > FACTOR else "warning", text)
+
+
+def check_gain(case: Case) -> Iterator[Statement]:
+    """Check that test rows, outliers among them, are predicted better than by the nominal arm, and by least squares."""
+    solution, problem = case.solution, case.problem
+    if problem.evaluated or case.fit.goodness.test is None or not case.fit.goodness.test.n:
+        return
+    before, after = (_test_misfit(problem, x) for x in (solution.before, solution.parameters))
+    text = f"test rows are predicted no better than by the nominal arm ({after:.3g} sigma RMS, {before:.3g} before)"
+    yield Statement("error", f"{text}: the calibration is no gain; keep the nominal arm", after > before)
+    if problem.options.loss != "none":
+        plain = replace(problem, options=replace(problem.options, loss="none"))
+        plain = with_factors(plain, problem.start, replace(problem.state, weights=None))
+        least = _test_misfit(problem, solve(plain).parameters)
+        text = f"least squares predicts the test rows better ({least:.3g} sigma RMS, {after:.3g} with loss"
+        text += f" {problem.options.loss}): it takes effects for outliers; use loss: none"
+        yield Statement("error", text, after > LEAST_GAIN * least)
+
+
+def _test_misfit(problem: Problem, parameters: Floats) -> float:
+    """RMS of all test rows at a parameter vector, over their noise; 0 where none counts."""
+    each = zip(problem.data.blocks, mahalanobis_distances(problem, parameters), strict=True)
+    e, n = (np.concatenate(found) for found in zip(*((e[s.test], n[s.test]) for s, (e, n) in each), strict=True))
+    return float(np.sqrt(np.sum(e**2) / max(np.sum(n), 1)))
 
 
 def check_priors(case: Case) -> Iterator[Statement]:
@@ -358,18 +421,17 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
 
 
 CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (
-    *(check_solver, check_change, check_fit, check_kept_noise, check_test_rows, check_priors, check_prior_scales),
-    *(check_signs, check_estimated_noise),
+    *(check_solver, check_change, check_fit, check_kept_noise, check_test_rows, check_gain, check_priors),
+    *(check_prior_scales, check_signs, check_estimated_noise),
 )
 """The checks of every solution, in the order of their statements; for what comes before and after them see `judge`."""
 
 
-def check_systematic(case: Case) -> Iterator[Statement]:
-    """Check whether residuals are systematic; a wrong set-up has them as its consequence."""
-    p = 1.0 if case.noise_like is None or case.setup.explanations else case.noise_like
-    claim = "several times those claimed: rely on the test rows" if p < NOT_NOISE else "twice those claimed"
-    text = f"the residuals are systematic (p = {p:.1g}): unmodelled effects; true errors may be {claim}"
-    yield Statement("warning", text, p < LIKE_NOISE)
+def check_systematic(case: Case, *, doubts: bool) -> Iterator[Statement]:
+    """Check whether residuals are systematic, which is the cause of other doubts, if it is not a wrong set-up."""
+    text = f"systematic residuals: {case.effect}; sigmas are {np.sqrt(case.variance):.2g} times what noise alone makes"
+    text += " them, as regions of joint space disagree; where no row is, errors may be larger: rely on the test rows"
+    yield Statement("error" if doubts else "warning", text, case.effect)
 
 
 def check_offsets(case: Case) -> Iterator[Statement]:
@@ -378,8 +440,8 @@ def check_offsets(case: Case) -> Iterator[Statement]:
     Where residuals are too large for the noise the linearised fit knows less of the offset than its sigma says.
     """
     labels, high = case.problem.data.labels, case.fit.chi_square.too_large
-    skipped = case.gross is not None or case.setup.explanations
-    for found in () if skipped else effects.forgotten_offsets(case.solution):
+    rows = None if case.gross is not None or case.setup.explanations else case.regression
+    for found in () if rows is None else effects.forgotten_offsets(rows):
         of = f" of {labels[found.table]}" if len(labels) > 1 else ""
         adds = f"{1e3 * found.size:+.3g} mm"
         adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
@@ -391,7 +453,7 @@ def check_missing(case: Case) -> Iterator[Statement]:
     """Check whether what the convention has no parameter for explains the misfit; an update's convention did before."""
     asked = case.high and not case.setup.explanations and case.problem.knowledge is None
     for motion in case.missing:
-        certain = asked and effects.explains_misfit(case.solution, motion)
+        certain = asked and case.regression is not None and effects.explains_misfit(case.regression, motion)
         yield Statement("error" if certain else "note", str(motion))
 
 

@@ -241,6 +241,11 @@ class Problem(FrozenArrays):
         return bool(self.added) or self.knowledge is not None
 
     @property
+    def is_exchangeable(self) -> bool:
+        """Whether no row counts for more than others: none has a robust weight or depends on landmarks."""
+        return not (self.variables.nuisance or self.options.loss != "none" or self.state.weights is not None)
+
+    @property
     def n_excluded(self) -> dict[str, int]:
         """Train pairs that take no part, by reason: once each, whatever was measured of them."""
         found: dict[str, set[tuple[int, int]]] = {}
@@ -388,22 +393,19 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
     return with_factors(problem, parameters, state)
 
 
-def subsampled(problem: Problem, share: float) -> Problem | None:
-    """Draw some train rows of a problem evenly, whitened at its start.
+def subsampled(problem: Problem, share: float, parameters: Floats | None = None) -> Problem:
+    """Draw some train rows of a problem evenly, whitened by their noise alone, without robust weights.
 
     Args:
         problem: The problem.
         share: Which share of each block.
-
-    Returns:
-        None where single rows count for more than others do: where they have robust weights, or depend on landmarks.
+        parameters: The parameter vector at which they are whitened; the problem's start if None.
     """
-    if problem.variables.nuisance or problem.options.loss != "none" or problem.state.weights is not None:
-        return None
     rng, blocks = np.random.default_rng(0), []
     for s in problem.data.blocks:
         blocks.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
-    return with_factors(replace(problem, data=replace(problem.data, blocks=tuple(blocks))), problem.start)
+    data, state = replace(problem.data, blocks=tuple(blocks)), replace(problem.state, weights=None)
+    return with_factors(problem, problem.start if parameters is None else parameters, state, data=data)
 
 
 def mahalanobis_distances(problem: Problem, parameters: Floats) -> list[tuple[Floats, Integers]]:

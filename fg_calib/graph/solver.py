@@ -238,10 +238,10 @@ def unsolved(problem: Problem) -> Solution:
 
 
 def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
-    """A problem of very many rows, started at the optimum of a few of them: some ten sigma away."""
-    few = subsampled(problem, SAMPLE_SHARE) if problem.n_residuals > MAX_AT_ONCE else None
-    if few is None:
+    """A problem of very many exchangeable rows, started at the optimum of a few of them: some ten sigma away."""
+    if problem.n_residuals <= MAX_AT_ONCE or not problem.is_exchangeable:
         return problem
+    few = subsampled(problem, SAMPLE_SHARE)
     try:
         options = replace(options, decrement=max(options.decrement, NEAR_ENOUGH))
         run = _fit(_started_by_few(few, options), options)

@@ -70,6 +70,11 @@ class ExpectedError:
     of: int
     relative: bool = False
 
+    @property
+    def measured(self) -> PoseRms:
+        """What of it shows in the measurements."""
+        return self.fitted if self.relative else self.base
+
 
 def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedError:
     """Expected errors of the tool at the test configurations, or at the train ones where these are few.

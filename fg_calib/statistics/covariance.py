@@ -119,6 +119,15 @@ class Spread(TangentCovariance):
     rank: int
     excess: float
 
+    def inflated(self, variance: float) -> Spread:
+        """The covariance of rows whose noise has so many times the variance; priors stay as they are."""
+        half, held = self.root[:, : self.rank], self.root[:, self.rank :]
+        priors = graph.prior_rows(self.variables, self.parameters)[1] @ half
+        grown = np.eye(self.rank) + (variance - 1.0) * (np.eye(self.rank) - priors.T @ priors)
+        root = np.hstack([half @ np.linalg.cholesky(grown), held])
+        more = root @ root.T - self.tangent
+        return replace(self, root=root, tangent=self.tangent + more, actual=self.actual + more)
+
 
 def spread_of(solution: graph.Solution) -> Spread:
     """The covariance: that of the weighted least-squares estimate under the noise as it is taken to be.

@@ -48,6 +48,7 @@ from fg_calib.inputs import (
 from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Labels, Table
 from fg_calib.parallel import Failure, map_jobs
+from fg_calib.robot import SCALES
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
 
 Verdict = Literal["pass", "fail", "not evaluated"]
@@ -291,7 +292,9 @@ class Acceptance:
         return "fail" if "fail" in found else "not evaluated" if "not evaluated" in found else "pass"
 
 
-def accept(limits: Limits, held_out: Sequence[HeldOut], findings: Sequence[str]) -> Acceptance | None:
+def accept(
+    limits: Limits, held_out: Sequence[HeldOut], findings: Sequence[str], tool: Mapping[str, float | None]
+) -> Acceptance | None:
     """Judge the limits of a job by what was held out; None without limits.
 
     Tables with enough rows are judged one by one: many rows of one do not make up for those of another. Where none has
@@ -301,27 +304,31 @@ def accept(limits: Limits, held_out: Sequence[HeldOut], findings: Sequence[str])
         limits: The limits.
         held_out: Measurements held out, by table and kind: test rows, or those of cross-validation.
         findings: Why the result is not to be trusted: it then passes nothing.
+        tool: Expected error of the tool, `position` [m] and `orientation` [rad].
     """
     judged = []
     for kind, limit in ((f.name, getattr(limits, f.name)) for f in fields(limits)):
         if limit is not None:
             parts = [held for held in held_out if held.kind == kind]
             enough = [held for held in parts if held.n >= LEAST] or ([pooled(parts)] if parts else [])
-            judged += [_judge(kind, limit, held, findings) for held in enough or (None,)]
+            judged += [_judge(kind, limit, held, findings, tool.get(kind)) for held in enough or (None,)]
     return Acceptance(tuple(judged)) if judged else None
 
 
-def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str]) -> Judgement:
+def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str], tool: float | None) -> Judgement:
     if held is None:
         return Judgement(kind, limit, None, None, 0, "not evaluated", f"no measurement of any {kind} was held out")
 
-    exceeds = held.after > limit
+    exceeds, scale = held.after > limit, SCALES["m" if kind == "position" else "rad"]
+    expected = f"{scale.factor * (tool or 0.0):.3g} {scale.unit}"
     doubts = {
         f"fewer than {LEAST} were held out": held.n < LEAST,
         "frame, base or tool were fitted to these rows, which are too few for that": held.few,
         "the noise of the measurements hides it": exceeds and held.after**2 - held.noise**2 <= limit**2,
         f"{held.by} misses it: mark some rows as test": exceeds and bool(held.by),
         "within the limit, but the result is not to be trusted": not exceeds and bool(findings),
+        f"within the limit, but the tool itself is expected to be off by {expected}: measure it (of targets make one"
+        " the tool: leave its `target` empty; or state the places of two)": not exceeds and (tool or 0.0) > limit,
         "the error is not known": not np.isfinite(held.after),
     }
     verdict: Verdict = "not evaluated" if any(doubts.values()) else "fail" if exceeds else "pass"

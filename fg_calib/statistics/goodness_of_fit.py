@@ -378,10 +378,10 @@ class RowStatistics:
             squares = (table.after / table.sigma) ** 2
         self.studentised[variance < LEAST_VARIANCE] = np.nan
         covariance = self._of(fitted).with_errors(-self._model.of_all(spread.tangent)) if known else None
-        chosen, of_test = slice(None) if len(fitted) == table.n else fitted, squares[test]
+        chosen, tested = slice(None) if len(fitted) == table.n else fitted, squares[test]
         squares, variance = (np.multiply(w, values, out=values)[chosen] for values in (squares, variance))
         self.fitted = JudgedRows(table, fitted, squares, variance, covariance, self._shared)
-        self.predicted = self._predict(test, of_test)
+        self.predicted = self._predict(test, tested)
 
     def _of(self, rows: Integers) -> ResidualCovariance:
         """Covariance of some of the kept rows, over sigma."""

@@ -66,23 +66,14 @@ def chi_square(reduced, p_value=0.5, dof=40):
     [
         (chi_square(1.0, dof=0), {}, "error", "no degree of freedom is left"),
         (chi_square(1.3), {}, None, ""),
-        (chi_square(1.3, 1e-4), {}, "note", "(1.14 times); sigmas may be too small by as much or more"),
+        (chi_square(1.3, 1e-4), {}, "note", "(1.14 times), and sigmas are shown larger by as much"),
         (chi_square(1.2, 1e-4), {}, None, ""),
         (chi_square(0.4), {}, "note", "noise specified too large"),
-        (
-            chi_square(2.1),
-            {},
-            "error",
-            "outside [0.50, 2.00]: noise specified too small, unmodelled effects, or outliers",
-        ),
+        (chi_square(2.1), {}, "error", "[0.50, 2.00]: noise specified too small, unmodelled effects, or outliers"),
         (chi_square(2.1), {"updated": True}, "error", "new rows contradict the earlier calibration"),
         (chi_square(2.1), {"evaluated": True}, "error", "the arm does not predict these test rows"),
-        (
-            chi_square(2.1),
-            {"gross": GrossErrors(1, ("7",), 1.1)},
-            "error",
-            "outliers: 1 (7), 1.1 without: look at them",
-        ),
+        (chi_square(2.1), {"gross": GrossErrors(1, ("7",), 1.1)}, "error", "outliers: 1 (7), 1.1 without: look"),
+        (chi_square(2.1), {"effect": "q2"}, "error", "[0.50, 2.00]: residuals are systematic"),
     ],
 )
 def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severity, words):

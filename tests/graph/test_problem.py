@@ -32,17 +32,8 @@ def direct_pairs(distance, angle, sigma=(1e-3, 1e-3), test=None):
 
 def bare(robot, q, pairs=None, sigma_joint=0.0):
     n = len(q)
-    return Measurements(
-        q,
-        np.arange(n).astype(str),
-        np.zeros(n, bool),
-        None,
-        None,
-        None,
-        None,
-        np.full(robot.n_joints, sigma_joint),
-        pairs,
-    )
+    sigma, nothing = np.full(robot.n_joints, sigma_joint), [None] * 4
+    return Measurements(q, np.arange(n).astype(str), np.zeros(n, bool), *nothing, sigma, pairs)
 
 
 def planar_pairs(angles, measured=None, distance=None, sigma=(1e-3, 1e-3)):

@@ -12,33 +12,16 @@ from fg_calib.robot.model import Parameter
 
 # Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.
 BASE_FREE = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]
+BOTH = [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"]]
+TURNS = [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"]]
+POINTS = [["beta5", "theta6", "a7"], ["d6", "alpha7"]]
 TABLE = {
-    "pose": (
-        29,
-        [],
-        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6"], ["beta6", "theta7"]],
-    ),
-    "distance-rotation": (
-        23,
-        BASE_FREE,
-        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6"]],
-    ),
-    "distance": (
-        21,
-        BASE_FREE,
-        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6", "a7"], ["d6", "alpha7"]],
-    ),
-    "rotation": (11, None, [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"]]),
-    "position": (
-        25,
-        ["beta6", "theta7", "beta7"],
-        [["beta1", "theta2"], ["beta2", "theta3"], ["d3", "d4", "d5"], ["beta5", "theta6", "a7"], ["d6", "alpha7"]],
-    ),
-    "orientation": (
-        15,
-        None,
-        [["beta1", "theta2"], ["beta2", "theta3", "theta4", "theta5"], ["beta5", "theta6"], ["beta6", "theta7"]],
-    ),
+    "pose": (29, [], [*BOTH, ["beta5", "theta6"], ["beta6", "theta7"]]),
+    "distance-rotation": (23, BASE_FREE, [*BOTH, ["beta5", "theta6"]]),
+    "distance": (21, BASE_FREE, [*BOTH, *POINTS]),
+    "rotation": (11, None, TURNS),
+    "position": (25, ["beta6", "theta7", "beta7"], [*BOTH, *POINTS]),
+    "orientation": (15, None, [*TURNS, ["beta6", "theta7"]]),
 }
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from instruments import measured_by
 from simulated import measure, small_arm, true_robot, write_job
 
 from fg_calib import InputError, calibrate
@@ -165,3 +166,12 @@ def test_rows_whose_prediction_nothing_determines_are_not_held_out():
     (one,) = result.result.acceptance.judgements
     assert (one.n, one.verdict) == (10, "pass")
     assert one.error == pytest.approx(result.assessment.fit.residuals.rms()["test"]["position"]["after"], rel=1e-12)
+
+
+def test_targets_within_a_limit_do_not_pass_a_tool_that_is_not_known():
+    robot, _, table = measured_by("targets", np.random.default_rng(2), n=60, n_test=20)
+    found = calibrate(robot, table, accept={"position": 5e-4})
+    one = found.result.acceptance.judgements[0]
+    assert one.error < 5e-4 < found.assessment.expected_error.measured.position
+    assert one.verdict == "not evaluated"
+    assert "the tool itself is expected to be off by" in one.reason
