@@ -18,6 +18,7 @@ def compare(
     from fg_calib.baseline import comparison
     from fg_calib.io import read_job, read_result
     from fg_calib.report import compare as report
+    from fg_calib.report import write_document
 
     if new is not None:
         both, files = (read_result(job), read_result(new)), (job, new)
@@ -27,6 +28,6 @@ def compare(
         return
     found = comparison.compare(read_job(job))
     if out is not None:
-        report.write_comparison(out, found)
+        write_document(out, "comparison.json", report.comparison_document(found))
     show_result(as_json, lambda: report.comparison_document(found), lambda: report.build_comparison_report(found))
     end(found.findings)

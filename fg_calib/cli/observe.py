@@ -35,7 +35,7 @@ def observe(
     from fg_calib.io import Units, read_measurements, read_robot
     from fg_calib.measurements import Noise
     from fg_calib.observability import observe_configurations, observe_structure
-    from fg_calib.report import build_identifiability_report, observability_document, write_observability
+    from fg_calib.report import build_identifiability_report, observability_document, write_document
 
     arm, names = read_robot(robot, base_link=base_link, tip_link=tip_link), names_in(prefer)
     if configurations is None:
@@ -50,5 +50,5 @@ def observe(
         table = read_measurements(configurations, arm, units=units, noise=noise)
         found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
     if out is not None:
-        write_observability(out, found)
+        write_document(out, "observability.json", observability_document(found))
     show_result(as_json, lambda: observability_document(found), lambda: build_identifiability_report(found))

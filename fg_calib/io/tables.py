@@ -10,8 +10,7 @@ import csv
 import logging
 import os
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from io import BytesIO
@@ -156,14 +155,21 @@ class Table:
             InputError: The table cannot be read, it has no rows, or `columns` does not fit.
         """
         require_polars(name)
+        import polars as pl
+
         is_file = isinstance(table, os.PathLike | str)
         name = Path(table).name if is_file else name
-        with _one_line(name, "no table"):
+        try:
             found = _read_file(Path(table)) if is_file else cls(name, (), _as_polars(table, name))
             header = [column.strip() for column in found.columns or found.frame.columns]
             check_different(name, header)
             names = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
             found.frame.columns = names
+        except (InputError, MemoryError):
+            raise
+        except (Exception, pl.exceptions.PanicException) as error:  # of a frame's objects polars may raise anything
+            first = str(error).strip().partition("\n")[0]
+            raise InputError(name, f"no table: {first or type(error).__name__}") from None
         if not found.n_rows:
             raise InputError(name, "no rows", "at least one")
         return replace(found, columns=tuple(names), renamed=dict(columns or {}))
@@ -374,34 +380,16 @@ def _as_polars(table: Any, name: str) -> pl.DataFrame:
 
 
 def _series(values: Any) -> Any:
-    """A column with None for pandas' missing values; cells of several types become texts, so that none is lost."""
+    """A column with None for what pandas has for a missing value; cells of several types become texts."""
     import polars as pl
 
     if not isinstance(values, list):
         return values
-    cells = [None if type(value).__name__ in ("NAType", "NaTType") else value for value in values]
-    try:
-        return pl.Series(cells)
-    except (pl.exceptions.PolarsError, TypeError, OverflowError):
-        return pl.Series([None if value is None or value != value else str(value) for value in cells], dtype=pl.String)  # noqa: PLR0124
-
-
-@contextmanager
-def _one_line(name: str, what: str) -> Iterator[None]:
-    """Errors of polars, and panics of its Rust, become one line.
-
-    Raises:
-        InputError: Polars cannot read a table.
-    """
-    import polars as pl
-
-    try:
-        yield
-    except (InputError, MemoryError):
-        raise
-    except (Exception, pl.exceptions.PanicException) as error:  # of a frame's objects polars may raise anything
-        first = str(error).strip().partition("\n")[0]
-        raise InputError(name, f"{what}: {first or type(error).__name__}") from None
+    missing = [type(value).__name__ == "NAType" or value != value for value in values]  # noqa: PLR0124
+    found = pl.Series([None if none else value for none, value in zip(missing, values, strict=True)], strict=False)
+    if found.null_count() > sum(missing):
+        raise ValueError("cells of types that do not go together")
+    return found
 
 
 def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None:

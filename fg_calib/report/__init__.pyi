@@ -4,7 +4,6 @@ from .compare import (
     check_document,
     comparison_document,
     history_document,
-    write_comparison,
 )
 from .design import build_design_report, design_document, write_design
 from .html import build_page, draw_figures, parameter_table_html
@@ -13,7 +12,6 @@ from .inspect import (
     build_inspection_report,
     inspection_document,
     observability_document,
-    write_observability,
 )
 from .predict import (
     build_correction_report,
@@ -23,7 +21,19 @@ from .predict import (
     write_commands,
     write_prediction,
 )
-from .tables import WIDTH, in_order, line, plain, report, section, shortened, shown_in, table_of, width_for
+from .tables import (
+    WIDTH,
+    in_order,
+    line,
+    plain,
+    report,
+    section,
+    shortened,
+    shown_in,
+    table_of,
+    width_for,
+    write_document,
+)
 from .text import ReportData, build_report, format_result, judged, notes_of, summary
 
 __all__ = [
@@ -62,8 +72,7 @@ __all__ = [
     "table_of",
     "width_for",
     "write_commands",
-    "write_comparison",
     "write_design",
-    "write_observability",
+    "write_document",
     "write_prediction",
 ]

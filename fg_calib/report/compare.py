@@ -160,16 +160,6 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
     return own | more
 
 
-@checked
-def write_comparison(folder: Path | str, comparison: Comparison) -> None:
-    """Write `comparison.json` into a folder.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    tables.write_document(folder, "comparison.json", comparison_document(comparison))
-
-
 def changes(old: Result, new: Result) -> list[dict[str, Any]]:
     """The parameters that one of two calibrations estimated: old, new, change, its sigma, and both over each other.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 from pydantic import TypeAdapter
@@ -34,16 +33,6 @@ def observability_document(found: Identifiability) -> dict[str, Any]:
     """The content of `observability.json`."""
     document: dict[str, Any] = json.loads(TypeAdapter(Document).dump_json(found))
     return document
-
-
-@checked
-def write_observability(folder: Path | str, found: Identifiability) -> None:
-    """Write `observability.json` into a folder.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    tables.write_document(folder, "observability.json", observability_document(found))
 
 
 def build_identifiability_report(found: Identifiability) -> Group:
