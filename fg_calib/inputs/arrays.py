@@ -9,35 +9,22 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from pydantic import BeforeValidator, PlainSerializer
-from pydantic_core import CoreSchema, core_schema
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator
 
 from fg_calib.inputs.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
 from fg_calib.inputs.errors import InputError, shown
 
 
-class _AsLists:
-    """Arrays as JSON has them: nested lists, null for what is not finite."""
+def _read_as(dtype: DTypeLike) -> PlainValidator:
+    """Arrays from JSON: from nested lists, null for what is not finite."""
 
-    def __init__(self, dtype: DTypeLike) -> None:
-        self._dtype = dtype
-
-    def __get_pydantic_core_schema__(self, *_: object) -> CoreSchema:
-        """The schema of a field with this annotation."""
-        return core_schema.no_info_plain_validator_function(
-            self._read,
-            serialization=core_schema.plain_serializer_function_ser_schema(_listed),
-        )
-
-    def _read(self, value: Any) -> NDArray[Any]:
+    def read(value: Any) -> NDArray[Any]:
         try:
-            return value if isinstance(value, np.ndarray) else np.array(value, dtype=self._dtype)
+            return value if isinstance(value, np.ndarray) else np.array(value, dtype=dtype)
         except (TypeError, OverflowError) as error:  # pydantic reports ValueError alone
             raise ValueError(str(error)) from None
 
-    def __get_pydantic_json_schema__(self, *_: object) -> dict[str, Any]:
-        """The JSON schema of a field with this annotation."""
-        return {"type": "array"}
+    return PlainValidator(read, json_schema_input_type=list[Any])
 
 
 def _listed(values: NDArray[Any]) -> list[Any]:
@@ -46,9 +33,11 @@ def _listed(values: NDArray[Any]) -> list[Any]:
     return listed
 
 
-Floats = Annotated[NDArray[np.float64], _AsLists(np.float64)]
-Integers = Annotated[NDArray[np.int64], _AsLists(np.int64)]
-Booleans = Annotated[NDArray[np.bool_], _AsLists(np.bool_)]
+_AS_LISTS = PlainSerializer(_listed)
+
+Floats = Annotated[NDArray[np.float64], _read_as(np.float64), _AS_LISTS]
+Integers = Annotated[NDArray[np.int64], _read_as(np.int64), _AS_LISTS]
+Booleans = Annotated[NDArray[np.bool_], _read_as(np.bool_), _AS_LISTS]
 """Arrays that a typed result writes to JSON and reads back, as fields of dataclasses too."""
 
 Figure = Annotated[
