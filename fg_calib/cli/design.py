@@ -35,7 +35,7 @@ def design(
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
     from fg_calib.designs.design import design as designed
-    from fg_calib.io import require_absent, require_writable
+    from fg_calib.io import read_joint_table, require_absent, require_writable
     from fg_calib.report import build_design_report, design_document, write_design
 
     if n is not None and target is not None:
@@ -51,8 +51,8 @@ def design(
         "fitted": None if error is None else error == "fitted",
         "criterion": criterion,
         "seed": seed,
-        "given": None if given is None else _readings(given, robot, units),
-        "task": None if task is None else _readings(task, robot, units),
+        "given": None if given is None else read_joint_table(given, robot, units)[1],
+        "task": None if task is None else read_joint_table(task, robot, units)[1],
         **_candidates(candidates, robot, units),
     }
     found = designed(subject, **choices)
@@ -77,14 +77,9 @@ def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
     return scenario, Units(scenario.length_unit, scenario.angle_unit), scenario.robot
 
 
-def _readings(path: Path, robot: Robot, units: Units) -> Any:
-    from fg_calib.io import read_measurements
-
-    return read_measurements(path, robot, units=units).readings
-
-
 def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
     """Options that say where the candidates come from."""
+    from fg_calib.io import read_joint_table
     from fg_calib.simulation import GivenReadings, read_scenario
 
     if given is None:
@@ -93,4 +88,4 @@ def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]
         return {"n_candidates": int(given)}
     if given.endswith((".yaml", ".yml")):
         return {"candidates": read_scenario(given).configurations}
-    return {"candidates": given if given == "rows" else GivenReadings(_readings(Path(given), robot, units))}
+    return {"candidates": given if given == "rows" else GivenReadings(read_joint_table(given, robot, units)[1])}

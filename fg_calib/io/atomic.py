@@ -39,10 +39,10 @@ def read_bytes(path: Path) -> bytes:
             raise InputError(str(path), "is a folder" if stat.S_ISDIR(mode) else "is a pipe or a device", "a file")
         content = path.read_bytes()
     except FileNotFoundError:
-        raise InputError(_short(str(path)), "no such file") from None
+        raise InputError(str(path), "no such file") from None
     except (OSError, ValueError, MemoryError) as error:  # ValueError: a path with a null character
         found = f"cannot be read: {getattr(error, 'strerror', None) or error or 'there is not enough memory for it'}"
-        raise InputError(_short(str(path)), found, "a file that can be") from None
+        raise InputError(str(path), found, "a file that can be") from None
     noted = _noted.get()
     if noted is not None:
         noted[path] = hashlib.sha256(content).hexdigest()
@@ -78,10 +78,6 @@ exists, is_folder = os.path.exists, os.path.isdir
 """Whether there is a file, a folder; False for a name that nothing can have."""
 
 
-def _short(path: str) -> str:
-    return path if len(path) <= 120 else f"{path[:117]}..."
-
-
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text, whole or not at all.
 
@@ -90,7 +86,7 @@ def write_text(path: Path, text: str) -> None:
     """
     content = text.encode()
     if not is_folder(path.parent):
-        raise InputError(_short(str(path)), f"there is no folder {path.parent}")
+        raise InputError(str(path), f"there is no folder {path.parent}")
     try:
         with TemporaryDirectory(prefix=".fg-calib-", dir=path.parent, ignore_cleanup_errors=True) as made:
             Path(made, path.name).write_bytes(content)
@@ -132,7 +128,7 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
                 os.replace(Path(made, name), folder / name)
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         found = f"cannot be written: {getattr(error, 'strerror', None) or error}"
-        raise InputError(_short(str(folder)), found, "a folder that can be") from error
+        raise InputError(str(folder), found, "a folder that can be") from error
     finally:
         for parent in missing:  # where nothing was written, they are empty
             with suppress(OSError, ValueError):

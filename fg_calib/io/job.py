@@ -169,7 +169,6 @@ def _read_job(path: Path) -> Job:
     return Job(path, robot, alone, options, truth, document=document)
 
 
-@checked
 def is_job(path: Path | str) -> bool:
     """Whether a file is a job, by a key that only jobs have: what was measured.
 

@@ -209,20 +209,19 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
     for joint in root.findall("joint"):
         name = joint.get("name", "")
         if name in origins:
-            _set(joint, "origin", {key: [origins[name][kind] for kind in kinds] for key, kinds in _ORIGIN.items()})
+            _set_origin(joint, origins[name])
     return f'<?xml version="1.0"?>\n{etree.tostring(root.getroottree(), encoding="unicode")}\n'
 
 
-def _set(joint: Element, tag: str, wanted: Mapping[str, Sequence[float]]) -> None:
-    """Give a joint's element attributes with these numbers; 0 is what a missing one means."""
-    element = joint.find(tag)
-    for name, numbers in wanted.items():
-        given = None if element is None else element.get(name)
-        read = [0.0] * len(numbers) if given is None else _figures(given)
+def _set_origin(joint: Element, wanted: Mapping[str, float]) -> None:
+    """Give a joint's `<origin>` these numbers; 0 is what a missing one means."""
+    element = joint.find("origin")
+    for name, kinds in _ORIGIN.items():
+        numbers, read = [wanted[kind] for kind in kinds], _figures(_attribute(joint, "origin", name, "0 0 0"))
         if len(read) == len(numbers) and max(abs(a - b) for a, b in zip(read, numbers, strict=True)) <= ROUNDING:
             continue
         if element is None:
-            element = joint.makeelement(tag)
+            element = joint.makeelement("origin")
             element.tail = joint.text
             joint.insert(0, element)
         element.set(name, " ".join(repr(float(number)) for number in numbers))
@@ -581,13 +580,11 @@ def robot_text(
     if (robot.urdf is None) != (urdf_name is None):
         raise ValueError("a URDF robot, and no other, is written with urdf_name")
     units, base, tool = units or Units(), robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
-    mapping: dict[str, Any] = {"name": robot.name}
+    mapping: dict[str, Any] = {"name": robot.name, "units": asdict(units)}
     if robot.urdf is None:
-        mapping |= {"convention": robot.convention, "units": asdict(units)}
-        mapping |= {"joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
+        mapping |= {"convention": robot.convention, "joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
     else:
         mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
-        mapping |= {"units": asdict(units)}
     for key, owned in (("base", base), ("tool", tool)):
         frame = [robot.parameters[i] for i in owned]
         mapping |= {key: {p.kind: units.from_si(p.nominal, p.unit) for p in frame if p.nominal != 0.0}}

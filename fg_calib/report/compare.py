@@ -15,7 +15,7 @@ from rich.text import Text
 
 from fg_calib.baseline import ESTIMATORS, Comparison, Estimate
 from fg_calib.diagnostics import probability
-from fg_calib.inputs import InputError, checked
+from fg_calib.inputs import InputError
 from fg_calib.io import NOISE_UNITS, Result, Run
 from fg_calib.monitoring import Check, Explanation
 from fg_calib.report import tables
@@ -103,7 +103,6 @@ def _comparison_notes(comparison: Comparison) -> Iterator[str]:
     yield "predicted errors take fixed parameters as exact, so they may be too small in the base frame"
 
 
-@checked
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """The document `comparison.json`: SI, full precision, None for what is unknown or infinite.
 

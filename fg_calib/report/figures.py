@@ -155,16 +155,14 @@ def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans) -> Chart:
 
 
 def _histogram(values: Floats, caption: str) -> Chart:
-    """The distribution of residuals; a column at each end holds those beyond `MAX_SIGMA`."""
-    inner = np.linspace(-MAX_SIGMA, MAX_SIGMA, 41)
-    edges = np.array([-MAX_SIGMA - 0.5, *inner, MAX_SIGMA + 0.5])
+    """The distribution of residuals; the columns at the ends hold those beyond `MAX_SIGMA` too."""
+    edges = np.linspace(-MAX_SIGMA, MAX_SIGMA, 41)
     counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
     density = counts / (len(values) * np.diff(edges))
     limits = limits_of(density, [0.45], with_zero=True)
     plot = Plot((float(edges[0]), float(edges[-1])), limits, ("residual, in its sigma", "share per sigma"))
     for k in np.flatnonzero(density).tolist():
-        kind = "column" if 0 < k < len(density) - 1 else "beyond"
-        plot.box((edges[k], edges[k + 1]), (0.0, density[k]), class_=kind)
+        plot.box((edges[k], edges[k + 1]), (0.0, density[k]), class_="column")
     x = np.linspace(-MAX_SIGMA, MAX_SIGMA, 81)
     plot.curve(x, np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi))
     return plot.chart(caption)

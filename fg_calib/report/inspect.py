@@ -11,7 +11,6 @@ from rich.console import Group
 from rich.table import Table
 
 from fg_calib.diagnostics import MAX_ROWS, Inspection
-from fg_calib.inputs import checked
 from fg_calib.io import Observability as Document
 from fg_calib.io import in_words as table_in_words
 from fg_calib.job import Job
@@ -28,7 +27,6 @@ COUNTS = {
 """Counts of a table by their headings."""
 
 
-@checked
 def observability_document(found: Identifiability) -> dict[str, Any]:
     """The content of `observability.json`."""
     document: dict[str, Any] = json.loads(TypeAdapter(Document).dump_json(found))
@@ -137,7 +135,6 @@ def _class_table(o: Observability, relative: Sequence[str]) -> Table:
     return table_of(("Identifiability", "Kinematic parameters"), rows, wrap=True)
 
 
-@checked
 def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:
     """The content of `fg-calib inspect --json`: SI, null for what is unknown or infinite.
 

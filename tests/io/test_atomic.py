@@ -111,4 +111,4 @@ def test_what_is_no_file_is_one_line(tmp_path, make, message):
     with pytest.raises(InputError) as error:
         read_bytes(make(tmp_path))
     assert message in str(error.value)
-    assert len(str(error.value)) < 300
+    assert len(str(error.value)) < 600

@@ -122,8 +122,8 @@ def test_a_written_robot_is_readable_for_people(tmp_path):
         (tmp_path / "out.yaml").read_text()
         == """\
 name: two
-convention: mdh-hayati
 units: {length: mm, angle: deg}
+convention: mdh-hayati
 joints:
 - {a: 0.0, alpha: 0.0, d: 100.0, theta: 0.0, beta: 0.0, limits: [-90.0, 90.0]}
 - {name: slide, a: 10.0, alpha: -90.0, d: 0.5, theta: 30.0, beta: 1.0, type: prismatic, limits: [0.0, 200.0]}
