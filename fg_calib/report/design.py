@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Group
 from rich.table import Table as Shown
 
@@ -24,7 +22,7 @@ from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
-from fg_calib.simulation import instrument_keys, table_columns, to_fill_in
+from fg_calib.simulation import job_text, table_columns, to_fill_in
 
 MAX_POSES_LISTED = 40
 """Poses that the report lists; the table has all."""
@@ -173,7 +171,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
         InputError: The folder cannot be written, or holds a file of these names: its tables may have been filled in.
     """
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
-    measured = design.tables if design.pool.scenario is not None else ()
+    scenario = design.pool.scenario
+    measured = design.tables if scenario is not None else ()
     files: dict[str, Any] = {CONFIGURATIONS: _configurations(design, robot, units)}
     for t in measured:
         for name, columns in table_columns(t, robot, units).items():
@@ -191,10 +190,11 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             write_csv(into / name, columns)
         if urdf is not None:
             write_urdf(into / urdf, robot)
-        if measured:
+        if scenario is not None:
             write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
             then = _CALIBRATE if design.pool.before is None else _UPDATE
-            write_text(into / "calibration.yaml", _JOB_BEGINS + then + _job_text(design, measured, units))
+            keys = {"robot": "robot.yaml"} | {k: v for k, v in scenario.job.items() if k not in ("model", "pairing")}
+            write_text(into / "calibration.yaml", job_text(_JOB_BEGINS + then, keys, measured, robot, units))
 
     fill_folder(folder, write)
     return names
@@ -224,16 +224,3 @@ def _rounded(readings: Floats, robot: Robot, units: Units) -> dict[str, Floats]:
 
 DECIMALS = 7
 """Decimals of joint readings and positions in the tables: far below what encoders and trackers resolve."""
-
-
-def _job_text(design: Design, measured: Sequence[Table], units: Units) -> str:
-    """The job of the tables that are to be filled in."""
-    scenario = design.pool.scenario
-    assert scenario is not None
-    robot, sigma = design.pool.robot, measured[0].measurements.sigma_joint
-    joint = [units.from_si(s, j.unit) for s, j in zip(sigma, robot.joints, strict=True)]
-    keys = {key: value for key, value in scenario.job.items() if key not in ("model", "pairing", "noise")}
-    job: dict[str, Any] = {"robot": "robot.yaml", **keys, "units": asdict(units)}
-    job |= {"noise": {"joint": joint[0] if len(set(joint)) == 1 else joint}}
-    job |= instrument_keys(measured, units)
-    return yaml.safe_dump(job, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)

@@ -17,7 +17,7 @@ from .scenario import (
 )
 from .simulator import Simulation, simulate
 from .views import Candidates, draw_candidates
-from .write import instrument_keys, table_columns, to_fill_in, write_simulation
+from .write import job_text, table_columns, to_fill_in, write_simulation
 
 __all__ = [
     "MOST_DRAWN",
@@ -36,7 +36,7 @@ __all__ = [
     "Spot",
     "TargetViews",
     "draw_candidates",
-    "instrument_keys",
+    "job_text",
     "link_points",
     "read_scenario",
     "simulate",

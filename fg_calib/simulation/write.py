@@ -132,16 +132,29 @@ def to_fill_in(columns: Columns, *, touched: bool = False) -> Columns:
 # --- the job ----------------------------------------------------------------------------------------------------------
 
 
+def job_text(words: str, keys: Mapping[str, Any], tables: Sequence[Table], robot: Robot, units: Units) -> str:
+    """A job of tables, each with its own keys.
+
+    Args:
+        words: Comments that it begins with.
+        keys: Its other keys.
+        tables: The tables.
+        robot: The nominal robot.
+        units: Of the job and the tables.
+    """
+    noise = {"joint": joint_noise(tables[0].measurements.sigma_joint, robot, units)}
+    return words + _yaml({**keys, "units": asdict(units), "noise": noise} | instrument_keys(tables, units))
+
+
 def _job_text(simulation: Simulation, units: Units) -> str:
-    scenario, m = simulation.scenario, simulation.measurements
-    job: dict[str, Any] = {"robot": "robot_nominal.yaml", "truth": "robot_true.yaml"}
-    noise = {"joint": joint_noise(m.sigma_joint, simulation.robot, units)}
+    scenario, m, robot = simulation.scenario, simulation.measurements, simulation.robot
+    words = f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n"
+    keys: dict[str, Any] = {"robot": "robot_nominal.yaml", "truth": "robot_true.yaml"}
     if scenario.instruments:
-        job |= {**scenario.job, "units": asdict(units), "noise": noise} | instrument_keys(simulation.tables, units)
-    else:
-        keys = {**scenario.job, "frame": frame_knowledge(scenario.frame)}
-        job |= {"measurements": m.source, **keys, "units": asdict(units), "noise": _noise(m, units) | noise}
-    return f"{_FIRST_WORDS}{scenario.source} --seed {simulation.seed}\n" + _yaml(job)
+        return job_text(words, {**keys, **scenario.job}, simulation.tables, robot, units)
+    keys |= {"measurements": m.source, **scenario.job, "frame": frame_knowledge(scenario.frame), "units": asdict(units)}
+    noise = {"joint": joint_noise(m.sigma_joint, robot, units)}
+    return words + _yaml(keys | {"noise": _noise(m, units) | noise})
 
 
 def _yaml(document: Mapping[str, Any]) -> str:
