@@ -9,7 +9,6 @@ Pairs have two ends. In a star all pairs share the reference pose, the first can
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -37,9 +36,6 @@ from fg_calib.simulation import (
 
 REFERENCE, NONE = -1, -2
 """Instead of the number of a pose: the reference of a star, and a configuration at which nothing is fitted."""
-
-_ID = re.compile(r"^(?:(\S+) (?:\S+ )?)?p(\d+)$")
-"""How a simulation names a configuration: the instrument whose own it is, if any, and its number."""
 
 MEASURED: Mapping[Model, Model] = {"distance": "position", "rotation": "orientation", "distance-rotation": "pose"}
 """Model to measure for pairs of each model to be formed.
@@ -327,10 +323,9 @@ def _with_instruments(scenario: Scenario) -> Scenario:
 
 
 def _split_name(name: str) -> tuple[str, int]:
-    """The group and the number of a configuration."""
-    found = _ID.match(name)
-    assert found is not None, name
-    return found[1] or "", int(found[2])
+    """The group and the number of a configuration, `p7`, `wire p7`, or `wire wire p7` where something is touched."""
+    *own, last = name.split(" ")
+    return own[0] if own else "", int(last.removeprefix("p"))
 
 
 def _nominal(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
