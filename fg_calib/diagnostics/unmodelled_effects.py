@@ -28,6 +28,7 @@ Loads: by virtual work the torque about joint k of a weight in direction g at th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -77,6 +78,9 @@ _WORDS = {
     "3 side load": "yields to loads along x and y of the base",
 }
 
+LIKE_NOISE = 1e-4
+"""P-value below which residuals are systematic."""
+
 LEAST_SHARE = 1e-3
 """Share of the information below which a region of joint space says nothing of a direction."""
 
@@ -90,7 +94,7 @@ class Systematic:
 
     Attributes:
         p_value: P-value of residuals as systematic, were there noise alone.
-        cause: The single effect that explains them best, in words; empty where none explains any.
+        cause: The single effect that explains them best, in words; empty where they are like noise or none does.
         variance: Variance of differences between regions of joint space, over that by the noise alone.
     """
 
@@ -189,7 +193,7 @@ class Regression:
 
     Attributes:
         problem: The problem of the rows, which count as their noise says: at most `MAX_ROWS`, evenly drawn.
-        fit: Their fit.
+        fit: Their fit, whose noise is as specified.
         columns: The columns of the rows, shape (n_rows, m).
         names: Their names, shape (m,).
     """
@@ -198,6 +202,13 @@ class Regression:
     fit: LinearFit
     columns: Floats
     names: NDArray[np.str_]
+
+    @cached_property
+    def fit_with_noise(self) -> LinearFit:
+        """The fit with the noise that one with all columns leaves."""
+        with_all = self.fit.test(self.columns)[2]
+        variance = 1.0 if with_all is self.fit else float(with_all.r @ with_all.r) / with_all.dof
+        return replace(self.fit, variance=variance)
 
     def named(self, *begin: str) -> Floats:
         """The columns whose names begin so, shape (n_rows, k)."""
@@ -226,13 +237,15 @@ def find_systematic(regression: Regression) -> Systematic | None:
             least, n, fit = min(least, p), n + 1, after
     if not n:
         return None
+    if (p := of_several(least, n)) >= LIKE_NOISE:
+        return Systematic(p)
     best, cause, gain = clipped, "", clipped.information - fit.information
     for words, name in _causes(problem.robot).items():
         after = clipped.test(regression.named(name))[2]
         if after.information < best.information:
             best, cause = after, words
     others = " and others" * (clipped.information - best.information < 0.5 * gain)
-    return Systematic(of_several(least, n), cause and cause + others, _regional_variance(problem, whole))
+    return Systematic(p, cause and cause + others, _regional_variance(problem, whole))
 
 
 def _regional_variance(problem: Problem, fit: LinearFit) -> float:
@@ -271,12 +284,12 @@ def find_change(regression: Regression) -> Change | None:
     Note:
         It is looked for in one table of poses, positions or orientations.
     """
-    problem, fit = regression.problem, regression.fit
+    problem = regression.problem
     blocks = [part.block for part in problem.rows.parts]
     several = len(problem.data.tables) > 1 or problem.rows.states.n_states > 0
     if several or problem.data.landmarks.names or any(b.kind.ends != 1 for b in blocks):
         return None
-    links = {"tool": problem.robot.n_joints, "base": 0}
+    fit, links = regression.fit_with_noise, {"tool": problem.robot.n_joints, "base": 0}
     motions = {what: regression.named(f"{LINK}{link}.") for what, link in links.items()}
     at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in blocks])
     first = np.unique(at)[LEAST_SIDE : 1 - LEAST_SIDE]
@@ -296,7 +309,7 @@ def explains_misfit(regression: Regression, motion: MissingMotion) -> bool:
     """Whether a motion that the convention has no parameter for explains a part of the misfit."""
     kinds = {PARAMETER_KINDS[kind].axis: kind for kind in FRAME_KINDS}
     wanted = [f"{LINK}{axis}.{kinds[one]}" for axis in motion.axes[:-1] for one in motion.motions]
-    p, left, _ = regression.fit.test(regression.named(*wanted))
+    p, left, _ = regression.fit_with_noise.test(regression.named(*wanted))
     return p < P_VALUE and left <= MISSING_LEFT
 
 
@@ -332,7 +345,11 @@ def regress(solution: Solution) -> Regression:
         problem = subsampled(problem, min(1.0, MAX_ROWS / problem.n_residuals), parameters)
     at = problem.variables.at(parameters)
     (chains, core), offsets = with_link_motions(problem, parameters), _offsets(problem)
-    errors = [_joint_errors(problem.robot, t.measurements.readings) for t in problem.data.tables]
+    errors = list[Floats]()
+    for table, place in zip(problem.data.tables, problem.data.places, strict=True):
+        fitted, n = problem.data.fitted[place], problem.robot.n_joints
+        errors.append(np.zeros((len(place), len(_JOINT_ERRORS), n)))
+        errors[-1][fitted] = _joint_errors(problem.robot, table.measurements.readings[fitted])
     columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)
     columns[list(offsets)] = len(core) + at.n_nuisance + np.arange(len(offsets))
     wide = replace(at, chains=chains, n_columns=len(core), columns=columns, n_nuisance=at.n_nuisance + len(offsets))
@@ -348,12 +365,12 @@ def regress(solution: Solution) -> Regression:
     r_unknown, J_unknown = unknown_prior_rows(problem.variables, parameters)
     J_prior = np.pad(J_prior, ((0, 0), (0, problem.variables.n_nuisance)))
     n = problem.n_independent + len(r_prior) + len(r_unknown)
-    columns = np.concatenate([J[:, ~more], J_prior, J_unknown])
-    fitted, r = basis_of(columns), np.concatenate([r[:, 0], r_prior, r_unknown])
-    fit = LinearFit(r - fitted @ (fitted.T @ r), fitted, n - fitted.shape[1])
-    with_all = fit.test(J[:, more])[2]
-    variance = 1.0 if with_all is fit else float(with_all.r @ with_all.r) / with_all.dof
-    return Regression(problem, replace(fit, variance=variance), J[:, more], all_names[more])
+    basis, r = (
+        basis_of(np.concatenate([J[:, ~more], J_prior, J_unknown])),
+        np.concatenate([r[:, 0], r_prior, r_unknown]),
+    )
+    fit = LinearFit(r - basis @ (basis.T @ r), basis, n - basis.shape[1])
+    return Regression(problem, fit, J[:, more], all_names[more])
 
 
 def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:

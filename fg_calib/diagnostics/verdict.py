@@ -25,6 +25,7 @@ from fg_calib.robot import SCALES, pose
 from fg_calib.statistics import (
     CONFIDENCE,
     FACTOR,
+    FINE,
     LEAST_REDUNDANCY,
     OUTLIER_WEIGHT,
     ChiSquare,
@@ -36,9 +37,6 @@ from fg_calib.statistics import (
 )
 
 Severity = Literal["error", "warning", "note"]
-
-LIKE_NOISE = 1e-4
-"""P-value below which residuals are systematic."""
 
 SIGNIFICANT = (1.0 - CONFIDENCE) / 2.0
 """P-value below which chi-square, and the outliers of test rows, are significant."""
@@ -152,7 +150,7 @@ class Case:
     def effect(self) -> str:
         """What systematic residuals follow, with the p-value; empty where residuals are not systematic."""
         found = self.systematic
-        if found is None or found.p_value >= LIKE_NOISE or self.setup.explanations:
+        if found is None or found.p_value >= effects.LIKE_NOISE or self.setup.explanations:
             return ""
         return f"{found.cause or 'unmodelled effects'} (p = {max(found.p_value, 1e-300):.1g})"
 
@@ -190,7 +188,8 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     """
     problem = solution.problem
     regression = None if problem.evaluated else effects.regress(solution)
-    change = None if regression is None else effects.find_change(regression)
+    suspicious = solution.estimated_noise is not None or any(kind.verdict not in FINE for kind in fit.goodness.kinds)
+    change = effects.find_change(regression) if suspicious and regression is not None else None
     systematic = None if regression is None or change is not None else effects.find_systematic(regression)
     case = Case(solution, spread, fit, missing, regression, change, systematic)
     found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}

@@ -18,7 +18,7 @@ from .goodness_of_fit import (
     judge_fit,
     upper_probability,
 )
-from .outliers import judge_without_outliers
+from .outliers import FINE, judge_without_outliers
 from .priors import PriorFit, estimate_tolerances, judge_priors
 from .residual_table import MAX_OUTLIER_SHARE, HeldOut, ResidualTable
 from .variance_components import LEAST_REDUNDANCY, estimate_noise, has_joint_noise
@@ -26,6 +26,7 @@ from .variance_components import LEAST_REDUNDANCY, estimate_noise, has_joint_noi
 __all__ = [
     "CONFIDENCE",
     "FACTOR",
+    "FINE",
     "FLAGS",
     "LEAST",
     "LEAST_REDUNDANCY",

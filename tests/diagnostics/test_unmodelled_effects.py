@@ -12,8 +12,15 @@ from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, prob
 
 from fg_calib import calibrate
 from fg_calib.assessment import assess
-from fg_calib.diagnostics.unmodelled_effects import Systematic, find_change, find_systematic, forgotten_offsets, regress
-from fg_calib.diagnostics.verdict import LIKE_NOISE, Case, check_systematic
+from fg_calib.diagnostics.unmodelled_effects import (
+    LIKE_NOISE,
+    Systematic,
+    find_change,
+    find_systematic,
+    forgotten_offsets,
+    regress,
+)
+from fg_calib.diagnostics.verdict import Case, check_systematic
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
