@@ -33,7 +33,7 @@ _WEIGHT = 100.0
 """Weight [1/m] of the point against a turn [rad] where the tool is turned about it."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Correction(FrozenArrays):
     """Commands for n targets.
 
@@ -69,17 +69,9 @@ class Correction(FrozenArrays):
         return np.asarray((self.missed < REACHED).all(axis=1))
 
     @cached_property
-    def changed(self) -> Floats:
-        """The joint values to command minus the nominal ones, shape (n, n_joints)."""
-        return self.readings - self.nominal_readings
-
-    @cached_property
     def far(self) -> Booleans:
         """Joints that change by more than a calibration alone explains, shape (n,)."""
-        return np.asarray((np.abs(self.changed) > LARGE_CHANGE).any(axis=1))
-
-    def __repr__(self) -> str:
-        return f"Correction, {len(self.readings)} targets, {int(self.reached.sum())} reached"
+        return np.asarray((np.abs(self.readings - self.nominal_readings) > LARGE_CHANGE).any(axis=1))
 
 
 def correct_targets(
