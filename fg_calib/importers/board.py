@@ -276,12 +276,8 @@ def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats,
     return found
 
 
-def estimate_camera(
-    points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]
-) -> tuple[Camera, dict[str, float]]:
+def estimate_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
     """The camera that explains views of a plane best (Zhang 2000, *A flexible new technique for camera calibration*).
-
-    And 1 sigma of each of its `INTRINSICS`, from the residuals, with unknown poses.
 
     Args:
         points: Of each view, points of the plane, x and y, shape (n, 2), [m].
@@ -299,9 +295,8 @@ def estimate_camera(
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
     try:
         seen = [image.astype(np.float32) for image in uv]
-        _, K, lens, _, _, sigmas, _, _ = cv2.calibrateCameraExtended(places, seen, size, None, None, criteria=criteria)
-        camera = Camera(*map(float, [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]))
-        return camera, dict(zip(INTRINSICS, sigmas.ravel().tolist(), strict=False))
+        _, K, lens, _, _ = cv2.calibrateCamera(places, seen, size, None, None, criteria=criteria)
+        return Camera(*map(float, [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.ravel()[:5]]))
     except (cv2.error, InputError):
         hint = "boards tilted by 30 degrees or so in several ways"
         raise InputError("images", "no camera that they determine", hint) from None
@@ -441,25 +436,44 @@ def fit_board(
     Raises:
         InputError: There are too few images for a camera, or none that a pose explains.
     """
-    points, camera_sigma = {one.name: board.corners[one.corners] for one in found}, None
+    given, points = camera is not None, {one.name: board.corners[one.corners] for one in found}
     if camera is None:
-        camera, camera_sigma = estimate_camera(list(points.values()), [one.uv for one in found], size)
+        camera = estimate_camera(list(points.values()), [one.uv for one in found], size)
     fits = {one.name: fit for one in found if (fit := _fit(camera, points[one.name], one.uv)) is not None}
     if not fits:
         raise InputError("images", "corners that no pose of the board explains", "images of this board by this camera")
-    taken = 6.0 + (0.0 if camera_sigma is None else len(INTRINSICS) / len(fits))
+    taken = 6.0 + (0.0 if given else len(INTRINSICS) / len(fits))
     squares, n = (sum(of) for of in zip(*((fit.squares, len(fit.J)) for fit in fits.values()), strict=True))
     variance = squares / (n - taken * len(fits))
     return BoardFit(
         board=board,
         size=size,
         camera=camera,
-        camera_sigma=camera_sigma,
+        camera_sigma=None if given else _camera_sigmas(camera, points, fits, variance),
         views=tuple(_view(one, fits[one.name], variance, taken) for one in found if one.name in fits),
         without_pose=tuple(one.name for one in found if one.name not in fits),
         rms=float(np.sqrt(squares / n)),
         sigma=float(np.sqrt(variance)),
     )
+
+
+def _camera_sigmas(
+    camera: Camera, points: Mapping[str, Floats], fits: Mapping[str, _Fit], variance: float
+) -> dict[str, float]:
+    """1 sigma of each of the camera's parameters, for corners of a variance and unknown poses.
+
+    Those of `cv2.calibrateCameraExtended` are small where the images hardly determine the camera.
+    """
+    rest = []
+    for name, (pose, _, J, _) in fits.items():
+        in_camera = pose[1] + points[name] @ pose[0][:, :2].T
+        K = load_opencv().projectPoints(in_camera, np.zeros(3), np.zeros(3), *_matrices(camera))[1][:, 6:15]
+        rest.append(K - J @ np.linalg.lstsq(J, K, rcond=None)[0])
+    A = np.vstack(rest)
+    size = np.linalg.norm(A, axis=0)
+    _, s, Vt = np.linalg.svd(A / size, full_matrices=False)
+    sigmas = np.sqrt(variance) * np.linalg.norm(Vt.T / np.maximum(s, 1e-12), axis=1) / size
+    return dict(zip(INTRINSICS, sigmas.tolist(), strict=True))
 
 
 def _view(one: Corners, fit: _Fit, of_all: float, taken: float) -> View:
