@@ -385,7 +385,7 @@ def _series(values: Any) -> Any:
 
     if not isinstance(values, list):
         return values
-    missing = [type(value).__name__ == "NAType" or value != value for value in values]  # noqa: PLR0124
+    missing = [v is None or type(v).__name__ == "NAType" or v != v for v in values]  # noqa: PLR0124
     found = pl.Series([None if none else value for none, value in zip(missing, values, strict=True)], strict=False)
     if found.null_count() > sum(missing):
         raise ValueError("cells of types that do not go together")
