@@ -8,21 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.inputs import (
-    InputError,
-    as_array,
-    as_floats,
-    as_frame,
-    as_mask,
-    as_names,
-    as_rotations,
-    as_sigmas,
-    check_names,
-    checked,
-    require,
-    shape_of,
-    shown,
-)
+from fg_calib import inputs
+from fg_calib.inputs import InputError, checked, shown
 from fg_calib.io.tables import OF_CONFIGURATIONS, OF_PAIRS, ROUNDED, Table, measurements_of
 from fg_calib.io.yaml import Units
 from fg_calib.measurements import Column, Measurements, Noise
@@ -89,11 +76,11 @@ def read_arrays(
     Raises:
         InputError: An array cannot be used; the message names it and its row.
     """
-    q = as_floats("readings", readings, "(n, n_joints)")
+    q = inputs.as_floats("readings", readings, "(n, n_joints)")
     if not q.size:
         raise InputError("readings", f"shape {q.shape}", "(n, n_joints) with at least one row and joint")
     given = {name: values for name, values in arrays.items() if values is not None}
-    check_names("Measurements.from_arrays", given, NAMES, "argument")
+    inputs.check_names("Measurements.from_arrays", given, NAMES, "argument")
     rotation = given.pop("rotation", None)
     if rotation is not None and (other := given.keys() & {"quaternion", "roll_pitch_yaw"}):
         raise InputError(f"rotation and {min(other)}", "both were given", "one of the two")
@@ -101,7 +88,9 @@ def read_arrays(
     table = _table_of(source, each, len(q), **{f"q{i + 1}": joint for i, joint in enumerate(q.T)})
     between = None if pairs is None else _pairs_of(pairs)
     found = measurements_of(table, q, between, Units(), Noise(joint=sigma_joint))
-    return found if rotation is None else found.with_values({"rotation": as_rotations("rotation", rotation, len(q))})
+    if rotation is None:
+        return found
+    return found.with_values({"rotation": inputs.as_rotations("rotation", rotation, len(q))})
 
 
 def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any]:
@@ -112,22 +101,22 @@ def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any
     """
     first, shape = column.names[0], (n,) if len(column.names) == 1 else (n, len(column.names))
     if first == "cov_11":
-        C = as_floats(place, given, f"({n}, 6, 6)")
+        C = inputs.as_floats(place, given, f"({n}, 6, 6)")
         off = np.abs(C - np.swapaxes(C, 1, 2)).max(axis=(1, 2))
-        require(off <= ROUNDED * np.abs(C).max(axis=(1, 2)), place, C, "symmetric matrices")
+        inputs.require(off <= ROUNDED * np.abs(C).max(axis=(1, 2)), place, C, "symmetric matrices")
         values: Any = C[:, *np.triu_indices(6)]
     elif first == "split":
-        values = np.where(as_mask(place, given, n), "test", "train")
+        values = np.where(inputs.as_mask(place, given, n), "test", "train")
     elif first.startswith("sigma_"):
-        values = np.broadcast_to(as_sigmas(place, given, shape), shape)
+        values = np.broadcast_to(inputs.as_sigmas(place, given, shape), shape)
     elif column.unit or column.generic or len(shape) == 2:
         expected = f"({', '.join(map(str, shape))})"
-        values = as_floats(place, given, expected, missing=column.generic or first in ("distance", "angle"))
-    elif (found := shape_of(place, given, "names")) != shape:
+        values = inputs.as_floats(place, given, expected, missing=column.generic or first in ("distance", "angle"))
+    elif (found := inputs.shape_of(place, given, "names")) != shape:
         raise InputError(place, f"shape {found}", f"({n},), one a row")
     else:  # whole numbers, of a million pairs, stay as they are
         whole = isinstance(given, np.ndarray) and given.dtype.kind in "iu"
-        return {first: given if whole else as_names(place, given, missing=True)}
+        return {first: given if whole else inputs.as_names(place, given, missing=True)}
     return dict(zip(column.names, values.reshape(n, -1).T, strict=True))
 
 
@@ -137,15 +126,15 @@ def _pairs_of(given: Any) -> Table:
     Raises:
         InputError: An array is no column of one, has another number of rows than the longest, or holds something else.
     """
-    frame = given if isinstance(given, Mapping) else as_frame("pairs", given)
+    frame = given if isinstance(given, Mapping) else inputs.as_frame("pairs", given)
     if frame is None:
         expected = "a mapping of arrays by the names a, b, distance, angle, or a frame"
         raise InputError("pairs", f"found {shown(given)}", expected)
     arrays = {key: frame[key] for key in (frame if isinstance(frame, Mapping) else frame.columns)}
     known = {"test" if name == "split" else name: of for name, of in OF_PAIRS.items()}
     known |= {key: Column((key,), "", "") for key in ("a", "b")}
-    check_names("pairs", arrays, list(known), "key")
-    arrays |= {key: as_array(f"pairs: {key}", arrays[key], "iuUO", "ids") for key in ("a", "b") if key in arrays}
+    inputs.check_names("pairs", arrays, list(known), "key")
+    arrays |= {key: inputs.as_array(f"pairs: {key}", arrays[key], "iuUO", "ids") for key in ("a", "b") if key in arrays}
     n = max((np.size(values) for values in arrays.values()), default=0)
     return _table_of("pairs", {f"pairs: {key}": (known[key], values) for key, values in arrays.items()}, n)
 

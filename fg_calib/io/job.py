@@ -10,37 +10,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, StrictBool, create_model
 
+from fg_calib import inputs
 from fg_calib.initialization import Camera
-from fg_calib.inputs import (
-    LIMITED,
-    FrameKnowledge,
-    InputError,
-    Limits,
-    Model,
-    Options,
-    Pairing,
-    check_names,
-    checked,
-    did_you_mean,
-)
+from fg_calib.inputs import LIMITED, FrameKnowledge, InputError, Limits, Model, Options, Pairing, checked
+from fg_calib.io import yaml
 from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.robot_file import read_robot, robot_from_mapping
 from fg_calib.io.tables import Column, read_measurements
-from fg_calib.io.yaml import (
-    Count,
-    FilePath,
-    NotNegative,
-    Number,
-    Positive,
-    Schema,
-    Units,
-    UnitsOfFile,
-    quantity,
-    read_yaml,
-    shown,
-    validate,
-    within,
-)
+from fg_calib.io.yaml import Count, FilePath, NotNegative, Number, Positive, Schema, Units, UnitsOfFile
 from fg_calib.job import Job
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, KnownPoint, Noise, Table
 from fg_calib.robot import Robot, names_of
@@ -122,7 +99,7 @@ class _JobKeys(_TableKeys):
             InputError: One is not possible.
         """
         choices = {key: getattr(self, key) for key in (*_CHOICES, "frame") if key in self.model_fields_set}
-        check_names("prefer", choices.get("prefer", ()), names_of(robot.parameters))
+        inputs.check_names("prefer", choices.get("prefer", ()), names_of(robot.parameters))
         return Options.of(
             **choices,
             model=model,
@@ -151,18 +128,18 @@ def read_job(path: Path | str) -> Job:
     with noting_reads() as files:
         job = _read_job(path)
     folder = path.parent
-    inputs = {str(f.relative_to(folder) if f.is_relative_to(folder) else f): digest for f, digest in files.items()}
-    return replace(job, inputs=inputs)
+    read = {str(f.relative_to(folder) if f.is_relative_to(folder) else f): digest for f, digest in files.items()}
+    return replace(job, inputs=read)
 
 
 def _read_job(path: Path) -> Job:
-    folder, given = path.parent, read_yaml(path)
-    file = validate(_Job, given, path.name)
+    folder, given = path.parent, yaml.read_yaml(path)
+    file = yaml.validate(_Job, given, path.name)
     robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     document = _with_cameras({key: value for key, value in given.items() if key not in _OF_THE_ROBOT}, folder)
     tables = [_table(entry, place, file, robot, folder) for place, entry in _entries(document, file, path.name)]
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    with within(path.name):
+    with yaml.within(path.name):
         options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)
     alone = tables[0].measurements if isinstance(file.measurements, str) and tables[0].is_plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
@@ -176,7 +153,7 @@ def is_job(path: Path | str) -> bool:
         path: The file; one that does not exist is none.
     """
     path = Path(path)
-    return exists(path) and not is_folder(path) and "measurements" in read_yaml(path)
+    return exists(path) and not is_folder(path) and "measurements" in yaml.read_yaml(path)
 
 
 def units_of(job: Job) -> Units:
@@ -213,13 +190,14 @@ def read_table_like(
         InputError: A file is missing or cannot be used, or it is not clear which table it is like.
     """
     place = "result.json: carried: job"
-    file = validate(_Job, {"robot": ".", "measurements": None, **document}, place)
+    file = yaml.validate(_Job, {"robot": ".", "measurements": None, **document}, place)
     entries = _entries(document, file, place)
     names = [Path(entry.table).name for _, entry in entries]
     wanted = like or path.name
     if wanted not in names and (like is not None or len(entries) > 1):
-        hint = "see --like" if like is None else did_you_mean(like, names)
-        raise InputError("like" if like else path.name, f"found {shown(wanted)}", f"one of {', '.join(names)}", hint)
+        hint = "see --like" if like is None else inputs.did_you_mean(like, names)
+        found, known = f"found {yaml.shown(wanted)}", f"one of {', '.join(names)}"
+        raise InputError("like" if like else path.name, found, known, hint)
     where, entry = entries[names.index(wanted) if wanted in names else 0]
     if (pairs is None) != (entry.pairs is None):
         found = "no table of pairs" if pairs is None else f"a table of pairs, {pairs.name}"
@@ -241,13 +219,13 @@ def _entries(given: Mapping[str, Any], file: _JobKeys, place: str) -> list[tuple
     """
     listed, entries = given.get("measurements"), list[tuple[str, _Entry]]()
     if not listed or not isinstance(listed, str | list):
-        raise InputError(f"{place}: measurements", f"found {shown(listed)}", "a path, or a list of tables")
+        raise InputError(f"{place}: measurements", f"found {yaml.shown(listed)}", "a path, or a list of tables")
     if isinstance(listed, list) and file.pairs is not None:
         raise InputError(f"{place}: pairs", "next to a list of tables", "the key in the table's own entry")
     defaults = {key: given[key] for key in _TableKeys.model_fields if key in given and key != "noise"}
     for number, one in enumerate([{"table": listed}] if isinstance(listed, str) else listed, start=1):
         where = place if isinstance(listed, str) else f"{place}: measurement {number}"
-        entries.append((where, validate(_Entry, defaults | one if isinstance(one, dict) else one, where)))
+        entries.append((where, yaml.validate(_Entry, defaults | one if isinstance(one, dict) else one, where)))
     return entries
 
 
@@ -318,7 +296,7 @@ def whole_camera(given: Any, folder: Path) -> Any:
         return given
     path = folder / given["file"]
     read_camera(path)
-    return {**read_yaml(path), **{key: value for key, value in given.items() if key != "file"}}
+    return {**yaml.read_yaml(path), **{key: value for key, value in given.items() if key != "file"}}
 
 
 def camera_in(given: Any, place: str, folder: Path) -> tuple[Camera | None, bool]:
@@ -342,9 +320,9 @@ def _limits(given: object, units: Units) -> Limits:
     """The errors that the user accepts, in [m] and [rad]."""
     given = {} if given is None else given
     if not isinstance(given, dict):
-        raise InputError("accept", f"found {shown(given)}", "limits by name")
-    check_names("accept", given, list(LIMITED), "limit")
-    return Limits(**{key: quantity(one, LIMITED[key], units, f"accept: {key}") for key, one in given.items()})
+        raise InputError("accept", f"found {yaml.shown(given)}", "limits by name")
+    inputs.check_names("accept", given, list(LIMITED), "limit")
+    return Limits(**{key: yaml.quantity(one, LIMITED[key], units, f"accept: {key}") for key, one in given.items()})
 
 
 def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
@@ -358,10 +336,10 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     Raises:
         InputError: A job with these keys could not be read.
     """
-    file = validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
+    file = yaml.validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
     if file.model is None:
         raise InputError(place, "missing key 'model'")
-    with within(place):
+    with yaml.within(place):
         file.options(robot, file.model)
 
 
@@ -381,7 +359,7 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
     if isinstance(given, dict):
         return robot_from_mapping({"units": units} | given if "urdf" in given else given, place, folder)
     if not isinstance(given, str) or not given:
-        raise InputError(place, f"found {shown(given)}", "a path, or the mapping of a robot file")
+        raise InputError(place, f"found {yaml.shown(given)}", "a path, or the mapping of a robot file")
     return read_robot(folder / given)
 
 
@@ -411,7 +389,7 @@ def pairing_of(given: Any, place: str = "pairing") -> Pairing:
 def _noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[Noise, bool]:
     """The noise in [m] and [rad], that of the readings joint by joint, and whether it is only where to start."""
     given = {"estimate": True} if given == "estimate" else {} if given is None else given
-    file: Any = validate(_Noise, given, place)
+    file: Any = yaml.validate(_Noise, given, place)
     specified = {key: sigma for key in NOISE_UNITS if (sigma := getattr(file, key)) is not None}
     sigmas = {key: units.sigma(one, NOISE_UNITS[key], f"{place}: {key}") for key, one in specified.items()}
     start = {f.name: getattr(UNSPECIFIED, f.name) for f in fields(Noise)[:-1]} if file.estimate else {}
@@ -425,7 +403,7 @@ def joint_noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[flo
         InputError: The entry is neither one number nor one a joint.
     """
     listed, n = isinstance(given, list), robot.n_joints
-    sigmas = validate(_JointNoises, {"joint": given if listed else [given]}, place).joint * (1 if listed else n)
+    sigmas = yaml.validate(_JointNoises, {"joint": given if listed else [given]}, place).joint * (1 if listed else n)
     if len(sigmas) != n:
         raise InputError(f"{place}: joint", f"{len(sigmas)} values", f"one for all or {n}, one a joint")
     return tuple(units.sigma(s, j.unit, f"{place}: joint") for s, j in zip(sigmas, robot.joints, strict=True))
@@ -454,7 +432,7 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
     Raises:
         InputError: The file is missing or cannot be used, or says that it is of images of another size.
     """
-    given = read_yaml(path)
+    given = yaml.read_yaml(path)
     for key, found in zip(("width", "height"), size or (), strict=False):
         if given.get(key) not in (None, found):
             hint = "the intrinsics of other images would have to be scaled"
@@ -463,7 +441,7 @@ def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
 
 
 def _camera(given: Any, place: str) -> Camera:
-    file = validate(_Camera, given, place)
+    file = yaml.validate(_Camera, given, place)
     try:
         return Camera(**{key: getattr(file, key) for key in _INTRINSICS})
     except InputError as error:

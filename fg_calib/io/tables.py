@@ -20,40 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib.inputs import (
-    LEAST_SIZE,
-    MOST_SIZE,
-    NORM_TOLERANCE,
-    NOTHING,
-    ORDINARY,
-    Booleans,
-    Floats,
-    FrozenArrays,
-    InputError,
-    Integers,
-    Model,
-    as_frame,
-    check_different,
-    check_names,
-    check_number,
-    checked,
-    did_you_mean,
-    once,
-)
+from fg_calib import inputs, measurements
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, checked
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import Number, Schema, Units, number_hint, shown
-from fg_calib.measurements import (
-    ANGLE_SLACK,
-    GENERIC_COLUMNS,
-    INSTRUMENTS,
-    Groups,
-    Labels,
-    Measurements,
-    Noise,
-    Pairs,
-    check_limits,
-    no_pairs,
-)
+from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
 from fg_calib.measurements import Column as ColumnSet
 from fg_calib.parallel import require_polars
 from fg_calib.robot import Robot
@@ -162,7 +133,7 @@ class Table:
         try:
             found = _read_file(Path(table)) if is_file else cls(name, (), _as_polars(table, name))
             header = [column.strip() for column in found.columns or found.frame.columns]
-            check_different(name, header)
+            inputs.check_different(name, header)
             names = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
             found.frame.columns = names
         except (InputError, MemoryError):
@@ -222,7 +193,7 @@ class Table:
             values[:, k] = cells.to_numpy()
             if (own := self.renamed.get(column)) is not None:
                 values[:, k] = (values[:, k] - own.zero) * own.scale
-            self.require(~(np.abs(values[:, k]) > MOST_SIZE), column, ORDINARY)
+            self.require(~(np.abs(values[:, k]) > inputs.MOST_SIZE), column, inputs.ORDINARY)
         return values
 
     def positive(self, columns: Sequence[str], default: float | None, factor: float) -> Floats:
@@ -230,7 +201,7 @@ class Table:
         values = self.numbers(columns, optional=default is not None)
         for column, value in zip(columns, values.T, strict=True):
             self.require(~(value <= 0.0), column, "a number above 0")
-            self.require(~(value < LEAST_SIZE), column, ORDINARY)
+            self.require(~(value < inputs.LEAST_SIZE), column, inputs.ORDINARY)
         return values * factor if default is None else np.where(np.isnan(values), default, values * factor)
 
     def texts(self, column: str, expected: str = "") -> pl.Series:
@@ -243,7 +214,7 @@ class Table:
         cells: pl.Series = self.frame[column]
         if cells.dtype.is_nested() or cells.dtype == pl.Object:
             raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "text")
-        if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= MOST_SIZE)).all()):
+        if cells.dtype.is_float() and bool(((cells % 1 == 0) & (cells.abs() <= inputs.MOST_SIZE)).all()):
             cells = cells.cast(pl.Int64)
         texts = cells.cast(pl.String).str.strip_chars()
         texts = texts.set(texts == "", None)
@@ -254,7 +225,7 @@ class Table:
     def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
         """The column as texts, without a word such as NA that stands for nothing; null where a cell may be empty."""
         names = self.texts(column, "" if optional else expected)
-        self.require(~names.str.to_lowercase().is_in(NOTHING).fill_null(False).to_numpy(), column, expected)
+        self.require(~names.str.to_lowercase().is_in(inputs.NOTHING).fill_null(False).to_numpy(), column, expected)
         return names
 
     def test_rows(self) -> Booleans:
@@ -337,10 +308,10 @@ def _understood(
         InputError: A key of `columns` is not known, or the table has no such column.
     """
     place = f"{table}: columns"
-    check_names(place, columns, sorted(known | joints), "column")
+    inputs.check_names(place, columns, sorted(known | joints), "column")
     for name, column in columns.items():
-        check_names(f"{place}: {name}", [column.name.strip()], header, "column")
-    check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
+        inputs.check_names(f"{place}: {name}", [column.name.strip()], header, "column")
+    inputs.check_different(f"{place}: the table's", [column.name.strip() for column in columns.values()])
     own = {column.name.strip(): name for name, column in columns.items()}
     names = [own.get(name) or f"{name} (the table's)" * (name in columns) or name for name in header]
     for i, name in enumerate(names):
@@ -352,7 +323,7 @@ def _understood(
         elif lower.startswith("sigma"):
             sigmas = ", ".join(sorted(column for column in known if column.startswith("sigma_")))
             _log.warning("%s: column %r is not used; sigmas are %s", table, name, sigmas)
-        elif hint := f"{lower} is" if lower in known else did_you_mean(name, known.difference(names), 0.85):
+        elif hint := f"{lower} is" if lower in known else inputs.did_you_mean(name, known.difference(names), 0.85):
             _log.warning("%s: column %r is not used; %s", table, name, hint)
     return names
 
@@ -366,13 +337,13 @@ def _as_polars(table: Any, name: str) -> pl.DataFrame:
     import polars as pl
     import polars.selectors as cs
 
-    frame = table if isinstance(table, Mapping) else as_frame(name, table)
+    frame = table if isinstance(table, Mapping) else inputs.as_frame(name, table)
     if frame is None or not (isinstance(frame, Mapping | pl.DataFrame) or hasattr(frame, "to_dict")):
         raise InputError(name, f"found a {type(table).__name__}", "a path, or a frame of polars or pandas")
     if not isinstance(frame, pl.DataFrame):
         named = getattr(getattr(frame, "index", None), "name", None) is not None
         columns = frame if isinstance(frame, Mapping) else (frame.reset_index() if named else frame).to_dict("list")
-        check_different(name, columns)
+        inputs.check_different(name, columns)
         frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
     if not frame.columns:
         raise InputError(name, "a frame without columns", "a frame with rows")
@@ -450,7 +421,7 @@ def read_measurements(
     units, noise = units or Units(), noise or Noise()
     for kind, sigma in vars(noise).items():
         if kind not in ("joint", "more") and sigma is not None:  # nothing but joint readings is measured exactly
-            check_number(f"noise: {kind}", sigma, above=True)
+            inputs.check_number(f"noise: {kind}", sigma, above=True)
     table = read_table(path, robot, columns or {})
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
@@ -480,7 +451,7 @@ def measurements_of(
     measured = _measured(table, [c.names[0] for i in instruments for c in i.columns], units, noise)
     repeated = bool(set(labels) - {"station"}) or "image" in measured
     ids, test, between = read_ids(table, repeated=repeated and pairs is None), table.test_rows(), None
-    groups, of_groups = Labels((), np.full(table.n_rows, -1)), no_pairs(table.name)
+    groups, of_groups = Labels((), np.full(table.n_rows, -1)), measurements.no_pairs(table.name)
     if "group" in table.columns:
         groups = _labels(table, "group", optional=True)
     if pairs is not None:
@@ -550,7 +521,7 @@ def read_readings(table: Table, columns: Sequence[str], robot: Robot, units: Uni
     """Joint readings within the joints' limits, shape (n_rows, n_joints), [rad] or [m]."""
     readings = table.numbers(columns) * [units.factor(joint.unit) for joint in robot.joints]
     shown_in = {unit: (units.name(unit), units.factor(unit)) for unit in ("rad", "m")}
-    check_limits(readings, robot, columns, table.place, shown_in)
+    measurements.check_limits(readings, robot, columns, table.place, shown_in)
     return readings
 
 
@@ -694,10 +665,10 @@ def _rotation(table: Table, first: str, values: Floats) -> dict[str, Floats]:
     if first == "rx":
         return {"rotation": Rotation.from_rotvec(values).as_matrix()}
     norm = np.linalg.norm(values, axis=1)
-    wrong = np.abs(norm - 1.0) > NORM_TOLERANCE
+    wrong = np.abs(norm - 1.0) > inputs.NORM_TOLERANCE
     if wrong.any():
         row = int(np.argmax(wrong))
-        raise InputError(table.place(row), f"quaternion of norm {norm[row]:.6g}", f"1 within {NORM_TOLERANCE:g}")
+        raise InputError(table.place(row), f"quaternion of norm {norm[row]:.6g}", f"1 within {inputs.NORM_TOLERANCE:g}")
     return {"rotation": Rotation.from_quat(values).as_matrix()}
 
 
@@ -711,7 +682,7 @@ def _covariances(table: Table, values: Floats, units: Units) -> Floats:
     i, j = np.triu_indices(6)
     C[:, i, j] = C[:, j, i] = values
     C *= np.outer(size, size)
-    size = np.sqrt(np.maximum(np.einsum("nii->ni", C), LEAST_SIZE**2))
+    size = np.sqrt(np.maximum(np.einsum("nii->ni", C), inputs.LEAST_SIZE**2))
     scaled = C / (size[:, :, None] * size[:, None, :])
     table.require(np.linalg.eigvalsh(scaled)[:, 0] > ROUNDED, "cov_11", "a covariance: eigenvalues above 0")
     return C
@@ -766,15 +737,17 @@ def _read_pairs(
             values = table.numbers([key], optional=True)[:, 0] * factor
         if f"sigma_{key}" in table.columns:
             sigma = table.positive([f"sigma_{key}"], default, factor)[:, 0]
-        table.require(~((values < 0.0) | (values > most + ANGLE_SLACK)), key, expected)
-        fields |= {key: np.minimum(values, most), f"sigma_{key}": once(sigma)}
+        table.require(~((values < 0.0) | (values > most + measurements.ANGLE_SLACK)), key, expected)
+        fields |= {key: np.minimum(values, most), f"sigma_{key}": inputs.once(sigma)}
     table.require(~of_groups | np.isnan(fields["angle"]), "angle", "none: two points have a distance, but no angle")
     table.require(~of_groups | (fields["distance"] > 0.0), "distance", "a number above 0 between two groups")
     test = table.test_rows()
     for flags, chosen in ((rows, ~of_groups), (groups.only_of(rows), of_groups)):
         test[chosen] |= flags[a[chosen]] | flags[b[chosen]]
-    pairs = Pairs(a, b, test=once(test), source=table.name, **fields)
-    return (pairs, no_pairs(table.name)) if not of_groups.any() else (pairs.select(~of_groups), pairs.select(of_groups))
+    pairs = Pairs(a, b, test=inputs.once(test), source=table.name, **fields)
+    if not of_groups.any():
+        return pairs, measurements.no_pairs(table.name)
+    return pairs.select(~of_groups), pairs.select(of_groups)
 
 
 def _ends(table: Table, ids: NDArray[np.str_], groups: Sequence[str]) -> tuple[Integers, Integers, Booleans]:

@@ -15,15 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from fg_calib import inputs
-from fg_calib.inputs import (
-    LEAST_SIZE,
-    MOST_SIZE,
-    AngleUnit,
-    InputError,
-    LengthUnit,
-    check_fields,
-    did_you_mean,
-)
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, AngleUnit, InputError, LengthUnit, check_fields, did_you_mean
 from fg_calib.io.atomic import read_text
 from fg_calib.robot import SCALES
 
