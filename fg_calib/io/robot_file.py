@@ -28,36 +28,10 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
-from fg_calib.io.yaml import (
-    Bound,
-    FilePath,
-    Loader,
-    Number,
-    Positive,
-    Schema,
-    Units,
-    UnitsOfFile,
-    read_yaml,
-    shown,
-    validate,
-)
-from fg_calib.robot import (
-    CONVENTIONS,
-    FRAME_KINDS,
-    IN_RAD,
-    MOST_ANGLE,
-    Joint,
-    Parameter,
-    Robot,
-    RobotBuilder,
-    UrdfSource,
-    frame_values,
-    names_of,
-    tolerance_kind,
-    unit_of,
-)
+from fg_calib.io.yaml import Bound, FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
+from fg_calib.robot import Joint, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
@@ -126,7 +100,7 @@ def read_urdf(
     path = Path(path)
     text, root = _parse(read_bytes(path), path.name)
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
-    builder.add_frame("base", frame_values("base", base), 0, False)
+    builder.add_frame("base", model.frame_values("base", base), 0, False)
     try:
         links = [link.get("name", "") for link in root.findall("link")]
         tree = _Tree(_read_joints(root, path.name), links, path.name)
@@ -138,7 +112,7 @@ def read_urdf(
     except InputError as error:  # elements of xacro may hold what is missing
         hint = _XACRO if any("xacro" in str(element.tag) for element in root.iter()) else error.hint
         raise InputError(error.place, error.found, error.expected, hint) from None
-    builder.add_frame("tool", frame_values("tool", tool), n_joints + 1, False)
+    builder.add_frame("tool", model.frame_values("tool", tool), n_joints + 1, False)
     return builder.build(
         fixed=fixed,
         estimate=estimate,
@@ -191,7 +165,7 @@ def write_urdf(path: Path | str, robot: Robot) -> None:
 def joint_origins(robot: Robot) -> dict[str, dict[str, float]]:
     """Nominal origins of the joints of a robot from a URDF, by joint and kind, [m] and [rad]."""
     values = {p.name: p.nominal for p in robot.parameters}
-    return {j.name: {kind: values[f"{j.name}.{kind}"] for kind in FRAME_KINDS} for j in robot.joints}
+    return {j.name: {kind: values[f"{j.name}.{kind}"] for kind in model.FRAME_KINDS} for j in robot.joints}
 
 
 def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
@@ -272,8 +246,8 @@ def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
 
 def _origin(joint: Element, place: str) -> dict[str, float]:
     xyz, rpy = (_numbers(joint, "origin", name, "0 0 0", place) for name in _ORIGIN)
-    if max(map(abs, rpy)) > MOST_ANGLE:
-        raise InputError(f"{place}: origin rpy", f"found {rpy}", IN_RAD, "are they in deg?")
+    if max(map(abs, rpy)) > model.MOST_ANGLE:
+        raise InputError(f"{place}: origin rpy", f"found {rpy}", model.IN_RAD, "are they in deg?")
     return dict(zip((*_ORIGIN["xyz"], *_ORIGIN["rpy"]), (*xyz, *rpy), strict=True))
 
 
@@ -401,7 +375,7 @@ class FrameValues(Schema):
         Raises:
             InputError: An angle in rad is one in deg.
         """
-        return {kind: _si(kind, getattr(self, kind), units, place) for kind in FRAME_KINDS}
+        return {kind: _si(kind, getattr(self, kind), units, place) for kind in model.FRAME_KINDS}
 
 
 def _si(kind: str, value: float, units: Units, place: str) -> float:
@@ -410,9 +384,9 @@ def _si(kind: str, value: float, units: Units, place: str) -> float:
     Raises:
         InputError: An angle in rad is one in deg.
     """
-    unit = unit_of(kind)
-    if units.name(unit) == "rad" and abs(value) > MOST_ANGLE:
-        raise InputError(f"{place}: {kind}", f"found {value:g}", IN_RAD, "units: {angle: deg} are deg")
+    unit = model.unit_of(kind)
+    if units.name(unit) == "rad" and abs(value) > model.MOST_ANGLE:
+        raise InputError(f"{place}: {kind}", f"found {value:g}", model.IN_RAD, "units: {angle: deg} are deg")
     return value * units.factor(unit)
 
 
@@ -444,7 +418,7 @@ class _Robot(Schema):
             InputError: A tolerance is too small.
         """
         sigma, where = self.units.sigma, f"{place}: tolerance"
-        tolerance = {key: sigma(value, unit_of(key), f"{where}: {key}") for key, value in self.tolerance.items()}
+        tolerance = {key: sigma(value, model.unit_of(key), f"{where}: {key}") for key, value in self.tolerance.items()}
         return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
 
 
@@ -525,7 +499,7 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
     builder.add_frame("base", file.base.si(file.units, f"{place}: base"), 0, False)
     names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
     for i, (row, name) in enumerate(zip(file.joints, names, strict=True)):
-        here, kinds = f"{place}: joint {i + 1}", CONVENTIONS[file.convention]
+        here, kinds = f"{place}: joint {i + 1}", model.CONVENTIONS[file.convention]
         if name in names[:i]:
             raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
         if row.beta and "beta" not in kinds:
@@ -621,7 +595,7 @@ def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
 
 def _tolerances(robot: Robot, units: Units) -> dict[str, float]:
     """Tolerances by kind where all parameters of the kind share one, by name of the others."""
-    kinds, tolerances = [tolerance_kind(p) for p in robot.parameters], {}
+    kinds, tolerances = [model.tolerance_kind(p) for p in robot.parameters], {}
     for p, kind in zip(robot.parameters, kinds, strict=True):
         if p.tolerance is not None:
             alike = {other.tolerance for other, its in zip(robot.parameters, kinds, strict=True) if its == kind}
