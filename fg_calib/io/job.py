@@ -137,7 +137,13 @@ def _read_job(path: Path) -> Job:
     file = yaml.validate(_Job, given, path.name)
     robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     document = _with_cameras({key: value for key, value in given.items() if key not in _OF_THE_ROBOT}, folder)
-    tables = [_table(entry, place, file, robot, folder) for place, entry in _entries(document, file, path.name)]
+    entries = _entries(document, file, path.name)
+    models = {entry.model: INSTRUMENTS[entry.model] for _, entry in entries}
+    used = {name for instrument in models.values() for name in (*instrument.options, instrument.key)}
+    for key in ("offset", "camera", "targets", "anchors"):
+        if key not in used and (key in given or getattr(file.tolerance, key, None) is not None):
+            raise InputError(f"{path.name}: {key}", f"of no use to model {' and '.join(models)}", "no such key")
+    tables = [_table(entry, place, file, robot, folder) for place, entry in entries]
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     with yaml.within(path.name):
         options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)

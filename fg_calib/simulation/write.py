@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,18 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, checked
-from fg_calib.io import NOISE_UNITS, Units, fill_folder, write_csv, write_robot, write_text, write_urdf
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError, checked
+from fg_calib.io import (
+    NOISE_UNITS,
+    Units,
+    exists,
+    fill_folder,
+    read_text,
+    write_csv,
+    write_robot,
+    write_text,
+    write_urdf,
+)
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Measurements, Pairs, Table
 from fg_calib.robot import Robot, yaw_pitch_roll
 from fg_calib.simulation.scenario import Placement, Plane, Spot, frame_knowledge
@@ -63,14 +74,25 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
             write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf)
         for name, columns in tables.items():
             write_csv(into / name, columns)
-        for name, text in texts.items():
+        words, _, rest = texts["calibration.yaml"].partition("\n")
+        for name, text in {**texts, "calibration.yaml": f"{words}; {_digest(into, rest)}\n{rest}"}.items():
             write_text(into / name, text)
 
+    job = folder / "calibration.yaml"
+    words, _, rest = read_text(job).partition("\n") if exists(job) else ("", "", "")
+    if words.startswith(_FIRST_WORDS) and not words.endswith(_digest(folder, rest)):
+        raise InputError(str(folder), "tables, or a job, that were changed since they were simulated", "another folder")
     urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
     names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
-    job = {"calibration.yaml": _FIRST_WORDS.encode()}
-    fill_folder(folder, write, job | dict.fromkeys(names, b"") | job)
+    own = {"calibration.yaml": _FIRST_WORDS.encode()}
+    fill_folder(folder, write, own | dict.fromkeys(names, b"") | own)
     return tuple(names)
+
+
+def _digest(folder: Path, job: str) -> str:
+    """A digest of the tables in a folder, and of the rest of their job."""
+    tables = b"".join(path.read_bytes() for path in sorted(folder.glob("*.csv")))
+    return sha256(tables + job.encode()).hexdigest()[:16]
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

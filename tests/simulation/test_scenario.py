@@ -213,6 +213,10 @@ def test_another_simulation_is_replaced_and_another_job_is_not(folder):
     simulation = simulate(read(folder, REST))
     names = write_simulation(folder / "job", simulation)
     assert write_simulation(folder / "job", simulation) == names
+    table = next(folder / "job" / name for name in names if name.endswith(".csv"))
+    table.write_text(table.read_text() + "filled in")
+    with pytest.raises(InputError, match="changed since they were simulated"):
+        write_simulation(folder / "job", simulation)
     (folder / "job" / "calibration.yaml").write_text("robot: mine.yaml\n")
     with pytest.raises(InputError, match="is there already"):
         write_simulation(folder / "job", simulation)
