@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from hashlib import file_digest, sha256
@@ -121,6 +121,15 @@ class Rms(Section):
     before: float | None
     after: float | None
     unit: str | None = None
+
+
+class Statistics(Section):
+    """Of the lengths of residuals: mean (ISO 9283: accuracy), standard deviation, 95 % quantile and maximum."""
+
+    mean: float
+    std: float
+    p95: float
+    max: float
 
 
 class Covariance(Section):
@@ -256,6 +265,7 @@ class Result(Section):
     noise_kept: tuple[str, ...] = ()
     tolerance_scales: tuple[ToleranceScale, ...] | None = of("solution.estimated_tolerances.scales", None)
     residual_rms: dict[str, dict[str, Rms | None]]
+    residual_statistics: dict[str, dict[str, dict[str, Statistics] | None]] = Field(default_factory=dict)
     parameters: tuple[statistics.ParameterEstimate, ...] = of("assessed.estimates.parameters")
     covariance: Covariance = of("assessed")
     posterior: Posterior | None = of("assessed.whole")
@@ -311,6 +321,7 @@ class Result(Section):
             n_unknowns=len(problem.variables.all_scales),
             goodness={key_of(kind, goodness.kinds): kind for kind in goodness.kinds},
             residual_rms=_residual_rms(assessed.fit.residuals),
+            residual_statistics=_by_kind(assessed.fit.residuals, _statistics),
             frames={v.symbol: frame for v, frame in zip(frames, assessed.estimates.frames, strict=True)},
             links=None if urdf is None else (urdf.base_link, urdf.tip_link),
             versions=versions(),
@@ -410,20 +421,29 @@ def _noise_factors(solution: Solution, fits: tuple[statistics.KindFit, ...]) -> 
 
 
 def _residual_rms(table: statistics.ResidualTable) -> dict[str, dict[str, Rms | None]]:
-    """RMS by split and kind, by table too where several tables have a kind."""
-    rms: dict[str, dict[str, Any]] = table.rms()
-    kinds = {kind: kind for kind in ("position", "orientation", "distance", "angle", *table.families)}
-    for number, kind in table.groups:
-        if [other for _, other in table.groups].count(kind) > 1:
-            kinds[f"{kind}, table {number + 1}"] = kind
-            for split, found in table.rms(number).items():
-                rms[split][f"{kind}, table {number + 1}"] = found.get(kind)
-
-    def of(split: str, key: str) -> Rms | None:
-        found, kind = rms[split].get(key), kinds[key]
+    def of(key: str, found: dict[str, float] | None) -> Rms | None:
+        kind = key.partition(", table ")[0]
         return None if found is None else Rms(**found, unit=None if kind in KINDS else table.unit(kind))
 
-    return {split: {key: of(split, key) for key in kinds} for split in ("train", "test")}
+    each = _by_kind(table, statistics.root_mean_square)
+    return {split: {key: of(key, found) for key, found in kinds.items()} for split, kinds in each.items()}
+
+
+def _by_kind(table: statistics.ResidualTable, figure: Callable[[Floats], Any]) -> dict[str, dict[str, Any]]:
+    """A figure of lengths by split and kind, by table too where several tables have a kind."""
+    found: dict[str, dict[str, Any]] = {**table.by_kind(figure)}
+    keys = [*("position", "orientation", "distance", "angle"), *table.families]
+    for number, kind in table.groups:
+        if [other for _, other in table.groups].count(kind) > 1:
+            keys.append(f"{kind}, table {number + 1}")
+            for split, of_table in table.by_kind(figure, number).items():
+                found[split][keys[-1]] = of_table.get(kind)
+    return {split: {key: found[split].get(key) for key in keys} for split in ("train", "test")}
+
+
+def _statistics(lengths: Floats) -> Statistics:
+    p95, most = np.quantile(lengths, [0.95, 1.0])
+    return Statistics(mean=float(np.mean(lengths)), std=float(np.std(lengths)), p95=p95, max=most)
 
 
 def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:

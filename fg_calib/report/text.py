@@ -113,12 +113,12 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
     joint_noise = ", with joint noise" if np.any(result.sigma_joint > 0.0) else ""
     notes = [*(text for text in result.cautions if result.findings or text not in result.reservations), *result.notes]
     return [
+        *section(RESIDUALS, _residuals(result), _lengths(result)),
         *section("Fit statistics", _statistics(result)),
         *section(f"Goodness of fit (1 sigma of a row{joint_noise})", *_goodness(result, found.robot)),
         *section("Prediction of the test rows", *_prediction(result)),
         *_cross_validation(result),
         *expected_tool_error(result.expected_error),
-        *section(RESIDUALS, _residuals(result)),
         *section(PARAMETERS, parameter_table(result)),
         *section("Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)", _tolerances(result)),
         *section("Combinations that the kept parameters stand for", _combinations(result)),
@@ -279,6 +279,18 @@ def _residuals(result: Result) -> Table:
             if any(both):
                 rows.append((name, result.unit_of(kind), *values))
     headings = ("train before", "after", "test before", "after")
+    return table_of(("", "|unit", *(f"{heading}|q:.4f|-" for heading in headings)), rows)
+
+
+def _lengths(result: Result) -> Table:
+    """Statistics of the lengths of test residuals, else of train ones."""
+    split = "test" if result.rms_after("test") else "train"
+    rows = [
+        (f"{kind} {when}", result.unit_of(kind), one.mean, one.std, one.p95, one.max)
+        for kind, both in result.residual_statistics.get(split, {}).items()
+        for when, one in (both or {}).items()
+    ]
+    headings = (f"{split} rows: mean", "std", "95 %", "max")
     return table_of(("", "|unit", *(f"{heading}|q:.4f|-" for heading in headings)), rows)
 
 

@@ -20,7 +20,7 @@ from .goodness_of_fit import (
 )
 from .outliers import FINE, judge_without_outliers
 from .priors import PriorFit, estimate_tolerances, judge_priors
-from .residual_table import MAX_OUTLIER_SHARE, HeldOut, ResidualTable
+from .residual_table import MAX_OUTLIER_SHARE, HeldOut, ResidualTable, root_mean_square
 from .variance_components import LEAST_REDUNDANCY, estimate_noise, has_joint_noise
 
 __all__ = [
@@ -64,6 +64,7 @@ __all__ = [
     "judge_fit",
     "judge_priors",
     "judge_without_outliers",
+    "root_mean_square",
     "spread_of",
     "upper_probability",
     "with_left_out",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from fg_calib.graph import Solution, noises_at
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
 from fg_calib.measurements import Labels, MeasurementBlock
 
+T = TypeVar("T")
 Codes = NDArray[np.int16]
 Indices = NDArray[np.int32]
 
@@ -213,26 +214,31 @@ class ResidualTable(FrozenArrays):
         return np.asarray(np.sum(of_ends, axis=0), dtype=np.float64)
 
     def rms(self, table: int | None = None) -> dict[str, dict[str, dict[str, float]]]:
-        """RMS by split and kind, before and after: of the length of a measurement's rows of that kind.
+        """RMS by split and kind, before and after: see `by_kind`."""
+        return self.by_kind(root_mean_square, table)
+
+    def by_kind(self, figure: Callable[[Floats], T], table: int | None = None) -> dict[str, dict[str, dict[str, T]]]:
+        """A figure of the lengths of the measurements' rows by split and kind, before and after.
 
         Args:
+            figure: From lengths, shape (m,), in the kind's unit.
             table: Of which table; of all if None.
         """
-        counted, found = self.reason_code == 0, dict[str, dict[str, dict[str, float]]](train={}, test={})
+        counted, found = self.reason_code == 0, dict[str, dict[str, dict[str, T]]](train={}, test={})
         if table is not None:
             counted = counted & (self._coded([kind.table for kind in self.kinds]) == table)
         for code, of_split in enumerate(found.values()):
             for k, name in enumerate(self.families):
                 rows = np.flatnonzero(counted & (self.split == code) & (self.family == k))
                 if len(rows):
-                    of_split[name] = dict(zip(("before", "after"), self._rms_of(rows)[1:3], strict=True))
+                    both = {"before": self.before, "after": self.after}
+                    of_split[name] = {when: figure(self._lengths(rows, v)) for when, v in both.items()}
         return found
 
-    def _rms_of(self, rows: Integers) -> tuple[int, float, float, float]:
-        """Number of measurements of some rows; RMS of their lengths before, after, and of their noise."""
-        n = int(np.sum(self.begins[rows]))
-        before, after, noise = (float(np.sqrt(np.sum(v[rows] ** 2) / n)) for v in (self.before, self.after, self.sigma))
-        return n, before, after, noise
+    def _lengths(self, rows: Integers, values: Floats) -> Floats:
+        """Length of the rows of each measurement of one kind, shape (m,)."""
+        out: Floats = np.sqrt(np.add.reduceat(values[rows] ** 2, np.flatnonzero(self.begins[rows])))
+        return out
 
     def of_configurations(self, held_out: Booleans) -> tuple[Integers, Floats, dict[str, Floats]]:
         """How many rows that count each configuration takes part in, the sum of their squares, and RMS by kind.
@@ -270,7 +276,9 @@ class ResidualTable(FrozenArrays):
             rows = np.flatnonzero(counted & (self.group == k))
             if len(rows):
                 table, few = labels[number] if len(labels) > 1 else "", len(rows) < ROWS_PER_FITTED * self.n_fitted
-                found.append(HeldOut(table, family, *self._rms_of(rows), few))
+                sizes = (self._lengths(rows, v) for v in (self.before, self.after, self.sigma))
+                before, after, noise = map(root_mean_square, sizes)
+                found.append(HeldOut(table, family, int(np.sum(self.begins[rows])), before, after, noise, few))
         return tuple(found)
 
     def rows_of(self, number: int) -> slice:
@@ -284,6 +292,11 @@ class ResidualTable(FrozenArrays):
             return self
         code = np.where(unknown, len(self.reasons), self.reason_code).astype(self.reason_code.dtype)
         return replace(self, reasons=(*self.reasons, "depends on what is not determined"), reason_code=code)
+
+
+def root_mean_square(lengths: Floats) -> float:
+    """Root mean square of lengths, shape (m,)."""
+    return float(np.sqrt(np.mean(lengths**2)))
 
 
 def residual_table(solution: Solution) -> ResidualTable:

@@ -117,12 +117,8 @@ def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
     write_urdf(tmp_path / "calibrated.urdf", robot)
     write_robot(tmp_path / "calibrated.yaml", robot, urdf_name="calibrated.urdf")
     back = read_robot(tmp_path / "calibrated.yaml")
-    assert (back.name, back.joints, back.parameters, back.elements) == (
-        robot.name,
-        robot.joints,
-        robot.parameters,
-        robot.elements,
-    )
+    for name in ("name", "joints", "parameters", "elements"):
+        assert getattr(back, name) == getattr(robot, name)
 
 
 def random_urdf(rng):

@@ -17,15 +17,16 @@ from fg_calib.report.html import build_page
 
 WEAKLY = "Weakly determined (sigma above a tenth of the prior sigma, or of 1 mrad at the reach)"
 SECTIONS = [
-    *("The arm and what was measured", "Notes", "Fit statistics", "Goodness of fit (1 sigma of a row)"),
-    *("Prediction of the test rows", "Expected tool error (RMS at 10 test configurations)", "Residuals (RMS)"),
     *(
-        "Parameters",
-        "Suspicious rows",
-        "Suspicious test rows",
-        "Suspicious configurations",
-        "Measurement frame (world_T_base)",
+        "The arm and what was measured",
+        "Notes",
+        "Residuals (RMS)",
+        "Fit statistics",
+        "Goodness of fit (1 sigma of a row)",
     ),
+    *("Prediction of the test rows", "Expected tool error (RMS at 10 test configurations)"),
+    *("Parameters", "Suspicious rows", "Suspicious test rows", "Suspicious configurations"),
+    "Measurement frame (world_T_base)",
     *("Not identifiable from these data", WEAKLY, "Studentised residuals", "Error over joint space"),
     *("Correlations", "Expected error over the workspace"),
     "Inputs, options and versions",

@@ -54,6 +54,13 @@ two-links: position
 GOOD: converged: less than 3e-07 sigma from the optimum
 test rows: chi-square 1.849 where 6 is expected (p-value 0.93)
 
+Residuals (RMS)
+              train before   after  test before   after
+position  mm        3.3943  1.3427       2.2226  1.0383
+                     test rows: mean     std    95 %     max
+position before  mm           2.2115  0.2223  2.4115  2.4337
+position after   mm           1.0352  0.0812  1.1083  1.1164
+
 Fit statistics
 configurations      6
 residuals           18, and 1 priors
@@ -75,10 +82,6 @@ Expected tool error (RMS at 6 train configurations)
                   in the base frame  after the best rigid fit
 position     mm              0.6901                    0.5044
 orientation  deg            0.00000                   0.00254
-
-Residuals (RMS)
-              train before   after  test before   after
-position  mm        3.3943  1.3427       2.2226  1.0383
 
 Parameters
          estimate  ± sigma       correction    nominal   prior  class

@@ -34,6 +34,9 @@ def test_limits_are_judged_by_the_rms_of_the_test_rows():
     rows = (table.reason_code == 0) & table.test & (table.family == table.families.index("position"))
     assert one.error == pytest.approx(np.sqrt(np.sum(table.after[rows] ** 2) / 20), rel=1e-12)
     assert one.noise == pytest.approx(np.sqrt(np.sum(table.sigma[rows] ** 2) / 20), rel=1e-12)
+    lengths, found = np.linalg.norm(table.after[rows].reshape(-1, 3), axis=1), result.result.residual_statistics["test"]
+    expected = [lengths.mean(), lengths.std(), np.quantile(lengths, 0.95), lengths.max()]
+    assert list(vars(found["position"]["after"]).values()) == pytest.approx(expected, rel=1e-12)
     assert one.n == 20
     assert verdicts(result) == ["pass", "pass"]
     assert result.not_accepted == ()
