@@ -81,6 +81,10 @@ _WORDS = {
 LIKE_NOISE = 1e-4
 """P-value below which residuals are systematic."""
 
+SECOND_ORDER = 10.0
+"""Length of a column per 1 rad or 1 m, over that of the residuals, below which it is their own: points that are touched
+turn by an angle times their residuals."""
+
 LEAST_SHARE = 1e-3
 """Share of the information below which a region of joint space says nothing of a direction."""
 
@@ -160,7 +164,7 @@ class LinearFit:
             The p-value of what they explain, the part of what is more than noise that they leave, and the fit with
             them; 1, 1 and this fit where they add nothing, or leave too few degrees of freedom.
         """
-        new = basis_of(self.padded(columns), self.fitted)
+        new = basis_of(self.padded(columns), self.fitted, SECOND_ORDER * float(np.linalg.norm(self.r)))
         r, m = self.r - new @ (new.T @ self.r), new.shape[1]
         after = replace(self, r=r, fitted=np.hstack([self.fitted, new]), dof=self.dof - m)
         total, rest = float(self.r @ self.r), float(r @ r)
@@ -205,10 +209,10 @@ class Regression:
 
     @cached_property
     def fit_with_noise(self) -> LinearFit:
-        """The fit with the noise that one with all columns leaves."""
+        """The fit with the noise that one with all columns leaves, at most that specified."""
         with_all = self.fit.test(self.columns)[2]
         variance = 1.0 if with_all is self.fit else float(with_all.r @ with_all.r) / with_all.dof
-        return replace(self.fit, variance=variance)
+        return replace(self.fit, variance=min(variance, 1.0))
 
     def named(self, *begin: str) -> Floats:
         """The columns whose names begin so, shape (n_rows, k)."""
@@ -314,15 +318,17 @@ def explains_misfit(regression: Regression, motion: MissingMotion) -> bool:
 
 
 def forgotten_offsets(regression: Regression) -> tuple[Offset, ...]:
-    """Offsets of instruments that were not estimated and are significant."""
-    fit, found = regression.fit, list[Offset]()
+    """Offsets of instruments that were not estimated, are significant, and smaller than the lengths' own spread."""
+    fit, found, blocks = regression.fit, list[Offset](), regression.problem.data.blocks
     for table in _offsets(regression.problem).values():
+        spread = np.std(np.concatenate([s.data[s.train, 0] for s in blocks if s.table == table]))
         column = fit.padded(regression.named(f"{OFFSET}{table},"))[:, 0]
         p, _, after = fit.test(column[:, None])
         if p < P_VALUE:
             new = column - fit.fitted @ (fit.fitted.T @ column)
             sigma = np.sqrt(float(after.r @ after.r) / after.dof / float(new @ new))
-            found.append(Offset(table, -float(new @ fit.r) / float(new @ new), float(sigma)))
+            size = -float(new @ fit.r) / float(new @ new)
+            found += [Offset(table, size, float(sigma))] * int(abs(size) < spread)
     return tuple(found)
 
 
@@ -430,12 +436,19 @@ def _joint_errors(robot: Robot, readings: Floats) -> Floats:
     return np.stack([z, z_links, reach, cos, sin, cos * cos, cos * sin, x, x_links, y, y_links], axis=1)
 
 
-def basis_of(columns: Floats, fitted: Floats | None = None) -> Floats:
-    """An orthonormal basis of what columns add to an orthonormal one; what is left of nothing is nothing."""
+def basis_of(columns: Floats, fitted: Floats | None = None, least: float = 0.0) -> Floats:
+    """An orthonormal basis of what columns add to an orthonormal one; what is left of nothing is nothing.
+
+    Args:
+        columns: The columns, shape (n, m).
+        fitted: The basis that they add to, shape (n, k); none if None.
+        least: Length below which a part of a column is none.
+    """
     fitted = np.zeros((len(columns), 0)) if fitted is None else fitted
     size = np.linalg.norm(columns, axis=0)
     rest = columns - fitted @ (fitted.T @ columns)
-    scaled = rest / np.maximum(size, max(_NOTHING * float(np.max(size, initial=0.0)), 1e-300))
-    Q, R, _ = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
-    basis: Floats = Q.astype(np.float64)[:, : int(np.sum(np.abs(np.diag(R)) > _RANK * np.sqrt(len(size))))]
+    scale = np.maximum(size, max(_NOTHING * float(np.max(size, initial=0.0)), 1e-300))
+    Q, R, order = scipy.linalg.qr(rest / scale, mode="economic", pivoting=True)
+    left = np.abs(np.diag(R))
+    basis: Floats = Q[:, (left > _RANK * np.sqrt(len(size))) & (left * scale[order[: len(left)]] > least)]
     return basis

@@ -55,7 +55,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, InputError, shown
@@ -441,6 +440,8 @@ def fit_parameters(start: Robot, calibrated: Robot, readings: Floats) -> Robot:
 
 def _fit(predict: Callable[[Floats], Poses], start: Floats, wanted: Robot, readings: Floats, hold: float) -> Floats:
     """The values that bring predicted poses nearest to those of an arm."""
+    from scipy.optimize import least_squares  # here, for it takes as long to import as a small calibration
+
     weight, at = np.repeat([wanted.reach, 1.0], 3), poses(wanted, readings)
 
     def residual(x: Floats) -> Floats:

@@ -15,7 +15,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations
 from fg_calib.measurements import check_readings
@@ -213,6 +212,8 @@ def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | 
 
 def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats) -> Floats:
     """The configuration nearest in orientation with the tool point in place, from one whose point is there."""
+    from scipy.optimize import least_squares  # here, for it takes as long to import as a small calibration
+
     chain = build_chain(robot)
 
     def misses(q: Floats) -> Floats:

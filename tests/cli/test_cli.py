@@ -190,10 +190,12 @@ def test_noise_specified_too_small_by_5_is_exit_code_3_with_the_reason_and_resul
     ended = fg_calib("calibrate", example / JOB, "--out", example / "result")
     finding = "noise specified too small, unmodelled effects, or outliers"
     assert ended.code == 3
-    assert re.fullmatch(rf"not to be trusted: reduced chi-square \S+ is outside \[0.50, 2.00\]: {finding}\n", ended.err)
+    too_small, no_gain = ended.err.splitlines()
+    assert re.fullmatch(rf"not to be trusted: reduced chi-square \S+ is outside \[0.50, 2.00\]: {finding}", too_small)
+    assert "test rows are predicted no better than by the nominal arm" in no_gain
     assert ended.out.splitlines()[1].startswith("DOUBTFUL: reduced chi-square")
     result = json.loads((example / "result" / "result.json").read_text())
-    assert (result["trustworthy"], len(result["findings"])) == (False, 1)
+    assert (result["trustworthy"], len(result["findings"])) == (False, 2)
     assert {f.name for f in (example / "result").iterdir()} == OUTPUTS
 
 

@@ -14,19 +14,16 @@ from fg_calib import calibrate
 from fg_calib.assessment import assess
 from fg_calib.diagnostics.unmodelled_effects import (
     LIKE_NOISE,
-    Systematic,
     find_change,
     find_systematic,
     forgotten_offsets,
     regress,
 )
-from fg_calib.diagnostics.verdict import Case, check_systematic
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.graph.variables import prior_rows
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics.covariance import spread_of
-from fg_calib.statistics.goodness_of_fit import ChiSquare, Fit
 from fg_calib.statistics.variance_components import estimate_noise
 
 
@@ -72,14 +69,6 @@ def test_p_values_of_noise_are_uniform_and_nothing_has_moved(name, model):
     assert not any(map(find_change, found))
     assert kstest(p, "uniform").pvalue > 1e-3
     assert np.sum(np.array(p) < 0.01) <= binom.ppf(0.999, 50, 0.01)
-
-
-def test_a_warning_of_systematic_residuals_goes_by_the_p_value_and_says_what_sigmas_grow_by():
-    fit = Fit(ChiSquare(40.0, 40, 40.0, (0.5, 2.0), 0.5), None, None, None)
-    cases = [Case(None, None, fit, systematic=Systematic(p * LIKE_NOISE, "q2 yields", 4.0)) for p in (1.0, 0.99)]
-    said = [[one.text for one in check_systematic(case, doubts=False) if one.applies] for case in cases]
-    assert said[0] == []
-    assert said[1][0].startswith("systematic residuals: q2 yields (p = 0.0001); sigmas are 2 times what noise alone")
 
 
 @pytest.mark.parametrize("loss", ["none", "gnc"])
