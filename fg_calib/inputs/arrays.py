@@ -33,7 +33,7 @@ def _listed(values: NDArray[Any]) -> list[Any]:
     return listed
 
 
-_AS_LISTS = PlainSerializer(_listed)
+_AS_LISTS = PlainSerializer(_listed, return_type=Any)
 
 Floats = Annotated[NDArray[np.float64], _read_as(np.float64), _AS_LISTS]
 Integers = Annotated[NDArray[np.int64], _read_as(np.int64), _AS_LISTS]
