@@ -259,13 +259,17 @@ def _regional_variance(problem: Problem, fit: LinearFit) -> float:
     have the information 1 and those of a region H = Q_b^T Q_b. With h and u its eigenvalues and vectors, the estimate
     without them differs along u by u . Q_b^T r / (1 - h), which noise alone gives the variance h / (1 - h).
     """
-    places = [(problem.data.places[p.table][p.block.ends[:, -1:]].ravel(), p.block) for p in problem.rows.parts]
-    ends = np.concatenate([np.repeat(place, block.residual_dim) for place, block in places])
+    none, at = np.full((1, problem.robot.n_joints), np.nan), list[Floats]()
+    for part in problem.rows.parts:
+        s, ends = part.block, problem.data.places[part.table][part.block.ends[:, -1:]].ravel()
+        at.append(
+            np.repeat(problem.data.readings[ends] if s.kind.ends else none.repeat(s.n, axis=0), s.residual_dim, 0)
+        )
     squares = list[float]()
-    for readings in problem.data.readings[ends].T:
-        edges = np.quantile(readings, [0.25, 0.5, 0.75])
+    for readings in np.concatenate(at).T:
+        edges = np.nanquantile(readings, [0.25, 0.5, 0.75])
         for k in range(len(edges) + 1):
-            rows = np.flatnonzero(np.searchsorted(edges, readings) == k)
+            rows = np.flatnonzero((np.searchsorted(edges, readings) == k) & np.isfinite(readings))
             Q = fit.fitted[rows]
             h, U = np.linalg.eigh(Q.T @ Q)
             seen = (h > LEAST_SHARE) & (h < 1.0 - LEAST_SHARE)
@@ -278,7 +282,7 @@ def _causes(robot: Robot) -> dict[str, str]:
     found = {f"{joint.name} {_WORDS[e]}": f"{e} {k}," for k, joint in enumerate(robot.joints) for e in _WORDS}
     for link in range(robot.n_joints + 1):
         where = {0: "the base", robot.n_joints: "the tool"}.get(link, f"the link after {robot.joints[link - 1].name}")
-        found[f"{where} is off as no parameter that is estimated tells"] = f"{LINK}{link}."
+        found[f"{where} has an error that no estimated parameter describes"] = f"{LINK}{link}."
     return found
 
 
