@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Iterable
 from importlib import import_module
 from typing import Annotated, NoReturn
 
@@ -24,14 +25,19 @@ COMMANDS = (
 )
 """The commands in the order of the help: each is the function of that name in the module of that name."""
 
-app = typer.Typer(
-    name="fg-calib",
-    help="Calibrate a robot arm's geometry, and say how well it is known.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-)
-for command in COMMANDS:
-    app.command()(getattr(import_module(f"fg_calib.cli.{command}"), command))
+
+def build_app(commands: Iterable[str] = COMMANDS) -> typer.Typer:
+    """The command line with these commands."""
+    app = typer.Typer(
+        name="fg-calib",
+        help="Calibrate a robot arm's geometry, and say how well it is known.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        callback=_options,
+    )
+    for command in commands:
+        app.command()(getattr(import_module(f"fg_calib.cli.{command}"), command))
+    return app
 
 
 class _Line(logging.Formatter):
@@ -47,9 +53,10 @@ def run() -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Line())
     logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    asked = [command for command in COMMANDS if command in sys.argv[1:2]]  # the others need not be looked at
     try:
         with progress():
-            app(prog_name="fg-calib")
+            build_app(asked or COMMANDS)(prog_name="fg-calib")
     except CalibrationError as error:
         _fail(str(error))
     except MemoryError:
@@ -70,7 +77,6 @@ def _show_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")

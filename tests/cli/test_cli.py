@@ -32,7 +32,7 @@ PARAMETER = "name unit nominal estimate correction sigma prior_sigma identifiabi
 def calibrated(tmp_path_factory):
     """A folder with the bundled example, calibrated into `result`, and what the command printed."""
     folder = Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path_factory.mktemp("cli") / "job"))
-    ended = CliRunner().invoke(entry.app, ["calibrate", str(folder / JOB), "--out", str(folder / "result")])
+    ended = CliRunner().invoke(entry.build_app(), ["calibrate", str(folder / JOB), "--out", str(folder / "result")])
     return folder, ended
 
 

@@ -16,7 +16,7 @@ from fg_calib.io.tables import write_csv
 
 
 def run(*words):
-    ended = CliRunner().invoke(entry.app, list(map(str, words)))
+    ended = CliRunner().invoke(entry.build_app(), list(map(str, words)))
     if ended.exception is not None and not isinstance(ended.exception, SystemExit):
         return 1, str(ended.exception)
     return ended.exit_code, ended.stdout

@@ -16,7 +16,7 @@ from simulated import measure, small_arm, true_robot
 import fg_calib as package
 from fg_calib import Robot, Table, calibrate, read_job, read_robot, simulate
 from fg_calib.cli import EXAMPLES
-from fg_calib.cli.entry import app
+from fg_calib.cli.entry import build_app
 from fg_calib.importers.board import read_calibration_board
 from fg_calib.io import Units, read_measurements
 from fg_calib.robot.kinematics import pose
@@ -24,7 +24,7 @@ from fg_calib.simulation import read_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {"README": ROOT / "README.md"} | {path.stem: path for path in sorted((ROOT / "docs").glob("*.md"))}
-COMMANDS = typer.main.get_command(app).commands
+COMMANDS = typer.main.get_command(build_app()).commands
 
 
 def snippets(page):
