@@ -42,11 +42,10 @@ def board(
     readings = None if configurations is None else importers.read_readings(configurations)
     if camera is not None:
         read_camera(camera)  # before the images, which take their time
-    found = importers.read_corners(files, target)
-    given = None if camera is None else read_camera(camera, found.size)
-    fit = importers.fit_board(target, found.images, found.size, given)
-    content = None if camera is None else read_bytes(camera)
-    tables = importers.BoardTables(fit, found.without, readings, Units(length, angle), content)
+    found, without, size = importers.read_corners(files, target)
+    given, content = (None, None) if camera is None else (read_camera(camera, size), read_bytes(camera))
+    fit = importers.fit_board(target, found, size, given)
+    tables = importers.BoardTables(fit, without, readings, Units(length, angle), content)
     names = importers.write_board_tables(out, tables)
     show_result(as_json, tables.document, lambda: _report(tables))
     say(f"wrote {', '.join(names)} to {out}")

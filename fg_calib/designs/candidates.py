@@ -16,23 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib import simulation
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
 from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
 from fg_calib.measurements import INSTRUMENTS, Landmarks, Table
 from fg_calib.robot import Robot
-from fg_calib.simulation import (
-    BoardViews,
-    Candidates,
-    Configurations,
-    Errors,
-    GivenReadings,
-    Instrument,
-    Placement,
-    Scenario,
-    draw_candidates,
-    simulate,
-)
+from fg_calib.simulation import BoardViews, Candidates, Configurations, Errors, GivenReadings, Instrument, Scenario
 
 REFERENCE, NONE = -1, -2
 """Instead of the number of a pose: the reference of a star, and a configuration at which nothing is fitted."""
@@ -205,7 +195,7 @@ def find_candidates(robot: Robot, of: Configurations, n: int, generator: np.rand
         InputError: None are found, with the shares of the reasons; or with self-motion held, the first view of a board
             is not reached.
     """
-    found = draw_candidates(robot, of, generator, n, "candidates")
+    found = simulation.draw_candidates(robot, of, generator, n, "candidates")
     if not len(found.readings):
         raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take")
     return found
@@ -290,7 +280,7 @@ def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Flo
             reason = "where every instrument has configurations of its own"
             raise InputError("given", reason, "a job with what was measured")
         readings[""] = np.vstack([given, readings[""]])
-    return simulate(_nominal(scenario, readings), exact=True).tables
+    return simulation.simulate(_nominal(scenario, readings), exact=True).tables
 
 
 def _find_references(problem: Problem, source: str) -> Integers:
@@ -336,7 +326,8 @@ def _nominal(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
         if i.configurations is not None:
             changes["configurations"] = GivenReadings(readings[i.name])
         if i.pairing is not None and i.pairing.strategy != "star":
-            changes |= {"model": MEASURED[i.model], "frame": Placement(np.eye(3), np.zeros(3)), "pairing": None}
+            in_base = simulation.Placement(np.eye(3), np.zeros(3))
+            changes |= {"model": MEASURED[i.model], "frame": in_base, "pairing": None}
         elif "board" in INSTRUMENTS[i.model].labels and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))

@@ -17,21 +17,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib import inputs
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
 from fg_calib.designs.information import N_TASK, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
-from fg_calib.inputs import (
-    Floats,
-    FrozenArrays,
-    InputError,
-    Integers,
-    ProblemError,
-    as_floats,
-    check_number,
-    checked,
-)
+from fg_calib.inputs import Floats, FrozenArrays, InputError, Integers, ProblemError, check_number, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Table
 from fg_calib.observability import Observability, ObservedQuantities
@@ -212,7 +204,7 @@ def _check_readings(name: str, given: object, robot: Robot) -> Floats | None:
     """
     if given is None:
         return None
-    q = as_floats(name, given, f"(n, {robot.n_joints})")
+    q = inputs.as_floats(name, given, f"(n, {robot.n_joints})")
     if not len(q):
         raise InputError(name, "no configurations", "at least one")
     return q

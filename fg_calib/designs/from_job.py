@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fg_calib import simulation
 from fg_calib.assessment import solve_job
 from fg_calib.designs.candidates import Pool, pool_of
 from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
@@ -22,18 +23,7 @@ from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
 from fg_calib.measurements import INSTRUMENTS, Measurements, Noise
 from fg_calib.robot import pose
-from fg_calib.simulation import (
-    BoardViews,
-    Candidates,
-    Configurations,
-    Errors,
-    Instrument,
-    Placement,
-    Plane,
-    RandomReadings,
-    Scenario,
-    Spot,
-)
+from fg_calib.simulation import Configurations, Errors, Instrument, Placement, Plane, RandomReadings, Scenario, Spot
 
 MIN_CONE_RAD = np.deg2rad(60.0)
 """New views may be at least as oblique as this angle between a board's normal and the direction to the camera."""
@@ -69,7 +59,7 @@ def pool_of_rows(problem: Problem, source: str) -> Pool:
     data = problem.data
     train = np.concatenate([data.places[s.table][s.ends[s.train]].ravel() for s in data.blocks])
     pool = pool_of(problem, train, source)
-    return replace(pool, found={"": Candidates(pool.readings, len(pool.readings), {})})
+    return replace(pool, found={"": simulation.Candidates(pool.readings, len(pool.readings), {})})
 
 
 def scenario_of(problem: Problem, configurations: Configurations | None = None, source: str = "job") -> Scenario:
@@ -190,5 +180,5 @@ def _seen(boards: Mapping[str, Floats], tool: Floats) -> dict[str, Any]:
     distance = np.linalg.norm(away, axis=1)
     oblique = np.arccos(np.clip(away @ board.rotation[:, 2] / distance, -1.0, 1.0))
     span, cone = (0.8 * float(distance.min()), 1.2 * float(distance.max())), float(np.quantile(oblique, 0.9))
-    views = BoardViews(board, count=1, distance=span, cone=max(MIN_CONE_RAD, cone))
+    views = simulation.BoardViews(board, count=1, distance=span, cone=max(MIN_CONE_RAD, cone))
     return {"boards": placed, "from_behind": tuple(behind), "configurations": views}

@@ -548,20 +548,6 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-class FoundCorners(NamedTuple):
-    """Corners of a board in some images.
-
-    Attributes:
-        images: Where there are any.
-        without: Names of the other images, and why there are none.
-        size: Width and height of the images, [px].
-    """
-
-    images: tuple[Corners, ...]
-    without: Mapping[str, str]
-    size: tuple[int, int]
-
-
 def image_files(given: Sequence[Path]) -> list[Path]:
     """Files of images: those given, and those in a folder, in order.
 
@@ -583,43 +569,42 @@ def image_files(given: Sequence[Path]) -> list[Path]:
     return list(names.values())
 
 
-def read_corners(files: Sequence[Path], board: CalibrationBoard) -> FoundCorners:
+def read_corners(
+    files: Sequence[Path], board: CalibrationBoard
+) -> tuple[list[Corners], dict[str, str], tuple[int, int]]:
     """Corners of a board in images.
+
+    Returns:
+        Corners of the images that have any; names of the others, and why they have none; width and height of the
+        images, [px].
 
     Raises:
         InputError: An image cannot be read, they have different sizes, none shows the board, or some a larger one.
     """
-    found: list[Corners] = []
-    without: dict[str, str] = {}
-    size: tuple[int, int] | None = None
+    found, without, size = list[Corners](), dict[str, str](), (0, 0)
     for k, file in enumerate(files):
         tell("looking for corners", k, len(files))
         image = decode(io.read_bytes(file), file.name)
         height, width = image.shape
-        size = size or (width, height)
-        if size != (width, height):
+        if k and size != (width, height):
             expected = f"{size[0]} x {size[1]} px as {files[0].name}"
             raise InputError(file.name, f"an image of {width} x {height} px", expected, "one camera at a time")
+        size = width, height
         seen = find_corners(image, board)
         if isinstance(seen, str):
             without[file.name] = seen
         else:
             found.append(Corners(file.stem, *seen))
-    if size is None or not found:
+    if not found:
         reasons = "; ".join(dict.fromkeys(without.values()))
         hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"
         raise InputError("images", f"the board in none of {len(files)} ({reasons})", "at least one", hint)
-    return FoundCorners(tuple(_upright(found) if board.upright else found), without, size)
-
-
-def _upright(found: Sequence[Corners]) -> list[Corners]:
-    """All corners in the order in which the rows run as in the first image, within a quarter turn."""
     half = len(found[0].uv) // 2
     along = [one.uv[-half:].mean(axis=0) - one.uv[:half].mean(axis=0) for one in found]
-    return [
-        one if step @ along[0] > 0.0 else one._replace(uv=one.uv[::-1].copy())
-        for one, step in zip(found, along, strict=True)
-    ]
+    for k, step in enumerate(along):
+        if board.upright and step @ along[0] <= 0.0:  # in the order in which rows run as in the first image
+            found[k] = found[k]._replace(uv=found[k].uv[::-1].copy())
+    return found, without, size
 
 
 BOARD_FILES = {
@@ -712,25 +697,20 @@ class BoardTables:
           "without_readings": [ids], "without_image": [ids], "findings": [text] }
 
         """
-        fit = self.fit
+        fit, arrays = self.fit, ("position", "rotation_vector", "covariance")
+        images = [
+            {"id": view.name, "n_corners": len(view.corners), "rms_pixel": view.rms, "sigma_pixel": view.sigma}
+            | {key: getattr(view, key).tolist() for key in arrays}
+            | {"ambiguous": bool(view.ambiguous)}
+            for view in fit.views
+        ]
         return {
             **{"schema": "fg-calib/board/1", "version": __version__, "board": fit.board.model_dump()},
-            **{"image_size": list(fit.size), "rms_pixel": fit.rms, "sigma_pixel": fit.sigma},
-            "images": [_image_document(view) for view in fit.views],
+            **{"image_size": list(fit.size), "rms_pixel": fit.rms, "sigma_pixel": fit.sigma, "images": images},
             **{"camera": asdict(fit.camera), "camera_sigma": fit.camera_sigma, "without_board": dict(self.without)},
             **{"without_pose": list(fit.without_pose), "without_readings": list(self.without_row)},
             **{"without_image": list(self.without_image), "findings": list(fit.findings)},
         }
-
-
-def _image_document(view: View) -> dict[str, Any]:
-    """A board in an image, as in `board.json`."""
-    arrays = ("position", "rotation_vector", "covariance")
-    return {
-        **{"id": view.name, "n_corners": len(view.corners), "rms_pixel": view.rms, "sigma_pixel": view.sigma},
-        **{key: getattr(view, key).tolist() for key in arrays},
-        "ambiguous": bool(view.ambiguous),
-    }
 
 
 def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:

@@ -91,26 +91,11 @@ import pydantic
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
 from scipy.spatial.transform import Rotation
 
-from fg_calib import io
+from fg_calib import inputs, io
 from fg_calib.initialization import Camera
-from fg_calib.inputs import (
-    PAIR_MODELS,
-    POSE_MODELS,
-    AngleUnit,
-    Brief,
-    Floats,
-    FrameKnowledge,
-    InputError,
-    LengthUnit,
-    Model,
-    Pairing,
-    as_floats,
-    check,
-    check_names,
-    checked,
-)
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, AngleUnit, Brief, Floats, InputError, Pairing
 from fg_calib.measurements import Noise
-from fg_calib.robot import Robot, names_of, tolerance_kind, unit_of
+from fg_calib.robot import Robot, tolerance_kind, unit_of
 
 MOST_DRAWN = 1_000_000
 """The largest number of configurations that are drawn."""
@@ -214,7 +199,7 @@ def _array(given: Any, context: FileContext | None) -> Floats:
     if context is not None and isinstance(given, Mapping):
         io.refuse_unknown_keys(*"xyz")(given)
         given = [given.get(axis, 0.0) for axis in "xyz"]
-    return as_floats("", given, "(3,)")
+    return inputs.as_floats("", given, "(3,)")
 
 
 Length = Annotated[io.Number, _scale("m")]
@@ -270,7 +255,7 @@ def _frame(given: Any, context: FileContext | None) -> str | Placement | None:
         return _placement(given, context)
     if given is None or isinstance(given, Placement):
         return given
-    return str(check("", given, ("base", "unknown")))
+    return str(inputs.check("", given, ("base", "unknown")))
 
 
 Board = Annotated[Placement, _in_file(_placement)]
@@ -395,7 +380,7 @@ class GivenReadings(Conditions):
         readings: Shape (n_configurations, n_joints), [rad] (prismatic: [m]).
     """
 
-    readings: Annotated[Floats, _convert(lambda given, _: as_floats("", given, "(n, m)"))]
+    readings: Annotated[Floats, _convert(lambda given, _: inputs.as_floats("", given, "(n, m)"))]
 
 
 Configurations = BoardViews | TargetViews | RandomReadings | GivenReadings
@@ -579,7 +564,7 @@ class Instrument:
         from_behind: Names of boards whose z axis points away from the camera.
     """
 
-    model: Model
+    model: inputs.Model
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
     noise: InNoise = Noise()
     configurations: InConfigurations | None = None
@@ -611,17 +596,6 @@ class Instrument:
         _require(not self.fixed or not self.boards, "camera", "fixed, with boards", "the board on the tool")
 
 
-def override_noise(noise: Noise, more: Noise | None) -> Noise:
-    """A noise with the values of another where it has some; the joints' stay."""
-    values = {} if more is None else {kind: more.get(kind) for kind in io.NOISE_UNITS}
-    return noise.updated(**{kind: value for kind, value in values.items() if value is not None})
-
-
-def frame_knowledge(frame: str | Placement) -> FrameKnowledge:
-    """The calibration's knowledge of a frame."""
-    return "known" if isinstance(frame, str) and frame == "base" else "unknown"
-
-
 # --- the scenario -----------------------------------------------------------------------------------------------------
 
 
@@ -639,6 +613,21 @@ class Errors:
     law: Literal["uniform", "normal", "values"]
     values: Mapping[str, io.Number]
 
+    def by_name(self, robot: Robot, place: str) -> dict[str, float]:
+        """The values by parameter name, [m] and [rad].
+
+        Args:
+            robot: The robot.
+            place: File and key, for messages.
+
+        Raises:
+            InputError: A key that is neither a parameter nor a kind of the robot.
+        """
+        kind_of = {p.name: tolerance_kind(p) or "" for p in robot.parameters}
+        inputs.check_names(place, self.values, [*sorted({*kind_of.values()} - {""}), *kind_of], "parameter or kind")
+        found = {name: self.values.get(name, self.values.get(kind)) for name, kind in kind_of.items()}
+        return {name: value for name, value in found.items() if value is not None}
+
 
 def _errors(given: Any, context: FileContext) -> Errors:
     if given == {"normal": "tolerance"}:
@@ -651,25 +640,7 @@ def _errors(given: Any, context: FileContext) -> Errors:
     law, values = _the_one_of({key: given.get(key) for key in laws})
     values = _read(dict[str, io.Number], values, law, context)
     values = {key: value * context.units.factor(unit_of(key)) for key, value in values.items()}
-    return Errors(cast("Any", law), values_by_name(context.robot, values, law))
-
-
-def values_by_name(robot: Robot, values: Mapping[str, float], place: str) -> dict[str, float]:
-    """Turn values by parameter name or by kind into values by parameter name.
-
-    Args:
-        robot: The robot.
-        values: By name or by kind, [m] or [rad].
-        place: File and key, for messages.
-
-    Raises:
-        InputError: A key that is neither a parameter nor a kind of the robot.
-    """
-    names = names_of(robot.parameters)
-    kinds = sorted({kind for p in robot.parameters if (kind := tolerance_kind(p)) is not None})
-    check_names(place, values, [*kinds, *names], "parameter or kind")
-    found = {p.name: values.get(p.name, values.get(tolerance_kind(p) or "")) for p in robot.parameters}
-    return {name: value for name, value in found.items() if value is not None}
+    return Errors(cast("Any", law), Errors(cast("Any", law), values).by_name(context.robot, law))
 
 
 @schema
@@ -701,7 +672,7 @@ class Scenario(Brief):
     validation: InConfigurations | None = None
     specified_noise: Noise | None = None
     job: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({"model": "distance-rotation"}))
-    length_unit: LengthUnit = "m"
+    length_unit: inputs.LengthUnit = "m"
     angle_unit: AngleUnit = "rad"
     name: str = "scenario"
     source: str = "scenario"
@@ -735,7 +706,7 @@ class _ScenarioInFile(io.Schema):
     instruments: list[dict[str, Any]] | None = Field(None, min_length=1)
 
 
-@checked
+@inputs.checked
 def read_scenario(path: Path | str) -> Scenario:
     """Read the scenario in a YAML file, or a shipped one.
 

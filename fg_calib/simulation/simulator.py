@@ -29,20 +29,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from fg_calib import inputs
 from fg_calib.initialization import Camera
-from fg_calib.inputs import (
-    PAIR_MODELS,
-    POSE_MODELS,
-    Booleans,
-    Brief,
-    Floats,
-    FrameKnowledge,
-    InputError,
-    Integers,
-    Pairing,
-    check_number,
-    checked,
-)
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Brief, Floats, FrameKnowledge, InputError, Integers
+from fg_calib.io import NOISE_UNITS
 from fg_calib.measurements import (
     INSTRUMENTS,
     Groups,
@@ -57,19 +47,7 @@ from fg_calib.measurements import (
 )
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
-from fg_calib.simulation.scenario import (
-    BoardViews,
-    Configurations,
-    Errors,
-    Instrument,
-    Placement,
-    Plane,
-    Scenario,
-    Spot,
-    frame_knowledge,
-    override_noise,
-    values_by_name,
-)
+from fg_calib.simulation.scenario import BoardViews, Configurations, Instrument, Placement, Plane, Scenario, Spot
 from fg_calib.simulation.views import find_readings
 
 MAX_BASE_M = 5.0
@@ -92,6 +70,12 @@ def choose_frame(frame: Placement | str, generator: np.random.Generator) -> Plac
         return Placement(np.eye(3), np.zeros(3))
     rotation = Rotation.from_quat(generator.normal(size=4)).as_matrix()  # any rotation as likely as any other
     return Placement(rotation, generator.uniform(-MAX_BASE_M, MAX_BASE_M, 3))
+
+
+def override_noise(noise: Noise, more: Noise | None) -> Noise:
+    """A noise with the values of another where it has some; the joints' stay."""
+    values = {} if more is None else {kind: more.get(kind) for kind in NOISE_UNITS}
+    return noise.updated(**{kind: value for kind, value in values.items() if value is not None})
 
 
 def joint_sigma(noise: Noise, robot: Robot) -> Floats:
@@ -312,9 +296,9 @@ class Measuring:
         if i.stations > 1:
             names = [f"{self.name}, station s{s + 1}" for s in range(i.stations)]
             labels["station"] = Labels(tuple(f"s{s + 1}" for s in range(i.stations)), station)
-        known = self.model in PAIR_MODELS or frame_knowledge(i.frame or self.scenario.frame) == "known"
+        known = self.model in PAIR_MODELS or (i.frame or self.scenario.frame) == "base"
         frame: FrameKnowledge = "known" if known else "unknown"
-        m, pairing = self.rows(k, labels=labels, **measured), i.pairing or Pairing()
+        m, pairing = self.rows(k, labels=labels, **measured), i.pairing or inputs.Pairing()
         table = Table(m, self.model, pairing, frame, known=self.known(targets))
         return table, {"targets": targets, "frames": dict(zip(names, frames, strict=True))}
 
@@ -560,7 +544,7 @@ class Simulation(Brief):
         return found
 
 
-@checked
+@inputs.checked
 @single_threaded
 def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simulation:
     """Run a scenario.
@@ -577,9 +561,9 @@ def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simul
         InputError: The scenario is impossible: poses that the robot does not reach within its joint limits, names that
             are no parameters, values that make no sense.
     """
-    check_number("seed", seed, whole=True)
+    inputs.check_number("seed", seed, whole=True)
     source = scenario.source
-    true_robot = _draw_robot(scenario.robot, scenario.errors, seed, f"{source}: errors")
+    true_robot = _draw_robot(scenario, seed, f"{source}: errors")
     frame = choose_frame(scenario.frame, generator_of(seed, "frame"))
     common = [_visit(scenario, scenario.configurations, seed, "configurations", exact)]
     if scenario.validation is not None:
@@ -622,11 +606,12 @@ def _visit(scenario: Scenario, of: Configurations, seed: int, what: str, exact: 
     return Visits(readings, stood, ids, np.full(len(readings), what == "validation"))
 
 
-def _draw_robot(robot: Robot, errors: Errors | None, seed: int, place: str) -> Robot:
+def _draw_robot(scenario: Scenario, seed: int, place: str) -> Robot:
     """Draw the robot that moves, each parameter by its name."""
+    robot, errors = scenario.robot, scenario.errors
     if errors is None:
         raise InputError(place, "found none", "one of uniform, normal, values: what the arm that moves has")
-    values = values_by_name(robot, errors.values, f"{place}: {errors.law}")
+    values = errors.by_name(robot, f"{place}: {errors.law}")
     error = np.zeros(len(robot.parameters))
     for k, p in enumerate(robot.parameters):
         size = values.get(p.name, 0.0)

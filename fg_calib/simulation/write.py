@@ -14,21 +14,12 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
+from fg_calib import io
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError, checked
-from fg_calib.io import (
-    NOISE_UNITS,
-    Units,
-    exists,
-    fill_folder,
-    read_text,
-    write_csv,
-    write_robot,
-    write_text,
-    write_urdf,
-)
+from fg_calib.io import NOISE_UNITS, Units
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Measurements, Pairs, Table
 from fg_calib.robot import Robot, yaw_pitch_roll
-from fg_calib.simulation.scenario import Placement, Plane, Spot, frame_knowledge
+from fg_calib.simulation.scenario import Placement, Plane, Spot
 from fg_calib.simulation.simulator import Simulation
 
 Columns = Mapping[str, Any]
@@ -70,22 +61,22 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
         for name, robot in robots.items():
             urdf = None if robot.urdf is None else f"{name}.urdf"
             if urdf is not None:
-                write_urdf(into / urdf, robot)
-            write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf)
+                io.write_urdf(into / urdf, robot)
+            io.write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf)
         for name, columns in tables.items():
-            write_csv(into / name, columns)
+            io.write_csv(into / name, columns)
         words, _, rest = texts["calibration.yaml"].partition("\n")
         for name, text in {**texts, "calibration.yaml": f"{words}; {_digest(into, rest)}\n{rest}"}.items():
-            write_text(into / name, text)
+            io.write_text(into / name, text)
 
     job = folder / "calibration.yaml"
-    words, _, rest = read_text(job).partition("\n") if exists(job) else ("", "", "")
+    words, _, rest = io.read_text(job).partition("\n") if io.exists(job) else ("", "", "")
     if words.startswith(_FIRST_WORDS) and not words.endswith(_digest(folder, rest)):
         raise InputError(str(folder), "tables, or a job, that were changed since they were simulated", "another folder")
     urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
     names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
     own = {"calibration.yaml": _FIRST_WORDS.encode()}
-    fill_folder(folder, write, own | dict.fromkeys(names, b"") | own)
+    io.fill_folder(folder, write, own | dict.fromkeys(names, b"") | own)
     return tuple(names)
 
 
@@ -174,7 +165,7 @@ def _job_text(simulation: Simulation, units: Units) -> str:
     keys: dict[str, Any] = {"robot": "robot_nominal.yaml", "truth": "robot_true.yaml"}
     if scenario.instruments:
         return job_text(words, {**keys, **scenario.job}, simulation.tables, robot, units)
-    keys |= {"measurements": m.source, **scenario.job, "frame": frame_knowledge(scenario.frame), "units": asdict(units)}
+    keys |= {"measurements": m.source, **scenario.job, "frame": simulation.tables[0].frame, "units": asdict(units)}
     noise = {"joint": joint_noise(m.sigma_joint, robot, units)}
     return words + _yaml(keys | {"noise": _noise(m, units) | noise})
 
