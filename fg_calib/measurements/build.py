@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -177,24 +178,39 @@ def _check_same_readings(tables: Sequence[Table], places: Sequence[Integers], n:
 
 
 def check_copies(tables: Sequence[Table]) -> None:
-    """Warn of rows of a table that repeat others, and raise where two tables hold the same measurements.
+    """Warn of rows of a table that repeat others, and raise where two tables, or targets, have the same measurements.
 
     Honest repeats have other values at the same readings; but what instruments round, or nothing disturbs, may repeat:
-    tables are the same where most values of the smaller one stand in the other at the same readings.
+    two are the same where most values of the smaller one stand in the other at the same readings.
     """
-    for number, table in enumerate(tables):
-        m, values = table.measurements, _rows_of(table)[1] if number else {}
-        n_rows = m.n_configurations if m.pairs is None else m.pairs.n_pairs
-        n, two, _ = find_copies(table) if n_rows <= MOST_LOOKED_AT else (0, "", 0)
+    for table in tables:
+        m = table.measurements
+        if (m.n_configurations if m.pairs is None else m.pairs.n_pairs) > MOST_LOOKED_AT:
+            continue
+        n, two, _ = find_copies(table)
         if n:
             found = f"{n} rows have the readings and figures of an earlier one, such as {two}"
             _log.warning("%s: %s; were they copied? They count as often", m.source, found)
-        for other in tables[:number]:
-            for name, rows in _rows_of(other)[1].items():
-                a, b = ({row.tobytes() for row in np.round(v, 9) + 0.0} for v in (rows, values.get(name, rows[:0])))
-                if 2 * len(a & b) > min(len(a), len(b)):
-                    found = f"the same {name}s as in {other.measurements.source}"
-                    raise ProblemError(m.source, found, "every measurement once")
+        ends, values = _rows_of(table)
+        for column, of in m.labels.items() if ends.shape[1] == 1 else ():
+            each = [(f"{m.source}: {column} {name}", of.index == k) for k, name in enumerate(of.names)]
+            vary = [of for of in values.items() if np.ptp(of[1][:, m.readings.shape[1] :])]  # not of a ball in a corner
+            _check_different([(name, noise, rows[mine]) for name, mine in each for noise, rows in vary])
+    if len(tables) > 1:
+        _check_different([(t.measurements.source, *of) for t in tables for of in _rows_of(t)[1].items()])
+
+
+def _check_different(sets: Sequence[tuple[str, str, Floats]]) -> None:
+    """Raise where most rows of a set stand in an earlier one; each has a name and a kind of noise."""
+    met, sizes = dict[tuple[str, bytes], int](), list[int]()
+    for name, noise, rows in sets:
+        mine = {(noise, row.tobytes()) for row in np.round(rows[np.isfinite(rows).all(axis=1)], 9) + 0.0}
+        for k, n in Counter(met.get(row, -1) for row in mine).items():
+            if k >= 0 and 2 * n > min(len(mine), sizes[k]):
+                raise ProblemError(name, f"the same {noise}s as in {sets[k][0]}", "every measurement once")
+        for row in mine:
+            met.setdefault(row, len(sizes))
+        sizes.append(len(mine))
 
 
 def find_copies(table: Table) -> tuple[int, str, int]:

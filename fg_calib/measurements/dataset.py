@@ -140,9 +140,8 @@ class Labels(FrozenArrays):
 
     def only_of(self, chosen: Booleans) -> Booleans:
         """Which names have rows, all of them chosen, shape (n_names,)."""
-        named = self.index >= 0
-        every, of_chosen = (np.bincount(self.index[r], minlength=len(self.names)) for r in (named, named & chosen))
-        only: Booleans = (every > 0) & (every == of_chosen)
+        here, elsewhere = (np.isin(np.arange(len(self.names)), self.index[rows]) for rows in (chosen, ~chosen))
+        only: Booleans = here & ~elsewhere
         return only
 
 

@@ -19,6 +19,7 @@ well known although it may be off by more at others. Where the noise was estimat
 (F); with a robust loss measurements with suspect rows count for nothing.
 
 References:
+    Cook, Weisberg (1982), Residuals and Influence in Regression.
     Satterthwaite (1946), An approximate distribution of estimates of variance components. Biometrics Bulletin 2(6).
     Sidak (1967), Rectangular confidence regions for the means of multivariate normal distributions. JASA 62(318).
 """
@@ -89,7 +90,7 @@ class KindFit:
         typical: Observed noise over noise as taken, from the median, which a few rows do not move.
         degrees: Degrees of freedom of chi-square.
         table: Number of its table.
-        n_beyond: Rows with a |studentised residual| that none of a clean table has (`suspect_level`).
+        n_beyond: Rows with a |studentised residual| that none of a clean table has (`level`).
         cause: Why the sum is too large where the other rows are as specified: `outliers` of this kind, or of `others`.
     """
 
@@ -122,6 +123,18 @@ class KindFit:
         if not unlikely or abs(ratio - 1.0) < 0.05:
             return "as specified"
         return "too large" if ratio < 1.0 else self.cause or "too small"
+
+    def level(self, n: int) -> float:
+        """|studentised residual| above which one of n rows is suspect.
+
+        That of the others' own noise where this is smaller than specified: beyond `t^2 chi2 / (nu - 1 + t^2)` a square
+        is beyond the quantile t^2 of its ratio to the others' mean (externally studentised, Cook & Weisberg 1982).
+        """
+        level, nu = suspect_level(n), self.expected - 1.0
+        if self.verdict != "too large" or nu < 1.0:
+            return level
+        t = float(special.stdtrit(nu, float(special.ndtr(level))))
+        return min(level, float(t * np.sqrt(self.chi2 / (nu + t * t))))
 
 
 VERDICTS = {
@@ -271,12 +284,14 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
         table: Its residuals.
     """
     rows = RowStatistics(solution, spread, table)
-    level = suspect_level(int(np.sum(table.reason_code == 0)))
+    n, kinds = int(np.sum(table.reason_code == 0)), rows.fit_kinds()
+    level, of = suspect_level(n), {(kind.table, kind.kind): kind.level(n) for kind in kinds}
+    levels = np.array([of.get(group, level) for group in table.groups] or [level])[table.group]
     with np.errstate(invalid="ignore"):
-        suspect, outlier = np.abs(rows.studentised) > level, rows.weight < OUTLIER_WEIGHT
+        suspect, outlier = np.abs(rows.studentised) > levels, rows.weight < OUTLIER_WEIGHT
     which = {"excluded": table.reason_code != 0, "test": table.test, "outlier": outlier, "suspect": suspect}
     return Goodness(
-        kinds=rows.fit_kinds(),
+        kinds=kinds,
         leverage=rows.leverage,
         studentised=rows.studentised,
         weight=rows.weight,
@@ -470,23 +485,21 @@ class RowStatistics:
             enough = expected >= 1.0
             variance, specified = (float(np.mean(v)) for v in (table.sigma[rows] ** 2, self._specified_variance[rows]))
             factor = float(np.sqrt(variance / specified))
-            found.append(
-                KindFit(
-                    kind=family,
-                    unit=table.unit(family),
-                    n=len(rows),
-                    specified_sigma_rms=float(np.sqrt(specified)),
-                    factor=factor,
-                    observed_over_specified=factor * float(np.sqrt(total / expected)) if enough else np.nan,
-                    chi2=total,
-                    expected=max(float(expected), 0.0),
-                    p_value=upper_probability(total / mean, degrees, of_noise) if enough and known else None,
-                    typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
-                    degrees=degrees,
-                    table=number,
-                    n_beyond=int(np.sum(size > suspect_level(len(rows)))),
-                )
+            fit = KindFit(
+                kind=family,
+                unit=table.unit(family),
+                n=len(rows),
+                specified_sigma_rms=float(np.sqrt(specified)),
+                factor=factor,
+                observed_over_specified=factor * float(np.sqrt(total / expected)) if enough else np.nan,
+                chi2=total,
+                expected=max(float(expected), 0.0),
+                p_value=upper_probability(total / mean, degrees, of_noise) if enough and known else None,
+                typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
+                degrees=degrees,
+                table=number,
             )
+            found.append(replace(fit, n_beyond=int(np.sum(size > fit.level(len(rows))))))
         return tuple(found)
 
     @cached_property

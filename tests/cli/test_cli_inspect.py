@@ -37,6 +37,7 @@ def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, whole_
     words += ["poses.csv 552 552 500 51 499 51 distance, 51 angle"]
     assert [" ".join(line.split()) for line in lines[4:6]] == words
     assert "What these rows can determine: 23 of 30 parameters" in lines
+    assert " 102 degrees of freedom" in ended.out
     assert "position mm 5.6799 5.6780" in [" ".join(line.split()) for line in lines]
     assert not any(line.startswith("Notes") for line in lines)
     assert max(map(len, lines)) <= 100

@@ -11,7 +11,7 @@ from simulated import measure, plus, true_robot
 
 from fg_calib import Job, Options, Robot, simulate
 from fg_calib.diagnostics import inspect_job
-from fg_calib.io.job import read_job
+from fg_calib.inputs import ProblemError
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker next to the robot."""
@@ -44,18 +44,6 @@ def said(found):
 
 
 # --- healthy jobs ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_the_bundled_example_is_ready_without_a_note(whole_example):
-    found = inspect_job(read_job(whole_example / "calibration.yaml"))
-    assert not found.findings
-    assert said(found) == ()
-    (table,) = found.tables
-    assert (table.n_rows, table.n_test, table.n_pairs, table.n_test_pairs) == (552, 500, 51, 499)
-    assert table.n_residuals == {"distance": 51, "angle": 51}
-    assert found.identifiability.observability.rank == 23
-    assert found.dof == 102
 
 
 @pytest.mark.sampled(2)
@@ -93,6 +81,17 @@ def test_a_mistake_in_the_set_up_is_a_finding(arm):
     (finding,) = found.findings
     assert "if x, y, z are in mm, not m" in finding
     assert found.disagreements == ()  # not looked for: all rows would
+
+
+def test_two_targets_with_the_same_positions_are_named():
+    """Copied from one to the other they fit perfectly, and count twice."""
+    simulation = simulate(scenario(INSTRUMENTS["targets"], n=8), seed=1)
+    (table,) = simulation.tables
+    position = table.measurements.position.copy()
+    position[1::3] = position[::3]
+    copied = replace(table, measurements=replace(table.measurements, position=position))
+    with pytest.raises(ProblemError, match=r"^it\.csv: target it target 2: the same positions as in .* it target 1, "):
+        inspect_job(Job(None, simulation.robot, (copied,), Options()))
 
 
 # --- single rows -----------------------------------------------------------------------------------------------------
