@@ -435,20 +435,21 @@ def joint_errors(problem: Problem, parameters: Floats) -> Floats:
     return found
 
 
-def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False) -> Floats:
+def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False, with_known: bool = True) -> Floats:
     """Rows [A r] with the Gram matrix of train rows, landmarks' priors and added factors, error states eliminated.
 
     Args:
         problem: The problem.
         parameters: The parameter vector.
         with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+        with_known: Whether information of earlier rows counts.
 
     Returns:
         Shape (m, n_columns + n_nuisance + 1).
     """
     v = problem.variables
     others = [unknown_prior_rows(v, parameters)] if v.nuisance else []
-    if problem.known is not None:
+    if problem.known is not None and with_known:
         others.append(problem.known.at_parameters(v, problem.data.landmarks, parameters))
     if problem.added:
         others.append(linearize_factors(problem.added, v, v.values(parameters)))

@@ -141,7 +141,7 @@ def _known_at(problem: graph.Problem, x: Floats, *, with_loss: bool) -> graph.Kn
     staying = {name: _place(problem, name) for name in unknowns.keys if name[0] in graph.STAYING}
     places = {name: place for name, place in staying.items() if place is not None}
     unseen = [name for name in (() if known is None else known.unknowns) if name not in places]
-    B = graph.square_root(replace(problem, knowledge=None), x, with_loss=with_loss)
+    B = graph.square_root(problem, x, with_loss=with_loss, with_known=False)
     rows = [np.column_stack([B[:, :-1], np.zeros((len(B), graph.SIZE * len(unseen))), B[:, -1]])]
     at = [np.zeros(0), *(x[place] for place in places.values())]
     if known is not None:
@@ -164,7 +164,7 @@ def _place(problem: graph.Problem, name: graph.Name) -> NDArray[np.int64] | None
 
 def fingerprints(tables: Sequence[Table]) -> tuple[str, ...]:
     """Fingerprints of the train rows of tables, 12 hexadecimal digits each, sorted; at most 1000 a table."""
-    smallest = [np.unique(_of_rows(table.measurements) >> np.uint64(16))[:MAX_FINGERPRINTS] for table in tables]
+    smallest = [np.sort(_of_rows(table.measurements) >> np.uint64(16))[:MAX_FINGERPRINTS] for table in tables]
     return tuple(sorted({f"{one:012x}" for some in smallest for one in some.tolist()}))
 
 

@@ -443,7 +443,10 @@ class RowStatistics:
         able = test & (self.leverage >= LEAST_VARIANCE - 1.0)
         if not able.any():
             return None
-        n_judged, n_measurements = (len(np.unique(table.measurement_number[of])) for of in (part.rows, able))
+        numbers = (
+            np.sort(table.measurement_number[of]) for of in (part.rows, able)
+        )  # np.unique takes a second for 10^6
+        n_judged, n_measurements = (int(np.count_nonzero(np.diff(number, prepend=-1))) for number in numbers)
         chosen = np.arange(n)
         if part.covariance is not None and n:
             chosen = np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
