@@ -21,45 +21,16 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import io
+from fg_calib import inputs, io
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.graph import SIZE, Knowledge, Solution, Variables, build_variables, frame_of, tables_of
-from fg_calib.inputs import (
-    Brief,
-    Floats,
-    InputError,
-    Options,
-    SolverError,
-    as_figures,
-    as_floats,
-    check_names,
-    check_number,
-    checked,
-    listed,
-    shown,
-)
+from fg_calib.inputs import Brief, Floats, InputError, Options, SolverError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
 from fg_calib.parallel import single_threaded, tell
-from fg_calib.prediction import (
-    Correction,
-    PredictedErrors,
-    ToolPoseUncertainty,
-    correct_targets,
-    predict_errors,
-    predict_poses,
-)
-from fg_calib.report import (
-    ReportData,
-    build_page,
-    draw_figures,
-    format_result,
-    judged,
-    notes_of,
-    parameter_table_html,
-    summary,
-)
+from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
+from fg_calib.report import ReportData, format_result, judged, notes_of, pages_of, parameter_table_html, summary
 from fg_calib.robot import Robot, names_of
 from fg_calib.statistics import ParameterEstimate, TangentCovariance, cross_validate
 
@@ -247,12 +218,8 @@ class Calibration:
         if joint_errors is not None:
             tables["joints.csv"] = io.joint_frame(joint_errors, self.solution)
         known = {name: table for name, table in tables.items() if table is not None}
-        io.write_calibration(Path(folder), self.result, self.robot, known, self._pages(report=report, figures=figures))
-
-    def _pages(self, *, report: bool, figures: bool) -> dict[str, str]:
-        """The text of the page and of its figures, by file."""
-        pages = {"report.html": build_page(self.report_data)} if report else {}
-        return pages | (draw_figures(self.report_data) if figures else {})
+        pages = pages_of(self.report_data, report=report, figures=figures)
+        io.write_calibration(Path(folder), self.result, self.robot, known, pages)
 
     @cached_property
     def configurations(self) -> pl.DataFrame | None:
@@ -365,11 +332,11 @@ class Calibration:
             SolverError: GTSAM could not solve a step at all.
         """
         self._require_trust()
-        history, names = (*self.result.history, self.result.run), listed("changed", changed)
+        history, names = (*self.result.history, self.result.run), inputs.listed("changed", changed)
         new, days = _date_and_days(date, self.result.date)
         if growth and days is None:
             raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
-        table, inputs = self._rows(rows, pairs, like)
+        table, digests = self._rows(rows, pairs, like)
         found = updated(
             self.calibrated,
             table,
@@ -381,7 +348,7 @@ class Calibration:
         if uncertainty.acceptance is not None and not names:
             uncertainty = uncertainty.with_held_out(predicted_before(self.calibrated, table), found)
         job = self.result.carried.job
-        return Calibration.of(found, uncertainty, inputs=inputs, job=job, date=new, history=history)
+        return Calibration.of(found, uncertainty, inputs=digests, job=job, date=new, history=history)
 
     def _require_trust(self) -> None:
         if not self.trustworthy:
@@ -403,20 +370,20 @@ class Calibration:
                 raise InputError(path.name, found, "a job that names the table")
             with io.noting_reads() as files:
                 table = io.read_table_like(job, robot, path, pairs=of_pairs, like=like)
-            inputs = {file.name: digest for file, digest in files.items()}
-            return self._not_counted(Rows.of([table], [like or path.name], options)), inputs
+            digests = {file.name: digest for file, digest in files.items()}
+            return self._not_counted(Rows.of([table], [like or path.name], options)), digests
         if pairs is not None or like is not None:
             raise InputError("pairs" if pairs else "like", "given with rows that say it themselves", "none")
-        new, inputs = io.read_job(given) if isinstance(given, Path | str) else given, {}
+        new, digests = io.read_job(given) if isinstance(given, Path | str) else given, {}
         if isinstance(new, Job):
             if names_of(new.robot.parameters) != names_of(robot.parameters) or new.robot.convention != robot.convention:
                 expected = f"that of the result, {robot.name}"
                 raise InputError(str(new.path or "job"), f"the robot {new.robot.name}", expected)
-            inputs, new = new.inputs, new.tables
+            digests, new = new.inputs, new.tables
         tables = tables_of(new, options)
         for one in tables:
             check_readings(one.measurements.readings, robot, one.measurements.source)
-        return self._not_counted(Rows.of(tables, [one.measurements.source for one in tables], options)), inputs
+        return self._not_counted(Rows.of(tables, [one.measurements.source for one in tables], options)), digests
 
     def _not_counted(self, rows: Rows) -> Rows:
         """New rows of which none was fitted before.
@@ -469,8 +436,8 @@ class Calibration:
             InputError: There is no such parameter.
         """
         given = self.result.covariance
-        names = given.names if names is None else listed("covariance", names)
-        check_names("covariance", names, list(self.parameters))
+        names = given.names if names is None else inputs.listed("covariance", names)
+        inputs.check_names("covariance", names, list(self.parameters))
         every = np.zeros((len(given.names) + 1,) * 2)  # the last one stands for what is fixed
         every[:-1, :-1] = given.matrix.reshape(len(given.names), len(given.names))
         rows = [given.names.index(name) if name in given.names else len(given.names) for name in names]
@@ -520,7 +487,7 @@ class Calibration:
         if number is None and len(known) == 1:
             return known[0]
         if number is None or number not in known:
-            found = "several measurement frames" if number is None else f"found {shown(number)}"
+            found = "several measurement frames" if number is None else f"found {inputs.shown(number)}"
             raise InputError("table", found, f"one of {', '.join(map(str, known))}: the table whose frame is meant")
         return int(number)
 
@@ -560,7 +527,7 @@ def predict(
             of other joints, not finite, or outside the limits.
     """
     if limit is not None:
-        check_number("limit", limit, above=True)
+        inputs.check_number("limit", limit, above=True)
     found = calibration if isinstance(calibration, Calibration) else Calibration.load(calibration)
     if found.result.evaluated_only:
         raise InputError(found.result.robot, "the arm was only evaluated: nothing was estimated", "a calibration")
@@ -569,15 +536,15 @@ def predict(
         place, expected = str(found.folder or "calibration"), "configurations.csv, or `measured`"
         raise InputError(place, "nothing says what was measured", expected)
     at = None if readings is None else _possible_readings("readings", readings, found.robot)
-    joint_noise = found.result.sigma_joint if np.any(found.result.sigma_joint > 0.0) else None
-    model = ToolPoseUncertainty.of(found.posterior, there, joint_noise)
-    return predict_errors(found.robot, model, there, at, fitted=found.result.free_of_frame, limit=limit)
+    sigma = found.result.sigma_joint if np.any(found.result.sigma_joint > 0.0) else None
+    fitted = found.result.free_of_frame
+    return predict_errors(found.robot, found.posterior, there, at, sigma_joint=sigma, fitted=fitted, limit=limit)
 
 
 def _as_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:
     """Readings of one or many configurations, shape (n, n_joints)."""
     shape = f"(n, {robot.n_joints})"
-    return as_floats(name, np.atleast_2d(as_figures(name, given, f"numbers of shape {shape}")), shape)
+    return inputs.as_floats(name, np.atleast_2d(inputs.as_figures(name, given, f"numbers of shape {shape}")), shape)
 
 
 def _possible_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:
@@ -636,7 +603,7 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
         InputError: There is no such calibration, it is damaged, or the folder cannot be written.
     """
     found = Calibration.load(path)
-    texts = found._pages(report=True, figures=figures)
+    texts = pages_of(found.report_data, report=True, figures=figures)
 
     def write(into: Path) -> None:
         for name, text in texts.items():
@@ -710,7 +677,7 @@ def _date_and_days(given: str | None, before: str) -> tuple[str, float | None]:
     try:
         dates = [datetime.fromisoformat(date) for date in (before or text, text)]
     except ValueError:
-        raise InputError("date", f"found {shown(given)}", "a date such as 2026-03-01") from None
+        raise InputError("date", f"found {inputs.shown(given)}", "a date such as 2026-03-01") from None
     first, second = (date if date.tzinfo else date.replace(tzinfo=UTC) for date in dates)
     days = (second - first).total_seconds() / 86400.0
     if days <= -1.0:  # a date without a time zone may be of the same day

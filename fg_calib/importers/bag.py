@@ -238,20 +238,6 @@ class Stops(FrozenArrays):
     scatter: dict[str, Scatter]
 
 
-class _Stop(NamedTuple):
-    """Measurements of one stop: means, and measurements minus these, by quantity, [m] and [rad].
-
-    Rotations are relative to their mean, about its axes.
-    """
-
-    id: str
-    span: tuple[float, float]
-    n_readings: int
-    n_poses: int
-    means: dict[str, Floats]
-    residuals: dict[str, Floats]
-
-
 def average_stops(
     joints: JointStream,
     poses: PoseStream,
@@ -287,20 +273,20 @@ def average_stops(
         raise InputError(f"topic {poses.source.topic}", found, f"at most {most_offset:g} s")
     applied = offset if estimate is None else estimate.seconds
     assert applied is not None
-    stops = [_average(f"stop{k + 1}", joints, poses, span, applied) for k, span in enumerate(spans)]
-    reasons = _reasons_to_skip(stops)
-    good = [stop for stop in stops if stop.id not in reasons]
+    stops, reasons = _centre(joints, poses, np.array(spans), applied)
     origin = float(joints.time[0])
-    skipped = tuple(Skipped(s.id, s.span[0] - origin, reasons[s.id]) for s in stops if s.id in reasons)
+    skipped = tuple(Skipped(f"stop{k + 1}", spans[k][0] - origin, reasons[k]) for k in sorted(reasons))
+    good = [k for k in stops if k not in reasons]
     if not good:
         hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
-        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(stops)} can be used", hint=hint)
-    scatter, sigmas = _scatter(good)
+        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(spans)} can be used", hint=hint)
+    means, residuals = ({kind: [stops[k][kind][part] for k in good] for kind in stops[good[0]]} for part in (0, 1))
+    scatter, sigmas = _scatter(residuals)
     return Stops(
-        ids=tuple(stop.id for stop in good),
-        interval=np.array([stop.span for stop in good]),
-        samples=np.array([float(stop.n_poses) for stop in good]),
-        means={kind: np.array([stop.means[kind] for stop in good]) for kind in good[0].means},
+        ids=tuple(f"stop{k + 1}" for k in good),
+        interval=np.array([spans[k] for k in good]),
+        samples=np.array([float(len(one)) for one in residuals["position"]]),
+        means={kind: np.array(each) for kind, each in means.items()},
         sigmas=sigmas,
         skipped=skipped,
         offset=estimate,
@@ -334,44 +320,52 @@ def _inner(stop: tuple[float, float]) -> tuple[float, float]:
     return stop[0] + trim, stop[1] - trim
 
 
-def _average(name: str, joints: JointStream, poses: PoseStream, span: tuple[float, float], offset: float) -> _Stop:
-    """Means of what was measured during a stop."""
-    a, b = np.searchsorted(joints.time, span)
-    c, d = np.searchsorted(poses.time, np.asarray(span) + offset)
-    if min(b - a, d - c) < MIN_SAMPLES:
-        return _Stop(name, span, int(b - a), int(d - c), {}, {})
-    values, means = {"position": poses.position[c:d]}, dict[str, Floats]()
-    if poses.rotation is not None:
-        single = Rotation.from_matrix(poses.rotation[c:d].copy())
-        means["orientation"] = single.mean().as_matrix()
-        values["orientation"] = (single.mean().inv() * single).as_rotvec()
-    values["joint"] = joints.readings[a:b]
-    residuals = {kind: v - v.mean(axis=0) for kind, v in values.items()}
-    means = {kind: v.mean(axis=0) for kind, v in values.items()} | means
-    return _Stop(name, span, int(b - a), int(d - c), means, residuals)
+def _centre(
+    joints: JointStream, poses: PoseStream, spans: Floats, offset: float
+) -> tuple[dict[int, dict[str, tuple[Floats, Floats]]], dict[int, str]]:
+    """Means of what was measured during stops, and measurements minus these; and why some stops give no row.
 
+    Args:
+        joints: Joint readings.
+        poses: Poses.
+        spans: Beginning and end of each stop, by the joints' clock, shape (n, 2), [s].
+        offset: Of the poses' clock, [s].
 
-def _reasons_to_skip(stops: Sequence[_Stop]) -> dict[str, str]:
-    """Why stops give no row, by name: too few measurements, or poses that scatter far more than those of others."""
-    reasons = {}
-    for stop in stops:
-        if not stop.means:
-            n, what = min((stop.n_readings, "joint readings"), (stop.n_poses, "poses"))
-            reasons[stop.id] = f"{n} {what}, fewer than {MIN_SAMPLES}"
-    for kind in ("position", "orientation"):
-        rms = {stop.id: np.sqrt(np.mean(stop.residuals[kind] ** 2)) for stop in stops if kind in stop.residuals}
-        usual = max(np.median(list(rms.values())), MIN_SIGMA) if rms else 0.0
-        for name, size in rms.items():
+    Returns:
+        By number and quantity, in [m] and [rad], rotations minus their mean about its axes; and the reasons by number:
+        too few measurements, or poses that scatter far more than those of others.
+    """
+    stops, reasons = dict[int, dict[str, tuple[Floats, Floats]]](), dict[int, str]()
+    for k, span in enumerate(spans):
+        (a, b), (c, d) = np.searchsorted(joints.time, span), np.searchsorted(poses.time, span + offset)
+        n, what = min((b - a, "joint readings"), (d - c, "poses"))
+        if n < MIN_SAMPLES:
+            reasons[k] = f"{n} {what}, fewer than {MIN_SAMPLES}"
+            continue
+        stops[k] = {"position": _minus_mean(poses.position[c:d])}
+        if poses.rotation is not None:
+            single = Rotation.from_matrix(poses.rotation[c:d].copy())
+            turns = (single.mean().inv() * single).as_rotvec()
+            stops[k]["orientation"] = single.mean().as_matrix(), _minus_mean(turns)[1]
+        stops[k]["joint"] = _minus_mean(joints.readings[a:b])
+    for kind in ("position", "orientation") if poses.rotation is not None else ("position",):
+        rms = {k: np.sqrt(np.mean(of[kind][1] ** 2)) for k, of in stops.items()}
+        usual = max(np.median([*rms.values()]), MIN_SIGMA) if rms else 0.0
+        for k, size in rms.items():
             if size > MAX_SCATTER_RATIO * usual:
-                reasons.setdefault(name, f"the {kind} scatters {size / usual:.0f} times as much as usual")
-    return reasons
+                reasons.setdefault(k, f"the {kind} scatters {size / usual:.0f} times as much as usual")
+    return stops, reasons
 
 
-def _scatter(stops: Sequence[_Stop]) -> tuple[dict[str, Scatter], dict[str, Floats]]:
+def _minus_mean(values: Floats) -> tuple[Floats, Floats]:
+    """The mean, and values minus it."""
+    return values.mean(axis=0), values - values.mean(axis=0)
+
+
+def _scatter(residuals: Mapping[str, Sequence[Floats]]) -> tuple[dict[str, Scatter], dict[str, Floats]]:
     """Scatter, and the sigma of each stop's mean, by quantity."""
     scatter, sigma = dict[str, Scatter](), dict[str, Floats]()
-    for kind in stops[0].residuals:
-        of = [stop.residuals[kind] for stop in stops]
+    for kind, of in residuals.items():
         tau = correlation_time(of)
         sigma[kind] = sigmas_of_means(of, tau)
         single, mean = np.median([r.std(axis=0) for r in of], axis=0), np.median(sigma[kind], axis=0)

@@ -158,11 +158,12 @@ def summed_up(errors: Floats) -> dict[str, float | None]:
 
 def predict_errors(
     robot: Robot,
-    model: ToolPoseUncertainty,
+    posterior: TangentCovariance,
     measured: Floats,
     readings: Floats | None = None,
     *,
     fitted: bool,
+    sigma_joint: Floats | None = None,
     limit: float | None = None,
 ) -> PredictedErrors:
     """Expected errors at configurations, or all over the workspace, and where they are largest.
@@ -171,12 +172,14 @@ def predict_errors(
 
     Args:
         robot: The calibrated robot, with its limits.
-        model: Expected errors of its tool.
+        posterior: The covariance of its parameters.
         measured: Readings of the measured configurations, shape (m, n_joints), [rad] (prismatic: [m]).
         readings: The configurations, shape (n, n_joints); drawn all over the workspace if None.
         fitted: Whether errors count after the best rigid fit.
+        sigma_joint: Of joint readings, shape (n_joints,), [rad] (prismatic: [m]); None where it is not known.
         limit: Largest allowed position error, [m].
     """
+    model = ToolPoseUncertainty.of(posterior, measured, sigma_joint)
     n, rng = N_DRAWN if readings is None else _N_SAMPLED, np.random.default_rng(0)
     drawn = random_readings(robot, n, rng)
     errors = model.at(drawn if readings is None else readings)

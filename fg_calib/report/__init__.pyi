@@ -6,7 +6,7 @@ from .compare import (
     history_document,
 )
 from .design import build_design_report, design_document, write_design
-from .html import build_page, draw_figures, parameter_table_html
+from .html import pages_of, parameter_table_html
 from .inspect import (
     build_identifiability_report,
     build_inspection_report,
@@ -45,14 +45,12 @@ __all__ = [
     "build_history",
     "build_identifiability_report",
     "build_inspection_report",
-    "build_page",
     "build_prediction_report",
     "build_report",
     "check_document",
     "comparison_document",
     "correction_document",
     "design_document",
-    "draw_figures",
     "format_result",
     "history_document",
     "in_order",
@@ -61,6 +59,7 @@ __all__ = [
     "line",
     "notes_of",
     "observability_document",
+    "pages_of",
     "parameter_table_html",
     "plain",
     "prediction_document",

@@ -83,9 +83,11 @@ def parameter_table_html(result: Result) -> str:
     return _environment().get_template("notebook.html").render(lines=text.summary(result), section=table)
 
 
-def draw_figures(data: text.ReportData) -> dict[str, str]:
-    """The figures of the page as SVG files: text by name."""
-    return {f"{name}.svg": standalone(charts) for name, charts in figures_of(data).items() if charts}
+def pages_of(data: text.ReportData, *, report: bool, figures: bool) -> dict[str, str]:
+    """The page as `report.html`, and its figures as SVG files: text by name."""
+    drawn = figures_of(data) if figures else {}
+    files = {f"{name}.svg": standalone(charts) for name, charts in drawn.items() if charts}
+    return {"report.html": build_page(data)} | files if report else files
 
 
 def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:

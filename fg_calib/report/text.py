@@ -20,7 +20,7 @@ from fg_calib.graph import Solution
 from fg_calib.inputs import LIMITED, Booleans, Floats
 from fg_calib.io import Result, key_of
 from fg_calib.measurements import LANDMARKS
-from fg_calib.prediction import ExpectedError, PredictedErrors, ToolPoseUncertainty, predict_errors
+from fg_calib.prediction import ExpectedError, PredictedErrors, predict_errors
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
 from fg_calib.robot import Robot
@@ -73,8 +73,7 @@ class ReportData:
         """Expected errors over the workspace; None where nothing says what was measured."""
         if self.configurations is None or not len(self.configurations):
             return None
-        model = ToolPoseUncertainty.of(self.posterior, self.readings)
-        return predict_errors(self.robot, model, self.readings, fitted=self.result.free_of_frame)
+        return predict_errors(self.robot, self.posterior, self.readings, fitted=self.result.free_of_frame)
 
     @cached_property
     def rms(self) -> tuple[str, Floats] | None:

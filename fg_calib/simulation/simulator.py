@@ -29,22 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib import inputs
+from fg_calib import inputs, measurements
 from fg_calib.initialization import Camera
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Brief, Floats, FrameKnowledge, InputError, Integers
 from fg_calib.io import NOISE_UNITS
-from fg_calib.measurements import (
-    INSTRUMENTS,
-    Groups,
-    KnownPoint,
-    Labels,
-    Measurements,
-    Noise,
-    Pairs,
-    Table,
-    form_pairs,
-    no_pairs,
-)
+from fg_calib.measurements import INSTRUMENTS, Groups, KnownPoint, Labels, Measurements, Noise, Pairs, Table
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import BoardViews, Configurations, Instrument, Placement, Plane, Scenario, Spot
@@ -316,7 +305,7 @@ class Measuring:
         """Distances and angles between configurations."""
         at, (distances, angles) = self.at(), PAIR_MODELS[self.model]
         assert self.instrument.pairs is not None
-        true = form_pairs(self.rows(position=at.position, rotation=at.rotation), self.instrument.pairs)
+        true = measurements.form_pairs(self.rows(position=at.position, rotation=at.rotation), self.instrument.pairs)
         n, keys = true.n_pairs, ("distance", "angle", "sigma_distance", "sigma_angle")
         found: dict[str, Any] = dict.fromkeys(keys, np.full(n, np.nan))
         if distances:
@@ -372,7 +361,7 @@ class Measuring:
         sockets = self.spots(self.instrument.sockets or {}, "socket", within_reach=True)
         which, places = np.arange(self.n) % len(sockets), np.array([s.xyz for s in sockets.values()])
         which = which[self.touch(places[which] + self.noise("point", self.n, 3))]
-        pairs = no_pairs(f"{self.name}.csv")
+        pairs = measurements.no_pairs(f"{self.name}.csv")
         if len(sockets) > 1:
             a, b = np.triu_indices(len(sockets), 1)
             d = np.linalg.norm(places[b] - places[a], axis=1) + self.noise("distance", len(a))

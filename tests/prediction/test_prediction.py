@@ -200,9 +200,8 @@ def test_arms_that_were_calibrated_are_as_far_off_as_expected(frame):
         m = measure(true, 25, rng, sigma=(2e-4, 2e-4))
         solution = solve(build_problem(robot, m, model="pose", frame=frame))
         estimate = robot.with_values(solution.parameters[solution.problem.variables.robot_span])
-        model = ToolPoseUncertainty.of(spread_of(solution), m.readings)
-        worst = predict_errors(estimate, model, m.readings, q, fitted=frame == "unknown").worst
-        errors = getattr(model.at(q), "fitted" if frame == "unknown" else "base")[:, 0]
+        found = predict_errors(estimate, spread_of(solution), m.readings, q, fitted=frame == "unknown")
+        errors, worst = found.expected[:, 0], found.worst
         off = pose(estimate, q).position - pose(true, q).position
         if frame == "unknown":
             a, b = pose(estimate, m.readings).position, pose(true, m.readings).position
