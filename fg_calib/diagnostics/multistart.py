@@ -23,6 +23,7 @@ from fg_calib.graph import (
     SIGNAL_FLOOR,
     Problem,
     Solution,
+    SolverOptions,
     directions,
     solve,
     with_factors,
@@ -53,6 +54,9 @@ MAX_MIRROR_COST = 10.0
 
 LEAST_GAIN = 0.01
 """Cost by which another optimum must be lower to count as better."""
+
+MOST_ITERATIONS = 50
+"""Of a descent from another start: a second optimum of a plausible arm is nearer."""
 
 MAX_ROWS = 20_000
 """Residuals beyond which weak directions are not searched: a descent takes seconds, and so many rows leave few weak."""
@@ -96,7 +100,7 @@ _objective = attrgetter("objective")
 def _solve_from(solution: Solution, problem: Problem, start: Floats | None = None) -> list[Solution]:
     """The optimum from another start, as a later stage of a solution; none where there is no solution from there."""
     try:
-        other = solve(problem, start=start)
+        other = solve(problem, SolverOptions(MOST_ITERATIONS), start=start)
     except CalibrationError:  # says nothing against the first
         return []
     if start is not None:

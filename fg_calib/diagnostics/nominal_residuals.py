@@ -25,7 +25,7 @@ from fg_calib.robot import Robot
 USUAL = {"m": 2e-3, "rad": 5e-3}
 """1 sigma of true minus nominal where a parameter has no prior: 2 mm and 5 mrad (0.3 degrees)."""
 
-MAX_ROWS, MAX_IMAGES, MAX_CORNERS = 60, 20, 8
+MAX_ROWS, MAX_IMAGES, MAX_CORNERS = 100, 20, 8
 """Train configurations that are looked at, drawn from the table; images, and corners of each."""
 
 MAX_STEPS = 6

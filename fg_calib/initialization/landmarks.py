@@ -68,6 +68,10 @@ def targets_from_positions(
     return Frame(rotation, shift if unknown_frame else np.zeros(3)), places
 
 
+MOST_STEPS = 50
+"""Of least squares of lengths from a start; lengths that are no lengths would take thousands."""
+
+
 def anchors_from_lengths(points: Floats, length: Floats, anchor: Integers, at: Floats) -> list[tuple[Integers, Floats]]:
     """Anchors of unknown place from the lengths to tool points.
 
@@ -131,7 +135,11 @@ def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:
     def misses(a: Floats) -> Floats:
         return np.append(np.linalg.norm(a - points, axis=1) - length, np.zeros(3))  # no fewer than coordinates
 
-    found = [leastsq(misses, start, full_output=True)[0] for start in starts]
+    def slopes(a: Floats) -> Floats:
+        away = a - points
+        return np.vstack([away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None], np.zeros((3, 3))])
+
+    found = [leastsq(misses, start, Dfun=slopes, full_output=True, maxfev=MOST_STEPS)[0] for start in starts]
     best: Floats = min(found, key=lambda a: float(np.sum(misses(a) ** 2)))
     return best
 
