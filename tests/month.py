@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from jobs import UR5E
 from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, true_robot
@@ -11,14 +12,7 @@ from fg_calib import Robot, calibrate, simulate
 from fg_calib.simulation.scenario import Errors
 
 SIGMA = (5e-5, 1e-4)
-ROWS = [
-    [0, np.pi / 2, 0.1625, 0],
-    [-0.425, 0, 0, 0],
-    [-0.3922, 0, 0, 0],
-    [0, np.pi / 2, 0.1333, 0],
-    [0, -np.pi / 2, 0.0997, 0],
-    [0, 0, 0.0996, 0],
-]
+ROWS = [[joint["a"], np.deg2rad(joint["alpha"]), joint["d"], 0] for joint in UR5E["joints"]]
 TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 2e-3}
 
 

@@ -9,7 +9,7 @@ from fg_calib.io.robot_file import write_robot
 from fg_calib.io.tables import write_csv
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Joint, Robot, RobotBuilder
+from fg_calib.robot.model import Robot
 
 PAPER_A = [0, 0, 0, 5, 5, 0, 0]
 PAPER_ALPHA = [0, -90, -90, 0, 0, 90, 90]
@@ -19,35 +19,25 @@ TOOL = [f"tool.{k}" for k in ("x", "y", "z", "roll", "pitch", "yaw")]
 
 def paper_robot(tolerance=None, fixed=(), estimate=()) -> Robot:
     """Table 2 of Jia et al. (2019)."""
-    builder = RobotBuilder("space-robot", "mdh-hayati")
-    builder.add_frame("base", {}, 0, False)
-    for i in range(7):
-        values = {"a": PAPER_A[i], "alpha": np.deg2rad(PAPER_ALPHA[i]), "d": PAPER_D[i], "theta": 0.0, "beta": 0.0}
-        builder.add_convention_joint(Joint(f"q{i + 1}"), values)
-    builder.add_frame("tool", {}, 8, False)
-    return builder.build(tolerance=tolerance, fixed=fixed, estimate=estimate)
+    rows, more = np.column_stack([PAPER_A, np.deg2rad(PAPER_ALPHA), PAPER_D, np.zeros((7, 2))]), {"estimate": estimate}
+    return Robot.from_dh(rows, "mdh-hayati", name="space-robot", tolerance=tolerance, fixed=fixed, **more)
 
 
-def planar_robot(tolerance=None) -> Robot:
-    """Two links of 2 m and 1 m in the plane; only the lengths and the second offset are unknown."""
-    builder = RobotBuilder("planar", "dh")
-    builder.add_frame("base", {}, 0, False)
-    for i, length in enumerate((2.0, 1.0)):
-        builder.add_convention_joint(Joint(f"q{i + 1}"), {"theta": 0.0, "d": 0.0, "a": length, "alpha": 0.0})
-    builder.add_frame("tool", {}, 3, False)
-    return builder.build(fixed=["theta1", "d1", "alpha1", "d2", "alpha2"], tolerance=tolerance)
+KNOWN = ("theta1", "d1", "alpha1", "d2", "alpha2")
+
+
+def planar_robot(tolerance=None, *, name="planar", fixed=KNOWN, **more) -> Robot:
+    """Two links of 2 m and 1 m in the plane; by default only the lengths and the second offset are unknown."""
+    return Robot.from_dh([[2, 0, 0, 0], [1, 0, 0, 0]], "dh", name=name, fixed=fixed, tolerance=tolerance, **more)
 
 
 def small_arm(tolerance=None, estimate=()) -> Robot:
     """A generic 4-joint arm without special geometry, one joint prismatic: 4 DH parameters a joint."""
-    base = random_robot("mdh", 4, np.random.default_rng(2))
-    builder = RobotBuilder("small-arm", "mdh")
-    builder.add_frame("base", {}, 0, False)
-    for i, joint in enumerate(base.joints):
-        values = {p.kind: p.nominal for p in base.parameters if p.owner == i + 1}
-        builder.add_convention_joint(Joint(joint.name, prismatic=i == 2), values)
-    builder.add_frame("tool", {"x": 0.1, "y": -0.05, "z": 0.2, "roll": 0.3, "pitch": 0.4, "yaw": -0.5}, 5, False)
-    return builder.build(tolerance=tolerance, estimate=estimate)
+    values = {p.name: p.nominal for p in random_robot("mdh", 4, np.random.default_rng(2)).parameters}
+    rows = [[values[f"{kind}{i + 1}"] for kind in ("a", "alpha", "d", "theta")] for i in range(4)]
+    more = {"names": ["j1", "j2", "j3", "j4"], "types": ["revolute", "revolute", "prismatic", "revolute"]}
+    tool = [0.1, -0.05, 0.2, 0.3, 0.4, -0.5]
+    return Robot.from_dh(rows, "mdh", name="small-arm", tool=tool, tolerance=tolerance, estimate=estimate, **more)
 
 
 def true_robot(robot: Robot, rng: np.random.Generator) -> Robot:
@@ -63,17 +53,7 @@ def plus(array, rows, amount):
     return changed
 
 
-def measure(
-    true: Robot,
-    n: int,
-    rng: np.random.Generator,
-    *,
-    sigma=(1e-3, 2e-4),
-    sigma_joint=0.0,
-    frame=None,
-    n_test=0,
-    readings=None,
-) -> Measurements:
+def measure(true, n, rng, *, sigma=(1e-3, 2e-4), sigma_joint=0.0, frame=None, n_test=0, readings=None) -> Measurements:
     """Poses of the true robot at random configurations, with noise; `frame` is (Rotation, translation) world_T_base."""
     total = n + n_test
     q = rng.uniform(-np.pi, np.pi, (total, true.n_joints)) if readings is None else readings
@@ -82,16 +62,8 @@ def measure(
     position = turn.apply(at.position) + shift + sigma[0] * rng.normal(size=(total, 3))
     noise = Rotation.from_rotvec(sigma[1] * rng.normal(size=(total, 3)))
     rotation = (turn * Rotation.from_matrix(at.rotation) * noise).as_matrix()
-    return Measurements(
-        readings=q,
-        ids=np.arange(total).astype(str),
-        test=np.arange(total) >= n,
-        position=position,
-        rotation=rotation,
-        sigma_position=np.full((total, 3), sigma[0]),
-        sigma_orientation=np.full((total, 3), sigma[1]),
-        sigma_joint=np.full(true.n_joints, sigma_joint),
-    )
+    sigmas = (*(np.full((total, 3), one) for one in sigma), np.full(true.n_joints, sigma_joint))
+    return Measurements(q, np.arange(total).astype(str), np.arange(total) >= n, position, rotation, *sigmas)
 
 
 def write_job(folder, robot: Robot, m: Measurements, /, **job):

@@ -16,18 +16,9 @@ from fg_calib.robot.kinematics import build_chain, pose
 
 
 def direct_pairs(distance, angle, sigma=(1e-3, 1e-3), test=None):
-    n = len(distance)
-    rows = np.arange(n)
-    return Pairs(
-        a=2 * rows,
-        b=2 * rows + 1,
-        distance=np.array(distance, dtype=float),
-        angle=np.array(angle, dtype=float),
-        sigma_distance=np.full(n, sigma[0]),
-        sigma_angle=np.full(n, sigma[1]),
-        test=np.zeros(n, dtype=bool) if test is None else np.array(test),
-        source="pairs.csv",
-    )
+    n, rows = len(distance), np.arange(len(distance))
+    measured, sigmas = np.array([distance, angle], dtype=float), (np.full(n, one) for one in sigma)
+    return Pairs(2 * rows, 2 * rows + 1, *measured, *sigmas, np.array(test or [False] * n), "pairs.csv")
 
 
 def bare(robot, q, pairs=None, sigma_joint=0.0):

@@ -22,7 +22,7 @@ from fg_calib.io.tables import read_measurements
 from fg_calib.measurements.dataset import Noise
 from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.model import Robot
 from fg_calib.robot.rotations import rotation_angle
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
@@ -129,16 +129,13 @@ def test_where_rounding_hides_the_optimum_nothing_has_converged():
 
 def arm(unit, *, convention="mdh", n=4, seed=2, tolerance=None):
     """A random arm with one sliding joint, its lengths times `unit`; `tolerance` in [m] and [rad] at unit 1."""
-    builder, shape = RobotBuilder("arm", convention), random_robot(convention, n, np.random.default_rng(seed))
-    builder.add_frame("base", {}, 0, False)
-    for i, joint in enumerate(shape.joints):
-        own = [p for p in shape.parameters if p.owner == i + 1]
-        values = {p.kind: p.nominal * (unit if p.unit == "m" else 1.0) for p in own}
-        builder.add_convention_joint(Joint(joint.name, prismatic=i == 2), values)
-    builder.add_frame("tool", {"x": 0.1 * unit, "z": 0.2 * unit, "roll": 0.3, "pitch": 0.4}, n + 1, False)
-    kinds = {p.kind: p.unit for p in shape.parameters if 1 <= p.owner <= n}
-    scaled = {kind: tolerance * (unit if u == "m" else 1.0) for kind, u in kinds.items()} if tolerance else None
-    return builder.build(tolerance=scaled)
+    shape, kinds = random_robot(convention, n, np.random.default_rng(seed)), ("a", "alpha", "d", "theta", "beta")
+    values = {p.name: p.nominal * (unit if p.unit == "m" else 1.0) for p in shape.parameters}
+    kinds = kinds[: 4 + ("beta1" in values)]
+    rows = [[values[f"{kind}{i + 1}"] for kind in kinds] for i in range(n)]
+    scaled = {kind: tolerance * (unit if kind in "ad" else 1.0) for kind in kinds} if tolerance else None
+    tool, types = [0.1 * unit, 0, 0.2 * unit, 0.3, 0.4, 0], ["prismatic" if i == 2 else "revolute" for i in range(n)]
+    return Robot.from_dh(rows, convention, types=types, tool=tool, tolerance=scaled)
 
 
 def measured(robot, unit, n, rng, *, error, sigma_joint):

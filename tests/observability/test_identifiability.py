@@ -6,7 +6,7 @@ from simulated import measure, paper_robot
 
 from fg_calib.observability.identifiability import observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.model import Robot
 
 MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")
 OFF_AXIS = {"x": 0.1, "y": 0.05, "z": 0.2, "roll": 0.3}
@@ -14,13 +14,9 @@ H = np.pi / 2
 
 
 def mdh_robot(name, a, alpha, d, tool=None, prismatic=(), theta=None):
-    builder = RobotBuilder(name, "mdh")
-    builder.add_frame("base", {}, 0, False)
-    for i in range(len(a)):
-        values = {"a": a[i], "alpha": alpha[i], "d": d[i], "theta": 0.0 if theta is None else theta[i]}
-        builder.add_convention_joint(Joint(f"q{i + 1}", prismatic=i + 1 in prismatic), values)
-    builder.add_frame("tool", tool or {}, len(a) + 1, False)
-    return builder.build()
+    rows = np.column_stack([a, alpha, d, np.zeros(len(a)) if theta is None else theta])
+    types = ["prismatic" if i + 1 in prismatic else "revolute" for i in range(len(a))]
+    return Robot.from_dh(rows, "mdh", name=name, types=types, tool=tool)
 
 
 def generic(tool=None):

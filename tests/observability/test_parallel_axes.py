@@ -12,7 +12,7 @@ from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.io.robot_file import read_robot
 from fg_calib.observability.parallel_axes import missing_motions
-from fg_calib.robot.model import Axis, Joint, RobotBuilder
+from fg_calib.robot.model import Axis, Robot
 
 QUARTER, SIGMA = np.pi / 2, (5e-5, 1e-4)
 TILT, SHIFT = (Axis.RY,), (Axis.TY,)
@@ -21,13 +21,9 @@ BOTH, TURNS = (Axis.TY, Axis.RY), (Axis.RX, Axis.RY, Axis.RZ)
 
 def arm(convention, *joints, tool=(0.1, 0.2)):
     """An arm of (a, alpha in degrees, d) a joint, a fourth figure makes it slide; x and z of its tool."""
-    builder = RobotBuilder("arm", convention)
-    builder.add_frame("base", {}, 0, False)
-    for i, (a, alpha, d, *slides) in enumerate(joints):
-        values = {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0, "beta": 0.0}
-        builder.add_convention_joint(Joint(f"q{i + 1}", prismatic=bool(slides)), values)
-    builder.add_frame("tool", {"x": tool[0], "z": tool[1]}, len(joints) + 1, False)
-    return builder.build()
+    rows = [[a, np.deg2rad(alpha), d, 0.0] for a, alpha, d, *_ in joints]
+    types = ["prismatic" if slides else "revolute" for *_, slides in ((*joint, "")[:4] for joint in joints)]
+    return Robot.from_dh(rows, convention, types=types, tool=[tool[0], 0.0, tool[1]])
 
 
 UR = ((0, 90, 0.16), (-0.43, 0, 0), (-0.39, 0, 0), (0, 90, 0.13), (0, -90, 0.1), (0, 0, 0.1))

@@ -10,7 +10,7 @@ from fg_calib.prediction import workspace
 from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
 from fg_calib.prediction.workspace import predict_errors, summed_up
 from fg_calib.robot import pose
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib.robot.model import Robot
 from fg_calib.statistics.covariance import spread_of
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
@@ -98,10 +98,7 @@ def test_where_nothing_was_measured_is_far(calibrated, monkeypatch):
 
 
 def test_a_slide_without_limits_is_drawn_within_a_metre():
-    builder, none = RobotBuilder("slide", "dh"), {"a": 0.5, "alpha": 0.0, "d": 0.0, "theta": 0.0}
-    builder.add_convention_joint(Joint("swing", lower=-2.0, upper=2.0), none)
-    builder.add_convention_joint(Joint("slide", prismatic=True), none)
-    robot = builder.build()
+    robot = Robot.from_dh([[0.5, 0, 0, 0]] * 2, types=["revolute", "prismatic"], limits=[(-2.0, 2.0), None])
     q = np.column_stack([np.linspace(-0.5, 1.9, 25), np.linspace(0.1, 0.9, 25)])
     result = calibrate(robot, measure(robot, 25, np.random.default_rng(0), readings=q), model="pose", gauge="none")
     slides = predict(result).errors.position[:, 2]

@@ -5,20 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 from reported import format_report
-from simulated import measure, plus, small_arm, true_robot
+from simulated import measure, planar_robot, plus, small_arm, true_robot
 
 from fg_calib import Measurements, Pairing, assess, build_problem, solve
-from fg_calib.robot.model import Joint, Robot, RobotBuilder
+from fg_calib.robot.model import Robot
 
 
 def planar_arm(tolerance=None) -> Robot:
     """Two links of 2 m and 1 m in a plane; unknown are both lengths, and by `tolerance` the last joint's offset d2."""
-    builder = RobotBuilder("two-links", "dh")
-    builder.add_frame("base", {}, 0, False)
-    for i, length in enumerate((2.0, 1.0)):
-        builder.add_convention_joint(Joint(f"q{i + 1}"), {"theta": 0.0, "d": 0.0, "a": length, "alpha": 0.0})
-    builder.add_frame("tool", {}, 3, False)
-    return builder.build(fixed=["theta1", "d1", "alpha1", "theta2", "alpha2"], tolerance=tolerance)
+    fixed = ["theta1", "d1", "alpha1", "theta2", "alpha2"]
+    return planar_robot(tolerance, name="two-links", fixed=fixed)
 
 
 def planar_measurements(n_test=2) -> Measurements:
@@ -30,16 +26,7 @@ def planar_measurements(n_test=2) -> Measurements:
     )
     position = np.vstack([position, np.zeros(8)]).T
     position[:, :2] += 1e-3 * np.array([[1, -1], [-1, 1], [1, 1], [-1, -1], [1, -1], [-1, 1], [1, 1], [-1, -1]])
-    return Measurements(
-        readings=q,
-        ids=np.arange(8).astype(str),
-        test=np.arange(8) >= 8 - n_test,
-        position=position,
-        rotation=None,
-        sigma_position=np.full((8, 3), 1e-3),
-        sigma_orientation=None,
-        sigma_joint=np.zeros(2),
-    )
+    return Measurements.from_arrays(q, position=position, sigma_position=1e-3, test=np.arange(8) >= 8 - n_test)
 
 
 def report(robot, measurements, **settings):

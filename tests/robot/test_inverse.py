@@ -9,7 +9,7 @@ from tolerances import rounding
 from fg_calib.inputs import InputError
 from fg_calib.robot.inverse import REACHED, random_readings, solve_inverse
 from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import CONVENTIONS, Joint, RobotBuilder
+from fg_calib.robot.model import CONVENTIONS, Robot
 
 
 def poses_of(robot, q):
@@ -31,13 +31,8 @@ def require_reached(robot, found, T):
 def elbow_arm(limit):
     """A six-joint arm with an elbow and a wrist; all joints turn +-limit degrees."""
     rows = [(0, 0, 0.67), (0, -90, 0.15), (0.43, 0, 0), (0.02, -90, 0.43), (0, 90, 0), (0, -90, 0)]
-    builder = RobotBuilder("elbow", "mdh")
-    builder.add_frame("base", {"x": 0.3, "yaw": 0.4}, 0, False)
-    for i, (a, alpha, d) in enumerate(rows):
-        joint = Joint(f"q{i + 1}", lower=-np.deg2rad(limit), upper=np.deg2rad(limit))
-        builder.add_convention_joint(joint, {"a": a, "alpha": np.deg2rad(alpha), "d": d, "theta": 0.0})
-    builder.add_frame("tool", {"z": 0.1, "pitch": 0.2}, 7, False)
-    return builder.build()
+    rows, limits = [(a, np.deg2rad(alpha), d, 0) for a, alpha, d in rows], [np.deg2rad([-limit, limit])] * 6
+    return Robot.from_dh(rows, "mdh", limits=limits, base={"x": 0.3, "yaw": 0.4}, tool={"z": 0.1, "pitch": 0.2})
 
 
 ARMS = [
@@ -56,13 +51,7 @@ def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
 
 
 def test_limits_that_are_no_whole_turn_about_zero_are_kept():
-    builder = RobotBuilder("shifted", "dh")
-    builder.add_frame("base", {}, 0, False)
-    for i in range(2):
-        joint = Joint(f"q{i + 1}", lower=np.deg2rad(200), upper=np.deg2rad(500))
-        builder.add_convention_joint(joint, {"theta": 0.0, "d": 0.0, "a": 1.0, "alpha": 0.0})
-    builder.add_frame("tool", {}, 3, False)
-    robot, rng = builder.build(), np.random.default_rng(2)
+    robot, rng = planar_robot(limits=[np.deg2rad([200, 500])] * 2), np.random.default_rng(2)
     T = poses_of(robot, random_readings(robot, 50, rng))
     require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
@@ -120,13 +109,7 @@ def test_what_cannot_be_reached_is_told_with_its_miss():
 @pytest.mark.slow
 def test_a_limit_that_is_in_the_way_is_not_passed():
     """Two links of 2 and 1 m: 2.2 m away needs an elbow of 90 degrees or so, and here it opens by 30 at most."""
-    builder = RobotBuilder("stiff", "dh")
-    builder.add_frame("base", {}, 0, False)
-    for i, (length, limit) in enumerate(((2.0, np.pi), (1.0, np.deg2rad(30)))):
-        joint = Joint(f"q{i + 1}", lower=-limit, upper=limit)
-        builder.add_convention_joint(joint, {"theta": 0.0, "d": 0.0, "a": length, "alpha": 0.0})
-    builder.add_frame("tool", {}, 3, False)
-    robot = builder.build()
+    robot = planar_robot(limits=np.deg2rad([[-180, 180], [-30, 30]]))
     T = tool_pose(planar_robot(), np.array([0.2, np.deg2rad(90)]))
     found = solve_inverse(robot, T[None, :3, 3], T[None, :3, :3], generator=np.random.default_rng(6))
     assert not found.reached[0]
@@ -149,19 +132,10 @@ def test_no_poses_are_no_work():
 
 
 def test_random_readings_fill_the_limits():
-    builder = RobotBuilder("slides", "mdh")
-    builder.add_frame("base", {}, 0, False)
-    joints = [
-        Joint("a", lower=-0.5, upper=2.0),
-        Joint("b"),
-        Joint("c", prismatic=True),
-        Joint("d", prismatic=True, lower=3.0),
-        Joint("e", upper=1.0),
-    ]
-    for joint in joints:
-        builder.add_convention_joint(joint, {"theta": 0.0, "d": 0.0, "a": 1.0, "alpha": 0.0})
-    builder.add_frame("tool", {}, 6, False)
-    q = random_readings(builder.build(), 4000, np.random.default_rng(0))
+    limits = [(-0.5, 2), None, None, (3, np.inf), (-np.inf, 1)]
+    types = [*["revolute"] * 2, *["prismatic"] * 2, "revolute"]
+    robot = Robot.from_dh([[1, 0, 0, 0]] * 5, "mdh", types=types, limits=limits)
+    q = random_readings(robot, 4000, np.random.default_rng(0))
     low, high = [-0.5, -np.pi, -1, 3, 1 - 2 * np.pi], [2, np.pi, 1, 5, 1]
     assert (q >= low).all()
     assert (q <= high).all()

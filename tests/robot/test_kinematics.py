@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from oracle import central_differences, dh_joint, frame, random_robot, rotation, tool_pose, translation
 from scipy.spatial.transform import Rotation
+from simulated import planar_robot
 from sparing import diagonal
 from tolerances import rounding
 
@@ -17,10 +18,7 @@ CASES = [(c, n) for c in [*CONVENTIONS, "urdf"] for n in (1, 2, 3, 6, 7, 12)]
 
 
 def test_a_planar_arm_reaches_where_one_can_draw_it():
-    builder = RobotBuilder("planar", "dh")
-    for i, length in enumerate((2.0, 1.0)):
-        builder.add_convention_joint(Joint(f"q{i + 1}"), {"theta": 0.0, "d": 0.0, "a": length, "alpha": 0.0})
-    poses = pose(builder.build(), [[0.0, 0.0], [np.pi / 2, 0.0], [np.pi / 2, -np.pi / 2]])
+    poses = pose(planar_robot(), [[0.0, 0.0], [np.pi / 2, 0.0], [np.pi / 2, -np.pi / 2]])
     assert poses.position == pytest.approx(np.array([[3, 0, 0], [0, 3, 0], [1, 2, 0]]), abs=rounding(1.0))
     assert poses.rotation[2] == pytest.approx(np.eye(3), abs=rounding(1.0))
 
