@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 
 from fg_calib.assessment import assess
-from fg_calib.diagnostics.verdict import check_chi_square
+from fg_calib.diagnostics.setup_check import SetupCheck
+from fg_calib.diagnostics.unmodelled_effects import Change, Systematic
+from fg_calib.diagnostics.verdict import Case, check_chi_square
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.robot.kinematics import pose
@@ -81,6 +84,22 @@ def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severi
     assert [one.severity for one in found] == ([] if severity is None else [severity])
     assert all(words in one.text for one in found)
     assert all(("by as much" in one.text) == ("by as much" in words) for one in found)
+
+
+@pytest.mark.parametrize(
+    ("more", "alone"),
+    [
+        ({}, True),
+        ({"systematic": Systematic(0.5)}, True),
+        ({"systematic": Systematic(1e-9)}, False),
+        ({"systematic": Systematic(1e-9), "setup": SetupCheck(explanations=("exchanged",))}, True),
+        ({"change": Change("tool", 3, 0.1)}, False),
+    ],
+)
+def test_gross_errors_are_not_all_that_is_wrong_beside_a_change_or_an_effect(more, alone):
+    gross = GrossErrors(1, ("7",), 1.1)
+    fit = SimpleNamespace(goodness=SimpleNamespace(gross_alone=True, gross=gross))
+    assert Case(None, None, fit, **more).gross == (gross if alone else None)
 
 
 # --- priors ---------------------------------------------------------------------------------------------------------

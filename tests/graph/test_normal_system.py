@@ -112,6 +112,16 @@ def test_a_null_direction_stays_where_it_is():
     assert abs(null @ (system.step / np.array([1.0, 1.0, 1.0, 1.0, 9.0]))) < 1e-12  # least norm in the scales
 
 
+def test_a_step_damped_in_its_coordinates_is_marquardts_in_the_scales():
+    rng, scales, damping = np.random.default_rng(4), np.array([0.1, 1.0, 3.0]), 1e-2
+    A, r = rng.normal(size=(20, 3)), rng.normal(size=20)
+    system = NormalSystem(np.column_stack([A, r]), 3, scales)
+    w = system.weights
+    damped = damping * np.linalg.norm(A * scales, 2) ** 2 * np.diag(scales**-2.0)
+    wanted = -np.linalg.solve(A.T @ A + damped, A.T @ r)
+    close(system.full_root @ (w * w * system.coordinates / (w * w + damping)), wanted)
+
+
 def test_landmarks_that_nothing_determines_are_named():
     rng = np.random.default_rng(3)
     A = rng.normal(size=(30, 6))

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import measure, true_robot
 
 from fg_calib import InputError, Robot, calibrate, correct
 from fg_calib.prediction import correction
-from fg_calib.robot import pose
 from fg_calib.robot.inverse import random_readings
 
 ROWS = [[0, 90, 118, 0], [-613, 0, 0, 0], [-572, 0, 0, 0], [0, 90, 164, 0], [0, -90, 116, 0], [0, 0, 92, 0]]
@@ -108,20 +107,6 @@ def test_targets_in_the_measurement_frame_are_reached_there():
     assert given.expected[:, 0].max() < 5e-5
     by_base = correct(found, T[:, :3, 3], T[:, :3, :3], near=q)
     assert by_base.expected_fitted < 5e-5 < by_base.expected[:, 0].max()  # where the base is, priors alone say
-
-
-@pytest.mark.slow
-def test_an_arm_of_four_joints_keeps_the_point_of_a_pose():
-    tolerance = {kind: sigma for kind, sigma in TOLERANCE.items() if kind != "beta"}
-    robot, rng = small_arm(tolerance), np.random.default_rng(7)
-    found = calibrate(robot, measure(true_robot(robot, rng), 30, rng), model="pose")
-    q = rng.uniform(-1.0, 1.0, (5, 4))
-    given = correct(found, near=q)
-    at = pose(found.robot, given.readings)
-    assert np.abs(at.position - pose(robot, q).position).max() < 1e-9
-    assert not given.reached.any()
-    assert (given.missed[:, 1] <= given.uncorrected[:, 1] + 1e-3).all()
-    assert (given.missed[:, 1] < 0.02).all()
 
 
 @pytest.mark.parametrize(

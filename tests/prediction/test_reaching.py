@@ -57,6 +57,12 @@ ARMS = {
 }
 
 
+def test_where_nobody_says_the_search_starts_amid_the_limits():
+    """And where there are not both, at 0 or what is nearest to it."""
+    limits = [[-1.0, 3.0], None, [0.5, np.inf], [-np.inf, -0.5]]
+    assert correction._middle(Robot.from_dh(SCARA, "mdh", limits=limits)).tolist() == [1.0, 0.0, 0.5, -0.5]
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ARMS)
 def test_no_target_that_can_be_reached_is_missed_although_nobody_says_from_where(name):

@@ -91,6 +91,8 @@ FOUR = [row[:4] for row in ROWS]
         ({"tolerance": {"a": "1e-3"}}, "tolerance: a: found '1e-3', expected a finite number above 0$"),
         ({"tool": {"w": 1.0}}, "tool: unknown value 'w', expected one of x, y, z, yaw, pitch, roll$"),
         ({"tool": {"x": "far"}}, r"tool: x: found 'far', expected numbers of shape \(\)$"),
+        ({"tool": [0, 0, 0.1, 90, 0, 0]}, r"tool: roll: found 90, expected angles in rad, .* most; is it in deg\?$"),
+        ({"tool": {"roll": 90}}, r"tool: roll: found 90, expected angles in rad, .* most; is it in deg\?$"),
         ({"estimate": 3}, "estimate: found 3, expected a list of names$"),
         ({"fixed": [None]}, "robot: fixed: unknown parameter None, expected one of base.x"),
         ({"fixed": ["a9"]}, "robot: fixed: unknown parameter 'a9'"),
@@ -127,25 +129,34 @@ def test_the_text_of_a_urdf_is_no_path():
         Robot.from_urdf('<?xml version="1.0"?>\n<robot name="arm"/>')
 
 
-@pytest.mark.parametrize(("values", "found"), [(None, "shape ()"), ([1.0], "1 values"), ([[1.0]], "shape (1, 1)")])
-def test_values_are_one_a_parameter(values, found):
-    robot = Robot.from_dh(FOUR)
-    with pytest.raises(InputError) as said:
-        robot.with_values(values)
-    assert str(said.value) == f"robot: {found}, expected {len(robot.parameters)}, one a parameter"
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (None, r"robot: shape \(\), expected 24, one a parameter$"),
+        ([1.0], "robot: 1 values, expected 24, one a parameter$"),
+        ([[1.0]], r"robot: shape \(1, 1\), expected 24, one a parameter$"),
+        ([0.0, 0.0, 0.0, np.nan, *np.zeros(20)], "robot: row 3: found nan, expected a finite number$"),
+    ],
+)
+def test_values_are_finite_and_one_a_parameter(values, message):
+    with pytest.raises(InputError, match=message):
+        Robot.from_dh(FOUR).with_values(values)
 
 
-def test_values_are_finite():
-    robot = Robot.from_dh(FOUR)
-    with pytest.raises(InputError, match=r"^robot: row 3: found nan, expected a finite number$"):
-        robot.with_values([0.0, 0.0, 0.0, np.nan, *robot.nominal[4:]])
-
-
-@pytest.mark.parametrize("tool", [[0, 0, 0.1, 90, 0, 0], {"roll": 90}])
-def test_a_frame_in_degrees_is_refused(tool):
-    with pytest.raises(InputError) as said:
-        Robot.from_dh(FOUR, tool=tool)
-    assert str(said.value) == "tool: roll: found 90, expected angles in rad, two turns at most; is it in deg?"
+@pytest.mark.parametrize(
+    ("limits", "slide"), [([-0.5, 0.2], 0.4), ([0.1, 0.3], 0.4), (None, 0.1), ([0.2, np.inf], 0.3)]
+)
+def test_an_arm_reaches_as_far_as_its_lengths_and_what_slides_go(limits, slide):
+    """From its base, wherever that stands; what slides is 0.1 m long at 0."""
+    rows = [[-0.3, 1.0, 0.2, 0.5], [0.0, 1.0, 0.1, 0.5]]
+    settings = {
+        "types": ["revolute", "prismatic"],
+        "limits": [[-1.0, 2.0], limits],
+        "base": [0, 0, 5],
+        "tool": [0, 0, -0.7],
+    }
+    assert Robot.from_dh(rows, **settings).reach == pytest.approx(0.3 + 0.2 + slide + 0.7)
+    assert Robot.from_dh(np.zeros((2, 4))).reach == 1.0
 
 
 @pytest.mark.parametrize(("limit", "told"), [(170.0, True), (20.0, False)])
