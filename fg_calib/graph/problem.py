@@ -511,9 +511,11 @@ def loss_variance(problem: Problem) -> float:
     """The factor by which a robust loss makes the variance of the estimate larger: the mean over the measurements."""
     if problem.state.weights is None:
         return 1.0
-    n_rows = np.concatenate([s.used[s.train].sum(axis=1) for s in problem.data.blocks])
-    counts = np.bincount(n_rows)
-    return float(sum(n * effect(problem.options.loss, dim).variance for dim, n in enumerate(counts) if n) / len(n_rows))
+    blocks, loss = problem.data.blocks, problem.options.loss
+    n_rows = np.concatenate([s.used[s.train].sum(axis=1) for s in blocks])
+    low = np.concatenate([w[s.train] < 0.5 for w, s in zip(problem.state.weights, blocks, strict=True)])
+    each = [(effect(loss, dim, float(low[n_rows == dim].mean())), n_rows == dim) for dim in np.unique(n_rows).tolist()]
+    return float(sum(of.variance * np.count_nonzero(rows) for of, rows in each) / len(n_rows))
 
 
 def correlation(problem: Problem, parameters: Floats) -> Floats | None:

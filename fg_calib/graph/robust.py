@@ -50,6 +50,9 @@ INLIERS = 0.99
 HALF_WEIGHT: dict[Loss, float] = {"huber": 2.0, "cauchy": 1.0, "geman-mcclure": (2.0**0.5 - 1.0) ** 0.5, "gnc": 1.0}
 """Residual, in the constant c, where a loss has the weight 1/2: larger ones are outliers."""
 
+FAR = 1e6
+"""Residual of an outlier, in the constant c."""
+
 SCHEDULE = 1.4
 """Factor by which `gnc` makes its surrogate less convex in each round (Yang et al. 2020)."""
 
@@ -109,7 +112,7 @@ def constants(loss: Loss, residual_dim: NDArray[np.int64]) -> Floats:
 
 @dataclass(frozen=True)
 class Effect:
-    """Efficiency of a robust loss on Gaussian residuals.
+    """Efficiency of a robust loss on Gaussian residuals, with some outliers among them.
 
     Attributes:
         variance: Factor from the covariance by weighted rows to that of the estimate.
@@ -121,8 +124,11 @@ class Effect:
 
 
 @cache
-def effect(loss: Loss, dim: int) -> Effect:
-    """Efficiency of a loss on Gaussian measurements of `dim` rows."""
+def effect(loss: Loss, dim: int, low: float = 0.0) -> Effect:
+    """Efficiency of a loss on measurements of `dim` rows, a share `low` of which keeps less than half its weight.
+
+    What is more than of Gaussian ones is outliers, which are far off: they have the loss's last psi, weight, and slope.
+    """
     if loss == "none":
         return Effect(1.0, 1.0)
     c = tuning(loss, dim)
@@ -133,6 +139,9 @@ def effect(loss: Loss, dim: int) -> Effect:
         return np.stack([np.ones_like(e), weight(loss, e, c) * e**2])
 
     kept, chi2 = _means(terms, dim, (0.0, min(c, end), end))
+    outliers = max(0.0, 1.0 - (1.0 - low) / kept)
+    psi = FAR * c * float(weight(loss, np.array(FAR * c), c))
+    squared += outliers / max(1.0 - outliers, 0.5) * psi**2 / dim
     return Effect(float(mean * squared / slope**2), float(chi2 / (dim * kept)))
 
 
