@@ -5,23 +5,10 @@ import numpy as np
 from fg_calib import Robot
 from fg_calib.io import read_urdf
 
-UR10 = [
-    [0, np.pi / 2, 0.1273, 0, 0],
-    [-0.612, 0, 0, 0, 0],
-    [-0.5723, 0, 0, 0, 0],
-    [0, np.pi / 2, 0.163941, 0, 0],
-    [0, -np.pi / 2, 0.1157, 0, 0],
-    [0, 0, 0.0922, 0, 0],
-]
-SEVEN = [
-    [0, 0, 0.333, 0],
-    [0, -np.pi / 2, 0, 0],
-    [0, np.pi / 2, 0.316, 0],
-    [0.0825, np.pi / 2, 0, 0],
-    [-0.0825, -np.pi / 2, 0.384, 0],
-    [0, np.pi / 2, 0, 0],
-    [0.088, np.pi / 2, 0.107, 0],
-]
+UR10 = [[0, np.pi / 2, 0.1273, 0, 0], [-0.612, 0, 0, 0, 0], [-0.5723, 0, 0, 0, 0],
+        [0, np.pi / 2, 0.163941, 0, 0], [0, -np.pi / 2, 0.1157, 0, 0], [0, 0, 0.0922, 0, 0]]  # fmt: skip
+SEVEN = [[0, 0, 0.333, 0], [0, -np.pi / 2, 0, 0], [0, np.pi / 2, 0.316, 0], [0.0825, np.pi / 2, 0, 0],
+         [-0.0825, -np.pi / 2, 0.384, 0], [0, np.pi / 2, 0, 0], [0.088, np.pi / 2, 0.107, 0]]  # fmt: skip
 SCARA = [[0.2, 0, 0.4, 0, 0], [0.325, 0, 0, 0, 0], [0.275, np.pi, 0, 0, 0], [0, 0, 0, 0, 0]]
 """The slide is the third: it goes down."""
 
@@ -71,9 +58,9 @@ def seven():
     return Robot.from_dh(SEVEN, "mdh", name="seven", limits=limits, tool=[0, 0, 0.2], base=[1, 2, 3, 0.1, 0.2, 0.3])
 
 
-def scara():
+def scara(last=None):
     types = ["revolute", "revolute", "prismatic", "revolute"]
-    limits = [(-2.5, 2.5), (-2.6, 2.6), (0.0, 0.2), None]
+    limits = [(-2.5, 2.5), (-2.6, 2.6), (0.0, 0.2), last]
     return Robot.from_dh(SCARA, "mdh-hayati", name="scara", types=types, limits=limits, tool=[0.02, 0, 0.05])
 
 

@@ -1,15 +1,18 @@
 """Robots and simulated measurements that several test files use."""
 
+from dataclasses import replace
+
 import numpy as np
 import yaml
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 
-from fg_calib.io.robot_file import write_robot
-from fg_calib.io.tables import write_csv
+from fg_calib.io import Units, write_csv, write_robot
 from fg_calib.measurements.dataset import Measurements
+from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.simulation import table_columns
 
 PAPER_A = [0, 0, 0, 5, 5, 0, 0]
 PAPER_ALPHA = [0, -90, -90, 0, 0, 90, 90]
@@ -68,19 +71,12 @@ def measure(true, n, rng, *, sigma=(1e-3, 2e-4), sigma_joint=0.0, frame=None, n_
 
 def write_job(folder, robot: Robot, m: Measurements, /, **job):
     """Robot, poses, pairs between groups and a job in SI as files; the path of the job."""
-    columns = {"id": m.ids} | {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
-    if m.position is not None:
-        columns |= dict(zip("xyz", m.position.T, strict=True))
-    if m.rotation is not None:
-        quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat()
-        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    tables = table_columns(Table(replace(m, source="poses.csv"), None), robot, Units())
     if m.groups is not None:
-        columns["group"] = np.array(["", *m.groups.names])[m.groups.index + 1]
-        pairs = m.groups.pairs
-        ends = {end: np.array(m.groups.names)[getattr(pairs, end)] for end in "ab"}
-        write_csv(folder / "pairs.csv", ends | {"distance": pairs.distance, "sigma_distance": pairs.sigma_distance})
+        tables["pairs.csv"]["sigma_distance"] = m.groups.pairs.sigma_distance
         job |= {"pairs": "pairs.csv"}
-    write_csv(folder / "poses.csv", columns | {"split": np.where(m.test, "test", "train")})
+    for name, columns in tables.items():
+        write_csv(folder / name, columns)
     if robot.urdf is None:
         write_robot(folder / "robot.yaml", robot)
     stated = {"position": m.sigma_position, "orientation": m.sigma_orientation, "point": m.sigma("point")}

@@ -22,7 +22,7 @@ from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square
 from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
 from fg_calib.measurements import INSTRUMENTS, Landmarks, Table
 from fg_calib.robot import Robot
-from fg_calib.simulation import BoardViews, Candidates, Configurations, Errors, GivenReadings, Instrument, Scenario
+from fg_calib.simulation import BoardViews, Candidates, Errors, GivenReadings, Instrument, Scenario
 
 REFERENCE, NONE = -1, -2
 """Instead of the number of a pose: the reference of a star, and a configuration at which nothing is fitted."""
@@ -181,23 +181,16 @@ def draw_groups(scenario: Scenario, n: int, generator: np.random.Generator) -> d
         generator: Draws them.
 
     Raises:
-        InputError: None are found.
-    """
-    own = {i.name: i.configurations for i in scenario.instruments if i.configurations is not None}
-    groups = own if len(own) == len(scenario.instruments) > 0 else {"": scenario.configurations} | own
-    return {name: find_candidates(scenario.robot, of, n, generator) for name, of in groups.items()}
-
-
-def find_candidates(robot: Robot, of: Configurations, n: int, generator: np.random.Generator) -> Candidates:
-    """Find configurations in which the arm can be measured, at most n.
-
-    Raises:
         InputError: None are found, with the shares of the reasons; or with self-motion held, the first view of a board
             is not reached.
     """
-    found = simulation.draw_candidates(robot, of, generator, n, "candidates")
-    if not len(found.readings):
-        raise InputError("candidates", f"none in {found.reasons()}", "some that the arm can take")
+    own = {i.name: i.configurations for i in scenario.instruments if i.configurations is not None}
+    groups = own if len(own) == len(scenario.instruments) > 0 else {"": scenario.configurations} | own
+    draw, robot = simulation.draw_candidates, scenario.robot
+    found = {name: draw(robot, of, generator, n, "candidates") for name, of in groups.items()}
+    for one in found.values():
+        if not len(one.readings):
+            raise InputError("candidates", f"none in {one.reasons()}", "some that the arm can take")
     return found
 
 

@@ -50,14 +50,6 @@ N_TRIED = 128
 _TINY = 1e-300
 
 
-def _trace(V: Floats) -> Floats:
-    return np.asarray(np.trace(V, axis1=-2, axis2=-1))
-
-
-def _log_det(V: Floats) -> Floats:
-    return np.asarray(np.linalg.slogdet(V)[1])
-
-
 def _of_variances(formula: Callable[[Floats], Floats]) -> Callable[[Floats], Floats]:
     """A criterion by its formula for the variances, ascending along the first axis."""
     return lambda V: formula(np.moveaxis(np.maximum(np.linalg.eigvalsh(V), _TINY), -1, 0))
@@ -71,8 +63,8 @@ def _worst(w: Floats) -> Floats:
 _Formula = Callable[[Floats], Floats]
 
 FORMULAS: dict[Criterion, tuple[_Formula, _Formula]] = {
-    **dict.fromkeys(("I", "A"), (_trace, np.ones_like)),
-    **dict.fromkeys(("D", "O1"), (_log_det, lambda w: w**-0.5)),
+    **dict.fromkeys(("I", "A"), (lambda V: np.asarray(np.trace(V, axis1=-2, axis2=-1)), np.ones_like)),
+    **dict.fromkeys(("D", "O1"), (lambda V: np.asarray(np.linalg.slogdet(V)[1]), lambda w: w**-0.5)),
     **dict.fromkeys(("E", "O3"), (_of_variances(lambda w: -(w[-1] ** -0.5)), _worst)),
     "O2": (_of_variances(lambda w: -((w[0] / w[-1]) ** 0.5)), _worst),
     "O4": (_of_variances(lambda w: -(w[0] ** 0.5) / w[-1]), _worst),

@@ -216,7 +216,8 @@ def view_board(views: BoardViews, generator: np.random.Generator) -> tuple[Float
     aimed = turn * Rotation.from_euler("x", np.pi) * Rotation.from_euler("z", roll[:, None])
     board_R_tool = aimed.as_matrix()
     if views.field_of_view > 0.0:  # from the centre, by a turn that brings it to a direction in the field of view
-        cosine, azimuth = _in_cone(turns, len(roll), views.field_of_view)
+        drawn = turns.uniform(size=(len(roll), 2))
+        cosine, azimuth = 1.0 - drawn[:, 0] * (1.0 - np.cos(views.field_of_view)), 2.0 * np.pi * drawn[:, 1]
         about = np.stack([np.sin(azimuth), -np.cos(azimuth), np.zeros(len(roll))], axis=1)
         board_R_tool = (aimed * Rotation.from_rotvec(np.arccos(cosine)[:, None] * about)).as_matrix()
     base_R_board = views.board.rotation
@@ -238,12 +239,6 @@ def sees_board(views: BoardViews, rotation: Floats, position: Floats) -> Boolean
     seen = (corners - position[:, None]) @ rotation  # in the tool frame, (n, 4, 3)
     inside: Booleans = (seen[:, :, 2] >= np.cos(views.field_of_view) * np.linalg.norm(seen, axis=2)).all(axis=1)
     return inside
-
-
-def _in_cone(generator: np.random.Generator, n: int, half_angle: float) -> tuple[Floats, Floats]:
-    """Cosine of the angle to the axis of a cone, and azimuth, of directions spread evenly in it, shapes (n,)."""
-    drawn = generator.uniform(size=(n, 2))
-    return 1.0 - drawn[:, 0] * (1.0 - np.cos(half_angle)), 2.0 * np.pi * drawn[:, 1]
 
 
 def _half_sphere(n: int) -> Floats:

@@ -16,11 +16,11 @@ from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import ProblemError
-from fg_calib.io import write_robot
-from fg_calib.io.tables import write_csv
+from fg_calib.io import Units, write_csv, write_robot
 from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
 from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
+from fg_calib.simulation import table_columns
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 PLACED = (Rotation.from_rotvec([0.4, -1.1, 2.0]), np.array([3.0, -1.0, 0.5]))
@@ -34,7 +34,7 @@ def pairs_of(true, q, rng, sigma=2e-4):
     n = len(q) - 1
     d = np.linalg.norm(np.diff(p, axis=0), axis=1) + sigma * rng.normal(size=n)
     nothing, rows = np.full(n, np.nan), np.arange(n)
-    return Pairs(rows, rows + 1, d, nothing, np.full(n, sigma), nothing, np.zeros(n, bool), "pairs.csv")
+    return Pairs(rows, rows + 1, d, nothing, np.full(n, sigma), nothing, np.zeros(n, bool), "lengths.csv")
 
 
 def mixture(seed, *, n=16, sigma_joint=0.0, shared=True):
@@ -144,13 +144,8 @@ def test_a_landmark_of_one_name_in_another_frame_is_another():
 
 def write_tables(folder, robot, tables, **keys):
     write_robot(folder / "robot.yaml", robot)
-    tracker, bar = (t.measurements for t in tables)
-    q = {f"q{i + 1}": x for i, x in enumerate(tracker.readings.T)}
-    write_csv(folder / "tracker.csv", {"id": tracker.ids, **q, **dict(zip("xyz", tracker.position.T, strict=True))})
-    other = {f"q{i + 1}": x for i, x in enumerate(bar.readings.T)}
-    write_csv(folder / "bar.csv", {"id": bar.ids, **other})
-    p = bar.pairs
-    write_csv(folder / "lengths.csv", {"a": bar.ids[p.a], "b": bar.ids[p.b], "distance": p.distance})
+    for name, columns in (one for table in tables for one in table_columns(table, robot, Units()).items()):
+        write_csv(folder / name, columns)
     job = {
         "robot": "robot.yaml",
         "units": {"length": "m", "angle": "rad"},

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from exported import UR10, scara, seven
 from oracle import tool_pose
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
@@ -36,31 +37,8 @@ def test_a_pose_out_of_reach_is_reached_at_its_point_with_the_tool_turned_least(
     assert found.miss_rotation[0] <= best.fun + 1e-7  # SLSQP's own accuracy, by finite differences
 
 
-SEVEN = [[0, 0, 0.34, 0], [0, -np.pi / 2, 0, 0], [0, np.pi / 2, 0.4, 0], [0, np.pi / 2, 0, 0], [0, -np.pi / 2, 0.4, 0],
-         [0, -np.pi / 2, 0, 0], [0, np.pi / 2, 0.126, 0]]  # fmt: skip
-"""a, alpha, d, theta of an arm of seven joints, in Craig's convention."""
-
-SCARA = [[0, 0, 0.35, 0], [0.325, 0, 0, 0], [0.275, np.pi, 0.05, 0], [0, 0, 0.1, 0]]
-
-UR10 = [[0, 0, 0.1273, 0], [0, np.pi / 2, 0, 0], [-0.612, 0, 0, 0], [-0.5723, 0, 0.1639, 0],
-        [0, np.pi / 2, 0.1157, 0], [0, -np.pi / 2, 0.0922, 0]]  # fmt: skip
-
-ARMS = {
-    "seven joints": Robot.from_dh(SEVEN, "mdh", limits=[[-2.9, 2.9]] * 7),
-    "UR10": Robot.from_dh(UR10, "mdh", limits=[[-np.pi, np.pi]] * 6),
-    "SCARA": Robot.from_dh(
-        SCARA,
-        "mdh",
-        types=["revolute", "revolute", "prismatic", "revolute"],
-        limits=[[-2.27, 2.27], [-2.53, 2.53], [0, 0.2], [-np.pi, np.pi]],
-    ),
-}
-
-
-def test_where_nobody_says_the_search_starts_amid_the_limits():
-    """And where there are not both, at 0 or what is nearest to it."""
-    limits = [[-1.0, 3.0], None, [0.5, np.inf], [-np.inf, -0.5]]
-    assert correction._middle(Robot.from_dh(SCARA, "mdh", limits=limits)).tolist() == [1.0, 0.0, 0.5, -0.5]
+UR = Robot.from_dh([row[:4] for row in UR10], "dh", limits=[[-np.pi, np.pi]] * 6)
+ARMS = {"seven joints": seven(), "UR10": UR, "SCARA": scara([-np.pi, np.pi])}
 
 
 @pytest.mark.sampled(1)

@@ -8,12 +8,11 @@ import pytest
 from oracle import tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 
-from fg_calib.designs.candidates import find_candidates
 from fg_calib.robot.inverse import REACHED, random_readings
 from fg_calib.robot.model import Robot
 from fg_calib.simulation.obstacles import enters, link_points
 from fg_calib.simulation.scenario import BoardViews, Box, GivenReadings, Placement, TargetViews
-from fg_calib.simulation.views import number_of
+from fg_calib.simulation.views import draw_candidates, number_of
 
 LIMIT = np.deg2rad(170.0)
 ARM = Robot.from_dh(
@@ -32,7 +31,7 @@ TARGET = TargetViews(
 
 def draw(robot, of, n=None, **conditions):
     of = replace(of, **conditions)
-    found = find_candidates(robot, of, n or number_of(of), np.random.default_rng(0))
+    found = draw_candidates(robot, of, np.random.default_rng(0), n or number_of(of), "candidates")
     assert found.asked == len(found.readings) + sum(found.rejected.values())
     lower, upper = robot.limits.T
     assert isinstance(of, GivenReadings) or ((found.readings >= lower) & (found.readings <= upper)).all()
