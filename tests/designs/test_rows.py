@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from instruments import measured_by
 from scenarios import CAMERA, GRID, INSTRUMENTS, SIGMA, WALL, scenario
 from tolerances import rounding
 
 from fg_calib import Pairing
-from fg_calib.designs.candidates import build_pool, draw_groups
-from fg_calib.graph import prior_rows, square_root, true_problem
+from fg_calib.designs.candidates import build_pool, draw_groups, rows_in_columns_of
+from fg_calib.graph import build_problem, prior_rows, square_root, true_problem
 from fg_calib.simulation.scenario import Instrument, Placement, RandomReadings
 
 N = 20
@@ -107,3 +108,15 @@ def test_many_rows_are_reduced_to_no_more_than_they_determine(kind):
     assert most >= len(GRID) / 2
     boards = len(pool.problem.data.landmarks.names) or 1
     assert pool.rows.rows.shape[1] <= 12 * boards < 2 * most
+
+
+def test_rows_of_before_say_what_they_do_with_places_that_are_not_seen_again_unknown():
+    robot, _, table = measured_by("anchors", np.random.default_rng(0))
+    again = table.measurements.labels["anchor"].index != 1
+    before = build_problem(robot, table)
+    problem = build_problem(robot, replace(table, measurements=table.measurements.select(again)))
+    whole = square(square_root(before, before.start)[:, :-1])
+    n = before.variables.n_columns
+    order = np.concatenate([np.arange(n + 3), np.arange(n + 6, n + 9), np.arange(n + 3, n + 6)])
+    wanted = without_last(whole[np.ix_(order, order)], n + 6)
+    assert apart(wanted, square(rows_in_columns_of(before, problem))) < rounding()

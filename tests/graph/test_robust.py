@@ -86,13 +86,13 @@ def test_costs_have_the_weights_as_their_slopes(loss):
 
 def test_gnc_starts_convex_and_ends_truncated():
     weighting = Weighting("gnc")
-    e, residual_dim = np.array([0.5, 2.0, 100.0]), np.array([1, 1, 1])
+    e, residual_dim = np.array([0.5, 2.0, 2.7, 100.0]), np.ones(4, dtype=np.int64)  # the third is hardly beyond
     first, final = weighting.update(e, residual_dim)
     assert not final
     assert np.all(first[:2] == 1.0)
     while not final:
         last, final = weighting.update(e, residual_dim)
-    assert last.tolist() == [1.0, 1.0, 0.0]
+    assert last.tolist() == [1.0, 1.0, 0.0, 0.0]
     assert Weighting("gnc").update(np.array([0.5, 1.0]), np.array([1, 1]))[1]
 
 

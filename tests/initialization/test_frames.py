@@ -8,6 +8,7 @@ from tolerances import rounding
 from fg_calib.initialization.hand_eye import (
     Frame,
     Unknown,
+    _frame_rotations,
     start_from_distances,
     start_from_most_poses,
     start_from_poses,
@@ -55,6 +56,14 @@ def test_frame_and_tool_point_are_found_from_positions(X):
     assert found[0].rotation == pytest.approx(X.rotation, abs=rounding(1, 100))
     assert found[0].translation == pytest.approx(X.translation, abs=1e-8)
     assert found[1].translation == pytest.approx(T.translation, abs=rounding(1, 100))
+
+
+def test_without_noise_every_candidate_is_the_frames_rotation():
+    """The linear one is that of an unknown tool point; about the means the point is taken to be known."""
+    flange, T = flange_poses(), Frame(np.eye(3), np.array([0.3, -0.2, 0.9]))
+    position, unknown = measured(flange, FAR[2], T)[1], Unknown(True, False, ALL)
+    found = _frame_rotations(*flange, position, T.translation, unknown)
+    assert [rotation == pytest.approx(FAR[2].rotation, abs=rounding(1, 100)) for rotation in found] == [True] * 3
 
 
 @pytest.mark.parametrize("T", FAR)

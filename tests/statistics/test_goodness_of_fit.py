@@ -90,7 +90,8 @@ def test_leverages_are_those_of_the_hat_matrix():
     """Independent rows without priors: H = J (J^T W J)^+ J^T W, whose trace is the rank."""
     rng = np.random.default_rng(2)
     robot = small_arm()
-    solution = solve(build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=4), model="pose"))
+    m = measure(true_robot(robot, rng), 20, rng, n_test=4)
+    solution = solve(build_problem(robot, m, model="pose"))
     uncertainty = assess(solution)
     table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
     rows = solution.problem.rows
@@ -106,6 +107,9 @@ def test_leverages_are_those_of_the_hat_matrix():
     assert n_rows.tolist() == [6] * 24
     assert squares == pytest.approx(np.bincount(table.a, (table.after / table.sigma) ** 2))
     assert rms["position"] == pytest.approx(np.linalg.norm(table.after.reshape(24, 6)[:, 3:], axis=1))
+    alone = assess(solve(build_problem(robot, m, model="position"))).fit.residuals
+    rms = alone.of_configurations(m.test)[2]
+    assert rms["position"] == pytest.approx(np.linalg.norm(alone.after.reshape(24, 3), axis=1))
 
 
 @pytest.mark.slow
