@@ -168,6 +168,7 @@ def test_not_knowing_the_scales_makes_sigmas_larger():
     problem, _ = drawn_problem("distance", n=14, estimate_tolerance="kind")
     solution = estimate_tolerances(problem)
     found, known = assess(solution), assess(replace(solution, estimated_tolerances=None))
+    assert (found.fit.chi_square.p_value, known.fit.chi_square.p_value is None) == (None, False)
     wider = [
         a.sigma / b.sigma
         for a, b in zip(found.estimates.parameters, known.estimates.parameters, strict=True)
