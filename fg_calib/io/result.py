@@ -14,6 +14,7 @@ The folder of a calibration: `result.json`, the calibrated robot and its tables,
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -35,7 +36,7 @@ from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale, Varia
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import read_robot, write_robot, write_urdf
-from fg_calib.io.yaml import first_misfit, shown
+from fg_calib.io.yaml import Units, first_misfit, shown
 from fg_calib.measurements import Table
 from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
@@ -542,8 +543,8 @@ RESULT_FILES = {
 }
 """The files that a calibration may write, and how each begins."""
 
-ROUNDING_IN_UNITS = 1e-12
-"""How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]."""
+RESOLUTION = 1e-8
+"""How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]: ten nanometres."""
 
 
 def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
@@ -668,12 +669,17 @@ def _digest(path: Path) -> str:
 
 
 def _write_robot(folder: Path, robot: Robot) -> None:
-    if robot.urdf is None:
-        write_robot(folder / "robot_calibrated.yaml", robot)
-        return
-    write_urdf(folder / "robot_calibrated.urdf", robot)
-    if any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
-        write_robot(folder / "robot_calibrated.yaml", robot, urdf_name="robot_calibrated.urdf")
+    units = Units(*robot.units)
+    if robot.urdf is not None:
+        write_urdf(folder / "robot_calibrated.urdf", robot)
+        if not any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
+            return
+    rounded = [
+        round(p.nominal / factor, math.ceil(math.log10(factor / RESOLUTION))) * factor if p.estimated else p.nominal
+        for p, factor in ((p, units.factor(p.unit)) for p in robot.parameters)
+    ]
+    name = None if robot.urdf is None else "robot_calibrated.urdf"
+    write_robot(folder / "robot_calibrated.yaml", robot.with_values(rounded), units=units, urdf_name=name)
 
 
 def read_calibrated_robot(folder: Path, result: Result) -> Robot:
@@ -690,10 +696,10 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     robot = read_robot(file, base_link=links[0], tip_link=links[1])
     names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]
     same = [p.name for p in robot.parameters] == names
-    if not same or not np.allclose(robot.nominal, estimates, 0.0, ROUNDING_IN_UNITS):
+    if not same or not np.allclose(robot.nominal, estimates, 0.0, RESOLUTION):
         found = "other values" if same else "other parameters"
         raise InputError(str(file), f"{found} than in result.json", "the files of one calibration")
-    return robot
+    return robot.with_values(estimates)
 
 
 def read_table(folder: Path, name: str, result: Result) -> pl.DataFrame | None:

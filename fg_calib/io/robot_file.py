@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -482,7 +482,7 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
     if "urdf" not in mapping:
         return _build_dh(validate(_DhRobot, dict(mapping), place), place)
     file = validate(_UrdfRobot, dict(mapping), place)
-    return read_urdf(
+    robot = read_urdf(
         folder / file.urdf,
         base_link=file.base_link,
         tip_link=file.tip_link,
@@ -492,6 +492,7 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
         place=place,
         **file.choices(place),
     )
+    return replace(robot, units=(file.units.length, file.units.angle))
 
 
 def _build_dh(file: _DhRobot, place: str) -> Robot:
@@ -515,7 +516,7 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
         values = {kind: _si(kind, getattr(row, kind), file.units, here) for kind in kinds}
         builder.add_convention_joint(joint, values)
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
-    return builder.build(place=place, **file.choices(place))
+    return replace(builder.build(place=place, **file.choices(place)), units=(file.units.length, file.units.angle))
 
 
 @checked

@@ -140,8 +140,8 @@ class Labels(FrozenArrays):
 
     def only_of(self, chosen: Booleans) -> Booleans:
         """Which names have rows, all of them chosen, shape (n_names,)."""
-        here, elsewhere = (np.isin(np.arange(len(self.names)), self.index[rows]) for rows in (chosen, ~chosen))
-        only: Booleans = here & ~elsewhere
+        inside, outside = (np.isin(np.arange(len(self.names)), self.index[rows]) for rows in (chosen, ~chosen))
+        only: Booleans = inside & ~outside
         return only
 
 

@@ -21,8 +21,10 @@ from numpy.typing import ArrayLike
 
 from fg_calib.inputs import (
     NEAR,
+    AngleUnit,
     Floats,
     InputError,
+    LengthUnit,
     Reader,
     as_figures,
     as_floats,
@@ -257,6 +259,7 @@ class Robot:
         parameters: All named parameters: base, joints in chain order, tool.
         elements: The chain, base to tool.
         urdf: The file it was read from, for a URDF robot.
+        units: Of length and angle in its robot file, in which its calibration is written.
     """
 
     name: str
@@ -265,6 +268,7 @@ class Robot:
     parameters: tuple[Parameter, ...]
     elements: tuple[Element, ...]
     urdf: UrdfSource | None = field(default=None, repr=False)
+    units: tuple[LengthUnit, AngleUnit] = field(default=("m", "rad"), repr=False, compare=False)
 
     from_urdf = Reader("read_urdf")
 

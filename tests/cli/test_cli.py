@@ -136,13 +136,14 @@ def test_predictions_are_those_of_the_calibrated_robot(calibrated, residuals):
         a, b = (tool_pose(robot, given.readings[row[r[end]]]) for end in ("a", "b"))
         turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).magnitude()
         predicted = np.linalg.norm(b[:3, 3] - a[:3, 3]) if r["kind"] == "distance" else turn
-        assert float(r["predicted"]) == pytest.approx(predicted, abs=rounding(10.0))  # rounding over a chain of 10 m
+        assert float(r["predicted"]) == pytest.approx(predicted, abs=1e-6)  # values are rounded to 1e-8
 
 
 def test_the_calibrated_robot_holds_the_estimates(calibrated, result):
     robot = read_robot(calibrated[0] / "result" / "robot_calibrated.yaml")
     nominal = read_robot(calibrated[0] / ROBOT)
-    assert {p.name: p.nominal for p in robot.parameters} == by_name(result)
+    assert robot.units == ("m", "deg")  # as the nominal one, rounded to 10 nm and 10 nrad
+    assert {p.name: p.nominal for p in robot.parameters} == pytest.approx(by_name(result), rel=0.0, abs=5.1e-9)
     assert {p.name: p.nominal for p in nominal.parameters} == by_name(result, "nominal")
     assert [(p.name, p.estimated, p.tolerance) for p in robot.parameters] == [
         (p.name, p.estimated, pytest.approx(p.tolerance, rel=rounding()) if p.tolerance else None)

@@ -61,7 +61,7 @@ def test_changes_since_are_added_to_the_covariance_and_free_ones_are_forgotten(d
     assert known.grown(np.zeros((28, 0)), np.zeros(0, dtype=bool)) is known
 
 
-def test_rows_elsewhere_follow_the_tangent_of_frames():
+def test_rows_at_other_parameters_follow_the_tangent_of_frames():
     """Their derivatives in a problem's columns are central differences, and the factor has half their squares."""
     robot, _, table = measured_by("anchors", np.random.default_rng(3), n=24)
     robot = robot.with_estimated([*(p.name for p in robot.parameters if p.estimated), *TOOL])
