@@ -14,6 +14,7 @@ from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib.assessment import assess
+from fg_calib.graph import solver
 from fg_calib.graph.build import build_problem
 from fg_calib.graph.solver import SolverOptions, solve
 from fg_calib.inputs import InputError, Pairing, SolverError
@@ -91,6 +92,27 @@ def test_history_tells_cost_damping_and_step():
     assert solution.history[0].step > 1
     assert all(i.damping == 0.0 for i in solution.history)  # no step had to be damped
     assert solution.cost == pytest.approx(solution.problem.linearize(solution.parameters).cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("damping", [1e-6, 1.0])
+def test_a_damped_step_is_marquardts_in_the_singular_directions(damping):
+    rng, robot = np.random.default_rng(5), small_arm()
+    problem = build_problem(robot, measure(true_robot(robot, rng), 40, rng), model="distance")
+    here = solver._Point(problem, problem.start)
+    there, used, following = here._descend_damped(damping)
+    assert (used, following) == pytest.approx((damping, damping / solver.DAMPING_FACTOR))
+    w, y = here.system.weights, here.system.coordinates
+    step = here.system.full_root @ (w * w * y / (w * w + damping))
+    assert there.parameters == pytest.approx(here.after(step).parameters, abs=1e-12)
+    assert there.system.cost < here.system.cost
+
+
+def test_where_no_step_lowers_the_cost_the_solver_gives_up_and_says_so(monkeypatch):
+    monkeypatch.setattr(solver._Point, "descend", lambda *_: None)
+    rng, robot = np.random.default_rng(5), small_arm()
+    solution = solve(build_problem(robot, measure(true_robot(robot, rng), 40, rng), model="pose"))
+    assert (solution.converged, solution.iterations) == (False, 0)
+    assert solution.message.startswith("not converged: no step lowers the cost although ")
 
 
 def test_too_few_iterations_are_said_to_be_too_few():

@@ -89,6 +89,17 @@ def test_most_clean_images_keep_all_corners():
     assert np.sum(squares) < 0.9 * np.sum(at_truth)
 
 
+def test_of_five_corners_none_is_left_out():
+    """Four have a pose of their own each: nothing tells which is off."""
+    corners, sigma = np.vstack([CORNERS[[0, 2, 9, 11]], CORNERS[4]]), np.full((5, 2), 0.3)
+    image = image_of(*tilted(0.8, np.random.default_rng(0)), corners=corners)
+    image[4, :2] += 10.0
+    cost, found = boards_from_image(CAMERA, image, sigma)[0]
+    off = (image_of(found.rotation, found.translation, corners=corners) - image) / 0.3
+    assert cost == pytest.approx(np.sum(off**2))
+    assert cost > 100.0
+
+
 @pytest.mark.parametrize("n_off", [1, 2])
 def test_corners_that_are_far_off_do_not_move_a_board(n_off):
     """30 pixels, of 12 corners at 0.1 pixel: where the others alone have it."""

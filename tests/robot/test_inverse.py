@@ -7,7 +7,7 @@ from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
 from fg_calib.inputs import InputError
-from fg_calib.robot.inverse import REACHED, random_readings, solve_inverse
+from fg_calib.robot.inverse import REACHED, _Search, random_readings, solve_inverse
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import CONVENTIONS, Robot
 
@@ -114,6 +114,17 @@ def test_a_limit_that_is_in_the_way_is_not_passed():
     found = solve_inverse(robot, T[None, :3, 3], T[None, :3, :3], generator=np.random.default_rng(6))
     assert not found.reached[0]
     assert np.abs(found.readings[0, 1]) <= np.deg2rad(30)
+
+
+def test_what_a_joint_at_its_limit_cannot_do_the_others_do():
+    """In one step but for its curvature: three joints for two coordinates, the first cannot turn on."""
+    robot, q = Robot.from_dh([[1.0, 0, 0, 0]] * 3, "dh", limits=[[-1.0, 1.0], None, None]), np.array([[1.0, 0.5, 0.5]])
+    for way in (1.0, -1.0):
+        target = pose(robot, q + way * np.array([[1e-4, 1e-4, 1e-4]])).position
+        search = _Search(robot, None, target)
+        moved = search.step(q, *search.look(q, np.array([0])))
+        assert np.linalg.norm(pose(robot, moved).position - target) < 1e-6
+        assert (moved[0, 0] == 1.0) == (way > 0.0)
 
 
 def test_a_pose_is_solved_alike_alone_and_among_others():
