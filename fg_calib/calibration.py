@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import gtsam
 import numpy as np
@@ -30,12 +30,24 @@ from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
-from fg_calib.report import ReportData, format_result, judged, notes_of, pages_of, parameter_table_html, summary
+from fg_calib.report import (
+    Drawing,
+    ReportData,
+    draw,
+    format_result,
+    judged,
+    notes_of,
+    pages_of,
+    parameter_table_html,
+    summary,
+)
 from fg_calib.robot import Robot, names_of
 from fg_calib.statistics import ParameterEstimate, TangentCovariance, cross_validate
 
 if TYPE_CHECKING:
     import polars as pl
+
+DataFrameOf = Literal["parameters", "covariance", "residuals", "configurations"]
 
 
 @checked
@@ -442,6 +454,42 @@ class Calibration:
         every[:-1, :-1] = given.matrix.reshape(len(given.names), len(given.names))
         rows = [given.names.index(name) if name in given.names else len(given.names) for name in names]
         return every[np.ix_(rows, rows)]
+
+    def to_dataframe(self, of: DataFrameOf = "parameters") -> pl.DataFrame:
+        """A part of it as a polars table, which `.to_pandas()` makes one of pandas.
+
+        Args:
+            of: `parameters`, or `covariance` with a column for each, in [m] and [rad]; `residuals` or `configurations`
+                as in their files.
+
+        Raises:
+            InputError: There is no such part, or it was loaded from a folder that lacks that table.
+        """
+        import polars as pl
+
+        inputs.check("of", of, DataFrameOf)
+        if of == "covariance":
+            names, matrix = list(self.result.covariance.names), self.covariance()
+            return pl.DataFrame({"name": names, **dict(zip(names, matrix.T, strict=True))})
+        if of == "parameters":
+            rows = ({k: v for k, v in vars(p).items() if k != "stands_for"} for p in self.result.parameters)
+            return pl.DataFrame(list(rows), infer_schema_length=None)
+        table = self.residuals if of == "residuals" else self.configurations
+        if table is None:
+            raise InputError("of", f"{of} were not saved with this calibration", "parameters or covariance")
+        return table
+
+    def plot_parameters(self) -> Drawing:
+        """Draw each correction with its sigma."""
+        return draw(self.report_data, "parameters")
+
+    def plot_residuals(self) -> Drawing:
+        """Draw residuals row by row, and how they are distributed."""
+        return draw(self.report_data, "residuals")
+
+    def plot_workspace(self) -> Drawing:
+        """Draw slices of the workspace with the expected error of the tool."""
+        return draw(self.report_data, "workspace")
 
     @property
     def findings(self) -> tuple[str, ...]:

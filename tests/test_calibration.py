@@ -56,6 +56,21 @@ def found():
 Q = np.random.default_rng(1).uniform(-1.5, 1.5, (4, 4))
 
 
+def test_parts_are_tables_and_drawings(found):
+    result = found["priors"]
+    rows = result.to_dataframe().rows_by_key("name", named=True, unique=True)
+    assert {name: row["sigma"] for name, row in rows.items()} == {n: p.sigma for n, p in result.parameters.items()}
+    covariance = result.to_dataframe("covariance")
+    assert covariance["name"].to_list() == covariance.columns[1:] == list(result.result.covariance.names)
+    assert np.array_equal(covariance[:, 1:].to_numpy(), result.covariance(), equal_nan=True)
+    assert result.to_dataframe("residuals").equals(result.residuals)
+    for drawing in (result.plot_parameters(), result.plot_residuals(), result.plot_workspace()):
+        assert drawing.startswith("<svg")
+        assert drawing._repr_svg_() == drawing
+    with pytest.raises(InputError, match="of: found 'frames', expected one of parameters, covariance"):
+        result.to_dataframe("frames")
+
+
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", CASES)
 def test_one_call_does_the_steps(found, name):

@@ -6,6 +6,7 @@ from .compare import (
     history_document,
 )
 from .design import build_design_report, design_document, write_design
+from .figures import Drawing, draw
 from .html import pages_of, parameter_table_html
 from .inspect import (
     build_identifiability_report,
@@ -38,6 +39,7 @@ from .text import ReportData, build_report, format_result, judged, notes_of, sum
 
 __all__ = [
     "WIDTH",
+    "Drawing",
     "ReportData",
     "build_check_report",
     "build_correction_report",
@@ -51,6 +53,7 @@ __all__ = [
     "comparison_document",
     "correction_document",
     "design_document",
+    "draw",
     "format_result",
     "history_document",
     "in_order",

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fg_calib.inputs import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats, InputError
 from fg_calib.report import charts
-from fg_calib.report.charts import Chart, Plot, limits_of
+from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.tables import shown_in
 from fg_calib.report.text import ReportData
 from fg_calib.robot import SCALES
@@ -48,6 +48,27 @@ def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
         "correlations": correlation_matrix(data),
         "workspace": error_slices(space.errors.position, space.expected[:, 0], space.measured) if space else [],
     }
+
+
+class Drawing(str):
+    """An SVG image: notebooks show it, `Path.write_text` saves it."""
+
+    __slots__ = ()
+
+    def _repr_svg_(self) -> str:
+        return str(self)
+
+
+def draw(data: ReportData, name: str) -> Drawing:
+    """A figure of a calibration by its name in `figures_of`.
+
+    Raises:
+        InputError: Its tables were not saved, or there is nothing to draw.
+    """
+    charts = figures_of(data)[name]
+    if not charts:
+        raise InputError(name, "nothing to draw: its tables were not saved, or nothing of it was estimated")
+    return Drawing(standalone(charts))
 
 
 def error_over_joints(data: ReportData) -> list[Chart]:
