@@ -206,7 +206,7 @@ def assess(solution: Solution) -> Assessment:
     table = table.without(goodness.unknown(table))
     chi_square, priors = statistics.chi_square(solution, spread), statistics.judge_priors(solution, spread)
     fit = statistics.Fit(chi_square, table, goodness, priors)
-    verdict = judge(solution, spread, fit, identifiability.missing)
+    verdict = judge(solution, spread, fit, identifiability)
     spread = spread.inflated(verdict.variance)
     whole = statistics.with_left_out(solution, spread)
     assessment = Assessment(

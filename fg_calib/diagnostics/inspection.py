@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
-from fg_calib.diagnostics.verdict import Severity, Statement, listed, texts
+from fg_calib.diagnostics.verdict import Severity, Statement, check_excitation, listed, texts
 from fg_calib.graph import Problem, problem_of, solve, tables_of, unsolved
 from fg_calib.inputs import Brief, CalibrationError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
-from fg_calib.observability import NOT_EXCITED, Identifiability, identifiability_of
+from fg_calib.observability import Identifiability, identifiability_of
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot
@@ -194,7 +194,8 @@ def inspect_job(job: Job) -> Inspection:
         evaluated=problem.evaluated,
     )
     statements = [statement for check in CHECKS for statement in check(found, job)]
-    return replace(found, findings=texts(statements, "error"), cautions=texts(statements, "note"))
+    cautions = (*texts(statements, "warning"), *texts(statements, "note"))
+    return replace(found, findings=texts(statements, "error"), cautions=cautions)
 
 
 def _disagreements(job: Job) -> tuple[Disagreement, ...]:
@@ -283,7 +284,7 @@ def _check_setups(found: Inspection, job: Job) -> Iterator[Statement]:
 
 def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
     """Check what makes any result worthless: nothing determined, nothing to check it by; and what it will lack."""
-    seen, lost, options = found.identifiability.observability, found.identifiability.lost, job.options
+    seen, options = found.identifiability.observability, job.options
     tested = any(table.n_test or table.n_test_pairs for table in found.tables)
     measured = {kind for table in found.tables for kind in table.n_residuals}
     limited = [f.name for f in fields(options.accept) if getattr(options.accept, f.name) is not None]
@@ -302,9 +303,7 @@ def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
     still = [joint.name for joint in found.joints if joint.still]
     what = "moves: its zero is" if len(still) == 1 else "move: their zeros are"
     yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before", still)
-    n = sum(direction.reason == NOT_EXCITED for direction in lost)
-    text = f"directions not excited by these configurations although the model sees more: {n}; move every joint more"
-    yield Statement("note", text, n)
+    yield from check_excitation(found.identifiability)
     text = "no test rows: nothing would check how well the calibration predicts (column split)"
     yield Statement("note", text, not (found.evaluated or tested))
 

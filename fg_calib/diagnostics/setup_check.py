@@ -182,7 +182,7 @@ def check_tables(
                 one = _check_alone(setup, doubtful, together[number])
             checks.append(replace(one, table=label if len(labels) > 1 else ""))
     if not reporting(checks):
-        for number, one in enumerate(together):
+        for number, one in enumerate(together if len(labels) > 1 else ()):
             if one.far:  # and the table alone is not
                 other = Explanation(OTHER_TOOL, checks[number].residuals)
                 checks[number] = replace(one, table=labels[number], explanations=(other,))
@@ -197,18 +197,17 @@ def _check_alone(setup: Setup, doubtful: bool, found: SetupCheck) -> SetupCheck:
         doubtful: Look for a mistake even where the residuals are not far from what is predicted.
         found: Its residuals with the base and the tool that all tables determine together; empty if not known.
     """
-    if not found.residuals or found.far or doubtful:
+    far = found.far
+    if not found.residuals or far or doubtful:
         alone = SetupCheck(nominal_residuals(setup))
         found = alone if not found.residuals or 0.0 < alone.excess < found.excess else found
-    look = found.far or (doubtful and not setup.has_landmarks and found.excess >= NEGLIGIBLE_EXCESS)
+    look = far or found.far or (doubtful and not setup.has_landmarks and found.excess >= NEGLIGIBLE_EXCESS)
     return replace(found, explanations=_explanations(setup, found)) if look else found
 
 
 def _explanations(setup: Setup, given: SetupCheck) -> tuple[Explanation, ...]:
     """Mistakes that explain residuals, the simplest first: they leave little, and at most twice what the best does."""
-    # Where residuals are no larger than predicted only what has unknowns of its own can make them much smaller.
-    least = HYPOTHESES.index(_frame) if given.excess < 1.0 else 0
-    undone = (one for hypothesis in HYPOTHESES[least:] for one in hypothesis(setup))
+    undone = (one for hypothesis in HYPOTHESES for one in hypothesis(setup))
     trials = [Explanation(mistake, nominal_residuals(without)) for mistake, without in undone]
     found = [trial for trial in trials if trial.excess <= min(given.excess / REDUCTION, EXPLAINED)]
     best = max(min((trial.excess for trial in found), default=0.0), 0.5)

@@ -20,7 +20,7 @@ from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, mahalanobis_distances, solve, with_factors
 from fg_calib.inputs import CalibrationError, Floats
 from fg_calib.measurements import missing_values
-from fg_calib.observability import MissingMotion
+from fg_calib.observability import NOT_EXCITED, Identifiability
 from fg_calib.robot import SCALES, pose
 from fg_calib.statistics import (
     CONFIDENCE,
@@ -119,7 +119,7 @@ class Case:
         solution: The solution.
         spread: The covariance of what was estimated.
         fit: How well it fits.
-        missing: Motions that the robot's convention has no parameter for.
+        identifiability: Identifiability by the rows, with motions that the robot's convention has no parameter for.
         regression: Its rows, linearised, with what the model does not have; None where the arm was evaluated.
         change: Change while a table was measured.
         systematic: See `Verdict`.
@@ -129,7 +129,7 @@ class Case:
     solution: Solution
     spread: Spread
     fit: Fit
-    missing: Sequence[MissingMotion] = ()
+    identifiability: Identifiability
     regression: effects.Regression | None = None
     change: effects.Change | None = None
     systematic: effects.Systematic | None = None
@@ -177,21 +177,21 @@ class Case:
         return self.gross is None and (self.fit.chi_square.too_large or bool(self.effect))
 
 
-def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[MissingMotion]) -> Verdict:
+def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identifiability) -> Verdict:
     """The verdict on a solution.
 
     Args:
         solution: The solution.
         spread: The covariance of what was estimated.
         fit: How well it fits.
-        missing: Motions that the robot's convention has no parameter for.
+        identifiability: Identifiability by the rows.
     """
     problem = solution.problem
     regression = None if problem.evaluated else effects.regress(solution)
     suspicious = solution.estimated_noise is not None or any(kind.verdict not in FINE for kind in fit.goodness.kinds)
     change = effects.find_change(regression) if suspicious and regression is not None else None
     systematic = None if regression is None or change is not None else effects.find_systematic(regression)
-    case = Case(solution, spread, fit, missing, regression, change, systematic)
+    case = Case(solution, spread, fit, identifiability, regression, change, systematic)
     found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}
     doubts = any(s.severity == "error" for each in found.values() for s in each)
     if not problem.evaluated:
@@ -205,7 +205,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, missing: Sequence[Missin
     statements += () if explained else check_systematic(case, doubts=doubts)
     statements += [s for each in found.values() for s in each]
     statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
-    statements += [*check_offsets(case), *lacking]
+    statements += [*check_excitation(identifiability), *check_offsets(case), *lacking]
     errors, warnings, notes = (texts(statements, severity) for severity in ("error", "warning", "note"))
     return Verdict(errors, warnings, notes, case.setup, systematic, change, case.variance)
 
@@ -454,9 +454,19 @@ def check_offsets(case: Case) -> Iterator[Statement]:
 def check_missing(case: Case) -> Iterator[Statement]:
     """Check whether what the convention has no parameter for explains the misfit; an update's convention did before."""
     asked = case.high and not case.setup.explanations and case.problem.knowledge is None
-    for motion in case.missing:
+    for motion in case.identifiability.missing:
         certain = asked and case.regression is not None and effects.explains_misfit(case.regression, motion)
         yield Statement("error" if certain else "note", str(motion))
+
+
+def check_excitation(found: Identifiability) -> Iterator[Statement]:
+    """Check whether other configurations would determine more; of more than these do their result is mostly priors."""
+    n, rank = sum(direction.reason == NOT_EXCITED for direction in found.lost), found.observability.rank
+    text = (
+        f"these rows determine {rank} of {len(found.observability.names)} parameters; directions not excited by these"
+    )
+    text += f" configurations although the model sees more: {n}; move every joint more"
+    yield Statement("warning" if n > rank else "note", text, n)
 
 
 def check_setup(case: Case, *, fits: bool) -> Iterator[Statement]:

@@ -9,7 +9,7 @@ from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, true_robot
 
-from fg_calib import Job, Options, Robot, simulate
+from fg_calib import Job, Options, Robot, calibrate, simulate
 from fg_calib.diagnostics import inspect_job
 from fg_calib.inputs import ProblemError
 
@@ -192,6 +192,12 @@ def test_a_joint_that_hardly_moves_is_reported(arm):
     assert not found.findings
     assert found.cautions[0] == "q4 hardly moves: its zero is not distinguishable from the link before"
     assert any("not excited by these configurations" in caution for caution in found.cautions)
+
+
+def test_a_good_fit_of_priors_says_how_little_its_rows_determine(arm):
+    found = calibrate(arm, measured(arm, n=2, n_test=0), model="pose", frame="unknown")
+    assert found.trustworthy
+    assert found.result.reservations[0].startswith("these rows determine 6 of 30 parameters; directions not excited by")
 
 
 def test_readings_far_outside_limits_are_a_finding():

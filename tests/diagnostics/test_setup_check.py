@@ -92,6 +92,17 @@ def test_a_mistake_in_the_table_is_named(tmp_path, model, frame, mistake):
     assert check.explanations[0].excess <= min(EXPLAINED, check.excess / REDUCTION)
 
 
+def test_a_quaternion_in_another_order_is_named_where_prior_sigmas_predict_as_much(tmp_path):
+    """It inverts rotations, which other frames make up for where all are about one axis: here all but 0.6 degrees."""
+    tolerance, rng = {"a": 0.003, "d": 0.003, "alpha": 1, "theta": 1, "beta": 1}, np.random.default_rng(0)
+    robot = ur5e(tmp_path, tolerance=tolerance, estimate=TOOL)
+    q = rng.uniform(-1, 1, (50, 6)) * [0.01, 1, 1, 1, 0.01, 0.01]
+    m = wxyz(measure(robot, 50, rng, sigma=SIGMA, frame=PLACED, readings=q))
+    check = check_setup(robot, m, "orientation", "unknown", doubtful=True)
+    assert check.excess < 1.0
+    assert "if columns qx, qy, qz, qw hold w, x, y, z" in str(check)  # or the orientations are inverted: the same
+
+
 ANGLES = {
     "roll, pitch, yaw are in deg, not rad": lambda R: R.as_euler("xyz", degrees=True),
     "roll, pitch, yaw are rotations about the moving axes x, y, z": lambda R: R.as_euler("XYZ"),
