@@ -521,14 +521,18 @@ class Calibration:
             InputError: The readings are of other joints, or there is no measurement frame.
         """
         q = _as_readings("readings", readings, self.robot)
-        return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table) if world else None))
+        return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table, world=world)))
 
-    def table_in_world(self, number: int | None = None) -> int:
-        """The number of the table whose estimated measurement frame is meant.
+    def table_in_world(self, number: int | None, *, world: bool) -> int | None:
+        """The number of the table whose estimated measurement frame is meant; None without `world`: the base frame.
 
         Raises:
             InputError: There is no such frame, or there are several.
         """
+        if not world:
+            if number is not None:
+                raise InputError("table", f"found {number} without world", "the measurement frame asked for")
+            return None
         known = [int(frame.symbol[2:-1]) for frame in self.posterior.variables.frames]
         if not known or self.posterior.variables.n_robot_columns == self.posterior.variables.n_columns:
             raise InputError("world", "the measurement frame was not estimated, or not saved", "the base frame")
@@ -633,7 +637,7 @@ def correct(
     """
     if world and position is None:
         raise InputError("world", "joint values reach poses in the base frame", "targets with positions")
-    number = calibration.table_in_world(table) if world else None
+    number = calibration.table_in_world(table, world=world)
     posterior, nominal = calibration.posterior, calibration.nominal
     return correct_targets(posterior, calibration.robot, nominal, position, rotation, near=near, table=number)
 

@@ -104,9 +104,6 @@ MISTAKES = {
     "a simulation's seed": (lambda: simulate(scenario(), 1.0), "seed: found 1.0, expected a whole number not below 0"),
     "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um, in; "
                          "did you mean mm?"),
-    "a scenario's frame": (lambda: scenario(frame="Base"), "Scenario: frame: found 'Base', expected one of base, "
-                           "unknown; did you mean base?"),
-    "names that are nothing": (lambda: problem(prefer=None), "prefer: found None, expected a list of names"),
     "pairs by numpy's halves": (lambda: Pairing("random", np.float32(2)), "pairing: count: found 2.0, "
                                 "expected a whole number above 0"),
     "more noise than a float holds": (lambda: Noise(10**400), f"noise: position: found 1{'0' * 47}...000000..., "

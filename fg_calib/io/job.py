@@ -138,11 +138,17 @@ def _read_job(path: Path) -> Job:
     robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
     document = _with_cameras({key: value for key, value in given.items() if key not in _OF_THE_ROBOT}, folder)
     entries = _entries(document, file, path.name)
-    models = {entry.model: INSTRUMENTS[entry.model] for _, entry in entries}
-    used = {name for instrument in models.values() for name in (*instrument.options, instrument.key)}
-    for key in ("offset", "camera", "targets", "anchors"):
-        if key not in used and (key in given or getattr(file.tolerance, key, None) is not None):
-            raise InputError(f"{path.name}: {key}", f"of no use to model {' and '.join(models)}", "no such key")
+    listed = given["measurements"] if isinstance(given["measurements"], list) else []
+    models = tuple(dict.fromkeys(entry.model for _, entry in entries))
+    of_tables = [(place, keys, (one.model,)) for (place, one), keys in zip(entries, listed, strict=False)]
+    for place, keys, users in ((path.name, given, models), *of_tables):
+        used = {name for model in users for name in (*INSTRUMENTS[model].options, INSTRUMENTS[model].key)}
+        for key in ("offset", "camera", "targets", "anchors"):
+            if key in keys and key not in used:
+                raise InputError(f"{place}: {key}", f"of no use to model {' and '.join(users)}", "no such key")
+    for key in ("targets", "anchors"):
+        if getattr(file.tolerance, key) is not None and key not in given:
+            raise InputError(f"{path.name}: tolerance: {key}", f"of no use without the key {key}", "no such key")
     tables = [_table(entry, place, file, robot, folder) for place, entry in entries]
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     with yaml.within(path.name):

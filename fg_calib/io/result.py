@@ -35,7 +35,7 @@ from fg_calib.diagnostics import SetupCheck
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale, Variables
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
-from fg_calib.io.robot_file import read_robot, write_robot, write_urdf
+from fg_calib.io.robot_file import read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
 from fg_calib.measurements import Table
 from fg_calib.monitoring import fingerprints, knowledge_of
@@ -671,7 +671,10 @@ def _digest(path: Path) -> str:
 def _write_robot(folder: Path, robot: Robot) -> None:
     units = Units(*robot.units)
     if robot.urdf is not None:
-        write_urdf(folder / "robot_calibrated.urdf", robot)
+        file = folder / "robot_calibrated.urdf"
+        write_urdf(file, robot)
+        written = read_robot(file, base_link=robot.urdf.base_link, tip_link=robot.urdf.tip_link)
+        require_same_chain(robot, written, str(file))
         if not any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
             return
     rounded = [

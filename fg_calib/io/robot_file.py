@@ -573,13 +573,22 @@ def robot_text(
     if robot.urdf is None:
         place = place or robot.name
         written = robot_from_mapping(mapping, place, Path())
-        if names_of(robot.parameters) != names_of(written.parameters) or len(robot.elements) != len(written.elements):
-            expected = "base, joints of one convention, tool: all that a robot file can say"
-            raise InputError(place, "the robot has elements or parameters of its own", expected)
+        require_same_chain(robot, written, place)
     text = yaml.dump(
         mapping, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf
     )
     return str(text)
+
+
+def require_same_chain(robot: Robot, written: Robot, place: str) -> None:
+    """Check that what was written of a robot is all of it: one made by hand may have elements of its own.
+
+    Raises:
+        InputError: The robots have other elements, or parameters.
+    """
+    if names_of(robot.parameters) != names_of(written.parameters) or robot.elements != written.elements:
+        expected = "base, joints of one convention or a URDF's, tool: all that a robot file can say"
+        raise InputError(place, "the robot has elements or parameters of its own", expected)
 
 
 def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:

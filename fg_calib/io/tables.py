@@ -68,6 +68,9 @@ def names_of(sets: Iterable[ColumnSet]) -> frozenset[str]:
 KNOWN = names_of(OF_CONFIGURATIONS.values())
 """Names of the columns of a table of configurations, besides the joint readings."""
 
+LABELS = frozenset(label for instrument in INSTRUMENTS.values() for label in instrument.labels)
+"""Names of those among them that say what a row is of."""
+
 
 class Column(Schema):
     """A table's own name of a column, and how its values convert: (value - zero) * scale, as encoder counts do.
@@ -423,9 +426,29 @@ def read_measurements(
         if kind not in ("joint", "more") and sigma is not None:  # nothing but joint readings is measured exactly
             inputs.check_number(f"noise: {kind}", sigma, above=True)
     table = read_table(path, robot, columns or {})
+    _check_use(table, model)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
     return measurements_of(table, readings, between, units, noise, model)
+
+
+def _check_use(table: Table, model: Model | None) -> None:
+    """Warn of known columns that are of no use to a model, and of values that it needs and rows lack.
+
+    Raises:
+        InputError: A column of names has a scale, or a zero.
+    """
+    for name, column in table.renamed.items():
+        if name in {"id", "split", "group", *LABELS} and (column.scale, column.zero) != (1.0, 0.0):
+            raise InputError(f"{table.name}: columns: {name}", "scale or zero of a column of names", "name alone")
+    if model is not None:
+        one = INSTRUMENTS[model]
+        used = {"id", "split", "group", *names_of(one.columns)} - LABELS.difference(one.labels)
+        if unused := [name for name in table.columns if name in KNOWN - used]:
+            _log.warning("%s: of no use to model %s: column %s", table.name, model, ", ".join(unused))
+        for name in table.present(*one.generic_columns):
+            if n := table.texts(name).null_count():
+                _log.warning("%s: %d of %d rows have no %s and take no part", table.name, n, table.n_rows, name)
 
 
 def measurements_of(

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exported import column
 from simulated import measure, small_arm, true_robot
 
 from fg_calib import Calibration, InputError, Pairing, calibrate
-from fg_calib.io import read_result
+from fg_calib.robot.model import Axis, Element
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -127,6 +128,15 @@ def test_a_damaged_folder_is_refused_in_a_line(folder, damage, message):
     assert "\n" not in str(error.value)
 
 
+def test_what_a_urdf_cannot_hold_is_not_saved(tmp_path):
+    robot, rng = column(tmp_path), np.random.default_rng(0)
+    robot = replace(robot, elements=(*robot.elements, Element(Axis.TX, 0.3)))
+    made = calibrate(robot, measure(robot, 30, rng, readings=rng.uniform(0, 0.7, (30, 5))), model="position")
+    with pytest.raises(InputError, match=r"robot_calibrated\.urdf: the robot has elements or parameters of its own"):
+        made.save(tmp_path / "result")
+    assert not (tmp_path / "result").exists()
+
+
 def test_an_arm_that_was_only_evaluated_reads_back(tmp_path):
     """Nothing is estimated: the covariance has no row."""
     rng = np.random.default_rng(6)
@@ -136,11 +146,6 @@ def test_an_arm_that_was_only_evaluated_reads_back(tmp_path):
     found = Calibration.load(tmp_path)
     assert found.result.evaluated_only
     assert found.covariance().shape == (0, 0)
-
-
-def test_there_must_be_something_to_read(tmp_path):
-    with pytest.raises(InputError, match=r"nowhere: no result\.json, expected what `fg-calib calibrate --out`"):
-        read_result(tmp_path / "nowhere")
 
 
 def test_version_1_is_readable_with_no_more_than_it_promised(folder):

@@ -107,7 +107,8 @@ def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
     another.add_frame("base", {}, 0, False)
     another.add_convention_joint(Joint("q1"), {"a": 0.1, "alpha": 0.2, "d": 0.3, "theta": 0.4})
     another.add_frame("flange", {"x": 0.1}, 2, False)
-    for one in (more, another.build()):
+    turned = replace(robot, elements=(*robot.elements[:-1], replace(robot.elements[-1], axis=Axis.TX)))
+    for one in (more, turned, another.build()):
         with pytest.raises(InputError, match="the robot has elements or parameters of its own, expected base, joints"):
             write_robot(tmp_path / "robot.yaml", one)
     with pytest.raises(InputError, match="convention: found 'urdf', expected one of dh"):

@@ -104,7 +104,7 @@ class Instrument:
     kind: ClassVar[Kind]
     quantities: tuple[Quantity, ...] = ()
     columns: ClassVar[tuple[Column, ...]] = ()
-    labels: ClassVar[tuple[str, ...]] = ()
+    labels: tuple[str, ...] = ()
     optional_labels: ClassVar[tuple[str, ...]] = ()
     noise: tuple[str, ...] = ()
     landmarks: tuple[LandmarkKind, ...] = ()

@@ -173,7 +173,7 @@ class PairGauge(Instrument):
         Column(("group",), "", "Which point the configuration touched; empty: none"),
         Column(("sigma_point",), "length", "1 sigma of the touch on each axis"),
     )
-    uses_pairs = True
+    labels, uses_pairs = ("station",), True
 
     def __init__(self, model: str, distance: bool, angle: bool) -> None:
         self.model, self.words = model, " and ".join(["distances"] * distance + ["angles"] * angle)

@@ -30,6 +30,7 @@ POSE_COLUMNS = (
     Column(("sigma_x", "sigma_y", "sigma_z"), "length", "1 sigma on each axis by itself"),
     Column(("sigma_orientation",), "angle", "1 sigma of the row's orientation about each axis, or"),
     Column(("sigma_rx", "sigma_ry", "sigma_rz"), "angle", "1 sigma about each axis by itself"),
+    Column(("station",), "", "Where it was seen from; each has a frame, or pairs, of its own"),
 )
 
 ANGLES = "qx, qy, qz, qw or roll, pitch, yaw"
@@ -111,11 +112,10 @@ class PoseTracker(Instrument):
         position: Whether positions do.
     """
 
-    labels, optional_labels = ("target", "station"), ("target",)
+    optional_labels = ("target",)
     columns = (
         *POSE_COLUMNS,
         Column(("target",), "", "Which point of the tool was seen; empty: the tool itself"),
-        Column(("station",), "", "Where it was seen from; each has a frame of its own with frame unknown"),
     )
     is_pose = True
 
@@ -124,7 +124,7 @@ class PoseTracker(Instrument):
         self.sees_orientation, self.sees_position = orientation, position
         self.quantities = (ORIENTATION,) * orientation + (POSITION,) * position
         self.noise = ("position",) * position + ("orientation",) * orientation
-        self.landmarks = (TARGET,) * position
+        self.landmarks, self.labels = (TARGET,) * position, ("target",) * position + ("station",)
 
     def kinds(self, table: Table) -> Kinds:
         """See `Instrument.kinds`."""
