@@ -80,6 +80,15 @@ def test_a_job_that_kills_its_process_is_a_failure_of_its_own():
 
 
 @pytest.mark.slow
+def test_workers_import_no_file_of_the_folder_that_they_start_in(example, fg_calib, monkeypatch):
+    (example / "multiprocessing.py").write_text("raise SystemExit('mine')")
+    monkeypatch.chdir(example)
+    monkeypatch.delenv("PYTHONSAFEPATH")
+    ended = fg_calib("calibrate", "calibration.yaml", "missing.yaml", "--workers", 1)
+    assert "1 good, 1 failed" in ended.out
+
+
+@pytest.mark.slow
 def test_a_process_that_is_killed_once_costs_nothing(tmp_path):
     with local_processes(1) as executor:  # a second job may be lost before it has died once
         assert map_jobs(die_once, [tmp_path / "1"], executor) == [None]

@@ -50,6 +50,7 @@ class _Line(logging.Formatter):
 def run() -> None:
     """Run the command line."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # kernels have threads of their own
+    os.environ["PYTHONSAFEPATH"] = "1"  # worker processes import no file of the folder that they are started in
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Line())
     logging.basicConfig(handlers=[handler], level=logging.WARNING)

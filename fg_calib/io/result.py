@@ -27,12 +27,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import scipy
-from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
+from pydantic import (
+    AliasPath,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    ValidationError,
+    WrapSerializer,
+)
 
 from fg_calib import __version__, statistics
 from fg_calib.assessment import Assessment
 from fg_calib.diagnostics import SetupCheck
-from fg_calib.graph import JOINT_NOISE, Problem, Solution, ToleranceScale, Variables
+from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import read_robot, require_same_chain, write_robot, write_urdf
@@ -239,7 +248,7 @@ class Result(Section):
     n_determined: int = of("assessed.spread.rank", 0)
     n_excluded: dict[str, int] = of("problem.n_excluded")
     solver: SolverRun = of("solution")
-    trustworthy: bool = of("assessed.trustworthy")
+    trustworthy: StrictBool = of("assessed.trustworthy")
     findings: tuple[str, ...] = of("assessed.verdict.errors", ())
     cautions: tuple[str, ...] = of("assessed.verdict.cautions", ())
     reservations: tuple[str, ...] = of("assessed.verdict.warnings", ())
@@ -255,7 +264,7 @@ class Result(Section):
     goodness: dict[str, statistics.KindFit] = {}
     suspect_level: Figure = of("assessed.fit.goodness.level", np.nan)
     suspect_configurations: tuple[statistics.SuspectConfiguration, ...] = of("assessed.fit.goodness.configurations", ())
-    evaluated_only: bool = of("problem.evaluated", False)
+    evaluated_only: StrictBool = of("problem.evaluated", False)
     test: statistics.PredictedFit | None = of("assessed.fit.goodness.test", None)
     acceptance: statistics.Acceptance | None = of("assessed.acceptance", None)
     folds: statistics.CrossValidation | None = of("assessed.cross_validation", None)
@@ -521,9 +530,19 @@ def _shapes(result: Result) -> Iterator[tuple[str, Any, Any]]:
         yield f"{key}: shape", M.shape if M.size else (0, 0), (n, n)
         yield f"{key}: negative variances", int(np.sum(np.diag(M) < 0.0)) if n else 0, 0
     yield "covariance: names", len(known.intersection(names)), len(names)
+    knowledge = result.carried.knowledge
+    for one in () if knowledge is None else filter(None, (knowledge, knowledge.nominal)):
+        arrays, n, m = (one.rows, one.right, one.at), SIZE * len(one.unknowns), one.right.size
+        shapes = [M.shape if M.size else (0,) for M in arrays]
+        yield "carried: knowledge: shapes", shapes, [(m, len(one.columns) + n) if m else (0,), (m,), (n,)]
+        huge = sum(int(np.sum(~(np.abs(M) < MOST_VALUE))) for M in (*arrays, one.parameters))
+        yield "carried: knowledge: values that are none", huge, 0
     for frame in (*result.frames.values(), *filter(None, [result.frame_estimate])):
         yield "frames: shape", [*frame.xyz.shape, *frame.quaternion_xyzw.shape, *frame.sigma.shape], [3, 4, 6]
 
+
+MOST_VALUE = 1e100
+"""Size beyond which a saved value is none: its square is no number."""
 
 ResidualFile = Literal["csv", "parquet", "none"]
 """How single residuals are written, if at all."""

@@ -113,6 +113,7 @@ def move(parameter):
         (lambda f: (f / "result.json").unlink(), "result: no result.json, expected what"),
         (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
         (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
+        (lambda f: changed(f, lambda d: d.update(trustworthy="yes")), "trustworthy: found 'yes', expected true or false"),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
         (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
         (lambda f: changed(f, lambda d: move(d["parameters"][8])), "robot_calibrated.yaml: other values than in"),
