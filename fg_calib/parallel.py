@@ -29,8 +29,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 R = TypeVar("R")
 
-THREADS = "FG_CALIB_THREADS"
-"""The environment variable that sets the number of threads of kernels."""
+THREADS, POLARS_THREADS = "FG_CALIB_THREADS", "POLARS_MAX_THREADS"
+"""The environment variables that set the number of threads of kernels, and of polars."""
 
 MOST = 1000
 """The largest number of threads, and of processes."""
@@ -62,12 +62,17 @@ def processors() -> int:
     Raises:
         InputError: `THREADS` is no number from 1 to `MOST`.
     """
-    given = os.environ.get(THREADS, "")
-    if not given:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-    if not given.isdecimal() or not 0.0 < float(given) <= MOST:
-        raise InputError(f"{THREADS} in the environment", f"found {shown(given)}", f"a number from 1 to {MOST}")
-    return int(given)
+    if given := _threads_in(THREADS):
+        return given
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def _threads_in(variable: str) -> int:
+    """The number in an environment variable; 0 where it is not set."""
+    given = os.environ.get(variable, "")
+    if given and (not given.isdecimal() or not 0.0 < float(given) <= MOST):
+        raise InputError(f"{variable} in the environment", f"found {shown(given)}", f"a number from 1 to {MOST}")
+    return int(given or 0)
 
 
 class _OneThread:
@@ -142,8 +147,9 @@ def require_polars(place: str) -> None:
         place: File that is read or written, for messages.
 
     Raises:
-        InputError: Polars does not work here.
+        InputError: Polars does not work here, or `POLARS_THREADS` is no number from 1 to `MOST`.
     """
+    _threads_in(POLARS_THREADS)
     if _forked_from_polars:
         found = "polars does not work in a fork of a process that has loaded it"
         raise InputError(place, found, hint='use multiprocessing.get_context("spawn") or "forkserver"')
@@ -252,7 +258,7 @@ def local_processes(n_workers: int) -> ProcessPoolExecutor:
 
 def _start_worker(n_threads: int) -> None:
     """Limit a worker's threads, and end it when the process that started it ends."""
-    os.environ |= {THREADS: str(n_threads), "POLARS_MAX_THREADS": str(n_threads)}
+    os.environ |= {THREADS: str(n_threads), POLARS_THREADS: str(n_threads)}
     threadpool_limits(1, user_api="blas")
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     parent = parent_process()

@@ -8,7 +8,6 @@ import pytest
 
 from fg_calib import InputError, Options, Robot
 from fg_calib.inputs import Strategy, check_type, checked
-from fg_calib.robot import solve_inverse
 
 
 @checked
@@ -44,8 +43,3 @@ def test_choices_and_switches_are_checked_and_numbers_where_they_are_used():
     check_type("x", np.True_, bool)
     with pytest.raises(InputError, match="x: found 'yes', expected True or False"):
         check_type("x", "yes", bool)
-
-
-def test_a_generator_that_is_none_is_one_line():
-    with pytest.raises(InputError, match=r"generator: found 3, expected a Generator, such as numpy.random.default_rng"):
-        solve_inverse(Robot.from_dh([[0.1, 0, 0.2, 0]]), [[0.1, 0.0, 0.2]], generator=3)

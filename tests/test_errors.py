@@ -1,6 +1,8 @@
 """Messages are one printable line, whatever stands in the files that they are about."""
 
 import logging
+import subprocess
+import sys
 
 import pytest
 
@@ -30,6 +32,23 @@ def test_findings_and_names_of_files_are_printable(capsys, tmp_path):
     assert len(lines) == 3
     assert all(line.isprintable() for line in lines)
     assert lines[0] == r"not to be trusted: row \x1b]0;title\x07 \u202eexe tab \ud800 [/red]ü is wrong"
+
+
+INTERRUPTED = """
+import os, signal, sys
+from fg_calib.cli import main
+class Finder:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder())
+main()
+"""
+
+
+def test_an_interruption_while_modules_are_imported_ends_in_silence():
+    ended = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, b"", b"")
 
 
 def test_warnings_are_printable(fg_calib, tmp_path, monkeypatch):

@@ -48,11 +48,6 @@ def test_an_executor_that_refuses_a_job_fails_that_job_alone():
         assert map_jobs(work, [1, 2, 3], executor) == [2, Failure("job 2", "TypeError: cannot pickle it"), 6]
 
 
-def test_an_executor_that_is_none_is_refused():
-    with pytest.raises(InputError, match="executor: found 4, expected an Executor"):
-        map_jobs(work, [1], 4)
-
-
 @pytest.mark.parametrize("n", [0, 1001, 1.5, True])
 def test_the_number_of_processes_is_checked(n):
     with pytest.raises(InputError, match="workers: found"):

@@ -80,9 +80,8 @@ MISTAKES = {
     "a strategy": (lambda: Pairing("Chain"), "pairing: found 'Chain', expected one of star, chain, all, random; "
                    "did you mean chain?"),
     "no random pairs": (lambda: Pairing("random"), "pairing: count: found 0, expected a whole number above 0"),
-    "a seed below 0": (
-        lambda: Pairing("random", 3, -1), "pairing: seed: found -1, expected a whole number not below 0"
-    ),
+    "a seed of halves": (lambda: Pairing("random", 3, np.float32(2)), "pairing: seed: found 2.0, expected a whole "
+                         "number not below 0"),
     **{f"a bare strategy {f.__name__}": (
         lambda f=f: f(pairing="chain"), "pairing: found 'chain', expected a Pairing, such as Pairing('chain')"
     ) for f in (problem, bound, practical)},
@@ -91,7 +90,7 @@ MISTAKES = {
     "a bare unit": (lambda: read_measurements("poses.csv", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
                     "such as Units(length='mm')"),
     "options as a mapping": (lambda: solve(problem(), {"max_iterations": 5}), "options: found {'max_iterations': 5}, "
-                             "expected a SolverOptions, such as SolverOptions(max_iterations=200)"),
+                             "expected a SolverOptions, such as SolverOptions(max_iterations=100)"),
     **{f"a name to keep {f.__name__}": (
         lambda f=f: f(prefer=["A2"]), "prefer: unknown parameter 'A2', expected one of base.x, base.y, base.z, "
         "base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, d2, ...; did you mean a2?"
@@ -104,8 +103,6 @@ MISTAKES = {
     "a simulation's seed": (lambda: simulate(scenario(), 1.0), "seed: found 1.0, expected a whole number not below 0"),
     "a unit of length": (lambda: Units(length="MM"), "units: length: found 'MM', expected one of m, cm, mm, um, in; "
                          "did you mean mm?"),
-    "pairs by numpy's halves": (lambda: Pairing("random", np.float32(2)), "pairing: count: found 2.0, "
-                                "expected a whole number above 0"),
     "more noise than a float holds": (lambda: Noise(10**400), f"noise: position: found 1{'0' * 47}...000000..., "
                                       "expected a finite number not below 0"),
 }  # fmt: skip

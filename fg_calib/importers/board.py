@@ -19,8 +19,9 @@ The only module that calls OpenCV, so that nothing else needs it installed.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -129,6 +130,19 @@ def load_opencv() -> Any:
     return cv2
 
 
+@contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Leave out what libraries in C, such as libpng, print of what they cannot read."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
+
+
 def decode(content: bytes, name: str) -> Image:
     """An image in grey levels, as the sensor saw it: no turn that its file asks viewers for is made.
 
@@ -140,7 +154,7 @@ def decode(content: bytes, name: str) -> Image:
         InputError: OpenCV cannot read it.
     """
     cv2, image = load_opencv(), None
-    with suppress(cv2.error):  # of absurd size, or of no content
+    with suppress(cv2.error), _without_stderr():  # of absurd size, or of no content
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), flags)
     if image is None:

@@ -72,7 +72,7 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     job = folder / "calibration.yaml"
     words, _, rest = io.read_text(job).partition("\n") if io.exists(job) else ("", "", "")
     if words.startswith(_FIRST_WORDS) and not words.endswith(_digest(folder, rest)):
-        raise InputError(str(folder), "tables, or a job, that were changed since they were simulated", "another folder")
+        raise InputError(str(folder), "files that were changed since they were simulated", "another folder")
     urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
     names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
     own = {"calibration.yaml": _FIRST_WORDS.encode()}
@@ -81,9 +81,9 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
 
 
 def _digest(folder: Path, job: str) -> str:
-    """A digest of the tables in a folder, and of the rest of their job."""
-    tables = b"".join(path.read_bytes() for path in sorted(folder.glob("*.csv")))
-    return sha256(tables + job.encode()).hexdigest()[:16]
+    """A digest of the tables and robots in a folder, and of the rest of their job."""
+    files = [*folder.glob("*.csv"), *folder.glob("robot_*.yaml"), *folder.glob("*.urdf"), *folder.glob("truth.yaml")]
+    return sha256(b"".join(path.read_bytes() for path in sorted(files)) + job.encode()).hexdigest()[:16]
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import yaml
 from boards import CAMERA, SIZE, render, views
 from scipy.spatial.transform import Rotation
 
+from fg_calib import InputError
 from fg_calib.importers import board as images
 from fg_calib.importers.board import CalibrationBoard, load_opencv
 from fg_calib.io.job import read_camera
@@ -183,6 +184,12 @@ def test_a_board_that_cannot_be_used_is_named(changes, message, job, fg_calib):
     assert ended.code == 1
     assert ended.err.startswith(f"error: {message}")
     assert ended.err.count("\n") == 1
+
+
+def test_what_libraries_print_of_half_an_image_is_left_out(job, capfd):
+    with pytest.raises(InputError, match=r"^half\.png: no image that OpenCV can read"):
+        images.decode((job / "images" / "view1.png").read_bytes()[:-5000], "half.png")
+    assert capfd.readouterr().err == ""
 
 
 def _replace(path, old, new):

@@ -99,7 +99,7 @@ def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severi
 def test_gross_errors_are_not_all_that_is_wrong_beside_a_change_or_an_effect(more, alone):
     gross = GrossErrors(1, ("7",), 1.1)
     fit = SimpleNamespace(goodness=SimpleNamespace(gross_alone=True, gross=gross))
-    assert Case(None, None, fit, **more).gross == (gross if alone else None)
+    assert Case(None, None, fit, None, **more).gross == (gross if alone else None)
 
 
 # --- priors ---------------------------------------------------------------------------------------------------------

@@ -111,17 +111,3 @@ def test_any_value_of_a_result_is_read_or_refused_in_one_line(folder, tmp_path):
         part[key] = pick(WRONG)
         (tmp_path / "result.json").write_text(json.dumps(damaged))
         assert refusal(read_result, tmp_path).isprintable()
-
-
-@pytest.mark.parametrize("key", ["columns", "at", "rows", "right", "parameters", "nominal"])
-def test_rows_are_compared_with_no_damaged_information(folder, tmp_path, key):
-    """One short, none, a number; of numbers others, which may be those of another calibration."""
-    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    new = (folder / "poses.csv").read_text().splitlines()
-    (tmp_path / "poses.csv").write_text("\n".join([new[0], *new[-5:]]).replace(",test", ",train"))
-    document = json.loads((folder / "result.json").read_text())
-    good = document["carried"]["knowledge"][key]
-    for bad in ([*good][:-1], [], 3, *([[2.0 * x for x in good]] if key in ("right", "parameters") else [])):
-        document["carried"]["knowledge"][key] = bad
-        (tmp_path / "result.json").write_text(json.dumps(document))
-        assert refusal(lambda: Calibration.load(tmp_path).check(tmp_path / "poses.csv")).isprintable()

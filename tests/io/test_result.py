@@ -59,20 +59,12 @@ def test_a_loaded_result_has_the_same_document_and_prints_the_same(calibrations,
     assert loaded.configurations.equals(made.configurations, null_equal=True)
 
 
-def test_the_document_has_the_promised_names(calibrations):
+def test_frames_and_combinations_have_the_promised_names(calibrations):
     document = calibrations["poses in an unknown frame"].result.document()
-    assert document.keys() >= PROMISED
-    o = document["observability"]
-    assert o.keys() >= {
-        *("schema", "model", "kind", "n_parameters", "rank", "names", "singular_values", "gap", "independent"),
-        *("ineffective", "relative", "null_space", "indices", "condition_number"),
-    }
-    assert len(o["independent"]) + len(o["ineffective"]) <= o["n_parameters"]
-    assert all(group.keys() >= {"parameters", "lost", "relations", "keep"} for group in o["relative"])
+    assert all(
+        one.keys() >= {"parameters", "lost", "relations", "keep"} for one in document["observability"]["relative"]
+    )
     assert document["frame_estimate"].keys() == {"xyz", "quaternion_xyzw", "sigma"}
-    assert document["parameters"][0].keys() >= {
-        *("name", "unit", "nominal", "estimate", "correction", "sigma", "prior_sigma", "identifiability")
-    }
 
 
 def test_what_is_not_determined_has_no_sigma(calibrations):
@@ -113,7 +105,10 @@ def move(parameter):
         (lambda f: (f / "result.json").unlink(), "result: no result.json, expected what"),
         (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
         (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
-        (lambda f: changed(f, lambda d: d.update(trustworthy="yes")), "trustworthy: found 'yes', expected true or false"),
+        (
+            lambda f: changed(f, lambda d: d.update(trustworthy="yes")),
+            "trustworthy: found 'yes', expected true or false",
+        ),
         (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
         (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
         (lambda f: changed(f, lambda d: move(d["parameters"][8])), "robot_calibrated.yaml: other values than in"),

@@ -228,6 +228,12 @@ def test_a_mistake_is_named_in_one_line(write, table, message):
     assert str(caught.value) == message
 
 
+def test_threads_of_polars_that_are_no_number_are_refused(write, monkeypatch):
+    monkeypatch.setenv("POLARS_MAX_THREADS", "x")
+    with pytest.raises(InputError, match=r"^POLARS_MAX_THREADS in the environment: found 'x', expected a number"):
+        read_measurements(write(POSES), ARM)
+
+
 def test_an_unknown_file_is_named(write):
     with pytest.raises(InputError) as caught:
         read_measurements(write("", "poses.xlsx"), ARM)

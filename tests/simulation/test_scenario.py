@@ -209,12 +209,13 @@ def test_the_truth_is_written_in_the_units_of_the_scenario(folder):
     assert set(truth["frames"]["tracker"]) == {"x", "y", "z", "roll", "pitch", "yaw"}
 
 
-def test_another_simulation_is_replaced_and_another_job_is_not(folder):
+@pytest.mark.parametrize("changed", [".csv", "robot_nominal.yaml"])
+def test_another_simulation_is_replaced_and_another_job_is_not(folder, changed):
     simulation = simulate(read(folder, REST))
     names = write_simulation(folder / "job", simulation)
     assert write_simulation(folder / "job", simulation) == names
-    table = next(folder / "job" / name for name in names if name.endswith(".csv"))
-    table.write_text(table.read_text() + "filled in")
+    file = next(folder / "job" / name for name in names if name.endswith(changed))
+    file.write_text(file.read_text() + "# filled in")
     with pytest.raises(InputError, match="changed since they were simulated"):
         write_simulation(folder / "job", simulation)
     (folder / "job" / "calibration.yaml").write_text("robot: mine.yaml\n")
