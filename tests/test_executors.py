@@ -3,13 +3,14 @@
 import json
 import pickle
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import get_args
 
 import numpy as np
 import pytest
 from deadly import die_once, work
 
 from fg_calib import InputError, ProblemError, calibrate_jobs
-from fg_calib.batch import Order, calibrate_into, exit_code, job_names
+from fg_calib.batch import JobSummary, Verdict, exit_code, job_names
 from fg_calib.parallel import DIED, Failure, dask_executor, listener, local_processes, map_jobs
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
@@ -127,8 +128,7 @@ def test_many_jobs_are_written_to_a_folder_each_with_one_table(example, tmp_path
     assert lines[2].startswith(f"bad,{bad},failed,")
 
 
-def test_the_worst_job_decides_the_exit_code(example, tmp_path):
-    job = example / "calibration.yaml"
-    good, missing = calibrate_into([Order("a", job, None), Order("b", tmp_path / "none.yaml", None)])
-    assert (good.verdict, missing.verdict) == ("good", "failed")
-    assert [exit_code(jobs) for jobs in ([good], [good, missing], [])] == [0, 1, 0]
+def test_the_worst_job_decides_the_exit_code():
+    good, refused, doubtful, failed = (JobSummary("a", "a.yaml", verdict) for verdict in get_args(Verdict))
+    cases = ([], [good], [good, refused], [good, doubtful], [doubtful, failed])
+    assert [exit_code(jobs) for jobs in cases] == [0, 0, 3, 3, 1]

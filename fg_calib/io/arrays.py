@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,9 +13,6 @@ from fg_calib.inputs import InputError, checked, shown
 from fg_calib.io.tables import OF_CONFIGURATIONS, OF_PAIRS, ROUNDED, Table, measurements_of
 from fg_calib.io.yaml import Units
 from fg_calib.measurements import Column, Measurements, Noise
-
-if TYPE_CHECKING:
-    pass
 
 COLUMNS: Mapping[str, str] = {
     "ids": "id",
