@@ -226,10 +226,10 @@ def _prediction(result: Result) -> Iterator[Content]:
     """How well the test rows are predicted, by kind."""
     if (fit := result.test) is None:
         return
-    ratios = [(k.n, k.chi2, k.expected, k.observed_over_specified / k.factor, k.p_value) for k in fit.kinds]
+    ratios = [(k.n, k.observed_over_specified / k.factor, k.p_value) for k in fit.kinds]
     words = [PREDICTION_VERDICTS[k.verdict] for k in fit.kinds]
     rows = [(_named(result, k), *of, word) for k, of, word in zip(fit.kinds, ratios, words, strict=True)]
-    yield table_of(("", "rows|d", "chi-square|.4g", "expected|.4g", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
+    yield table_of(("", "rows|d", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
     if fit.n_outliers:
         yield f"{fit.n_outliers} of {fit.n_measurements} measurements do not count: outliers by the loss"
     if fit.n_unknown:
@@ -282,7 +282,7 @@ def _residuals(result: Result) -> Table:
 
 
 def _lengths(result: Result) -> Table:
-    """Statistics of the lengths of test residuals, else of train ones."""
+    """Statistics of the lengths of test residuals, else of train ones, in the words of ISO 9283."""
     split = "test" if result.rms_after("test") else "train"
     rows = [
         (f"{kind} {when}", result.unit_of(kind), one.mean, one.std, one.p95, one.max)
@@ -290,7 +290,9 @@ def _lengths(result: Result) -> Table:
         for when, one in (both or {}).items()
     ]
     headings = (f"{split} rows: mean", "std", "95 %", "max")
-    return table_of(("", "|unit", *(f"{heading}|q:.4f|-" for heading in headings)), rows)
+    table = table_of(("", "|unit", *(f"{heading}|q:.4f|-" for heading in headings)), rows)
+    table.caption, table.caption_justify = line("mean: the accuracy of ISO 9283, averaged over these rows"), "left"
+    return table
 
 
 def parameter_table(result: Result) -> Table:
