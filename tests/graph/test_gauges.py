@@ -47,6 +47,18 @@ def test_a_kept_parameter_is_as_uncertain_as_what_it_stands_for():
     assert ones @ covariance @ ones == pytest.approx(d5.sigma_of_combination**2, rel=1e-3)
 
 
+def test_what_was_left_out_is_as_uncertain_as_it_was_specified_angles_of_a_tool_too():
+    rng = np.random.default_rng(6)
+    robot = small_arm(tolerance=TOLERANCE, estimate=TOOL)
+    prefer = ("theta4", "d4", "tool.x", "tool.y", "tool.z")
+    found = assessed(robot, true_robot(robot, rng), rng, "pose", prefer=prefer)
+    left_out = [name for name in found.names if name not in found.spread.variables.names]
+    assert left_out == ["a3", "a4", "tool.z", "tool.yaw"]
+    rows = [found.names.index(name) for name in left_out]
+    variance = [robot.parameters[robot.index(name)].tolerance ** 2 for name in left_out]
+    assert found.covariance[np.ix_(rows, rows)] == pytest.approx(np.diag(variance), abs=1e-12)
+
+
 @pytest.mark.parametrize("gauge", ["keep", "none"])
 def test_without_a_tolerance_only_what_does_not_depend_on_it_is_known(gauge):
     rng = np.random.default_rng(4)

@@ -69,6 +69,9 @@ def test_each_table_has_its_own_frame():
         off = np.concatenate([(turn.inv() * Rotation.from_quat(found.quaternion_xyzw)).as_rotvec(), found.xyz - shift])
         assert np.all(np.abs(off[:3]) < 6 * found.sigma[:3])
         assert np.linalg.norm(off[3:]) < 6 * np.linalg.norm(found.sigma[3:])
+    table = uncertainty.fit.residuals
+    rows = [np.arange(table.n)[table.rows_of(number)].tolist() for number in (0, 1)]
+    assert rows == [np.flatnonzero(table.block == number).tolist() for number in (0, 1)]
     turned = assess(solve(build_problem(robot, tables[::-1]))).estimates.frames[::-1]
     for found, again in zip(uncertainty.estimates.frames, turned, strict=True):
         assert again.sigma == pytest.approx(found.sigma, rel=1e-6)

@@ -22,7 +22,7 @@ from fg_calib.measurements.dataset import Measurements, Pairs
 from fg_calib.measurements.table import Table
 from fg_calib.robot.kinematics import pose
 from fg_calib.statistics import variance_components as estimation
-from fg_calib.statistics.variance_components import estimate_noise, noise_components
+from fg_calib.statistics.variance_components import NoiseComponents, estimate_noise, noise_components
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
@@ -248,3 +248,11 @@ def test_factors_of_own_and_joint_noise_that_do_not_settle_are_a_finding(monkeyp
     solution = estimate_noise(draw("pose", np.random.default_rng(11))[0])
     assert not solution.converged
     assert assess(solution).verdict.errors[0].startswith("not converged: the estimated noise still moved by ")
+
+
+def test_degrees_of_freedom_of_an_origin_are_those_that_others_leave_it():
+    information = np.array([[4.0, 1.0, 0.5], [1.0, 9.0, 0.0], [0.5, 0.0, 2.0]])
+    found = NoiseComponents(((0, "distance"), (0, "angle"), JOINT_NOISE), np.ones(3), np.ones(3), information)
+    assert found.degrees(0, np.array([], dtype=np.int64)) == pytest.approx(4.0)
+    assert found.degrees(0, np.array([0, 1])) == pytest.approx(4.0 - 1.0 / 9.0)
+    assert found.degrees(1, np.array([0, 2])) == pytest.approx(9.0 - 1.0 / (4.0 - 0.25 / 2.0))
