@@ -27,16 +27,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import scipy
-from pydantic import (
-    AliasPath,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    StrictBool,
-    ValidationError,
-    WrapSerializer,
-)
+from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
 
 from fg_calib import __version__, statistics
 from fg_calib.assessment import Assessment
@@ -248,7 +239,7 @@ class Result(Section):
     n_determined: int = of("assessed.spread.rank", 0)
     n_excluded: dict[str, int] = of("problem.n_excluded")
     solver: SolverRun = of("solution")
-    trustworthy: StrictBool = of("assessed.trustworthy")
+    trustworthy: Annotated[bool, Field(strict=True)] = of("assessed.trustworthy")
     findings: tuple[str, ...] = of("assessed.verdict.errors", ())
     cautions: tuple[str, ...] = of("assessed.verdict.cautions", ())
     reservations: tuple[str, ...] = of("assessed.verdict.warnings", ())
@@ -264,7 +255,7 @@ class Result(Section):
     goodness: dict[str, statistics.KindFit] = {}
     suspect_level: Figure = of("assessed.fit.goodness.level", np.nan)
     suspect_configurations: tuple[statistics.SuspectConfiguration, ...] = of("assessed.fit.goodness.configurations", ())
-    evaluated_only: StrictBool = of("problem.evaluated", False)
+    evaluated_only: Annotated[bool, Field(strict=True)] = of("problem.evaluated", False)
     test: statistics.PredictedFit | None = of("assessed.fit.goodness.test", None)
     acceptance: statistics.Acceptance | None = of("assessed.acceptance", None)
     folds: statistics.CrossValidation | None = of("assessed.cross_validation", None)
