@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,9 @@ class Job(Brief):
 
     def __post_init__(self) -> None:
         check_fields(self, "job: ")
+        as_usual = self.options.gauge == "prior" and self.options.estimate_tolerance is None
+        if as_usual and self.robot.estimates_zeros_freely:  # a zero that nothing determines stays nominal
+            object.__setattr__(self, "options", replace(self.options, gauge="keep"))
 
     @property
     def tables(self) -> tuple[Table, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,7 +15,7 @@ from fg_calib.initialization import Camera
 from fg_calib.inputs import LIMITED, FrameKnowledge, InputError, Limits, Model, Options, Pairing, checked
 from fg_calib.io import yaml
 from fg_calib.io.atomic import exists, is_folder, noting_reads
-from fg_calib.io.robot_file import read_robot, robot_from_mapping
+from fg_calib.io.robot_file import Names, read_robot, robot_from_mapping
 from fg_calib.io.tables import Column, read_measurements
 from fg_calib.io.yaml import Count, FilePath, NotNegative, Number, Positive, Schema, Units, UnitsOfFile
 from fg_calib.job import Job
@@ -77,13 +77,14 @@ class _Entry(_TableKeys):
 _CHOICES = ("prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
 """Keys of a job that `Options` checks as they stand."""
 
-_OF_THE_ROBOT = ("robot", "truth", "prior", "gauge", "prefer", "folds")
+_OF_THE_ROBOT = ("robot", "estimate", "truth", "prior", "gauge", "prefer", "folds")
 """Keys of a job that say nothing of how a table is read."""
 
 
 class _JobKeys(_TableKeys):
     robot: Any
     measurements: Any
+    estimate: Names = ()
     accept: Any = None
     truth: FilePath | None = None
     targets: Mapping[str, _Point] = Field(default_factory=dict)
@@ -135,7 +136,7 @@ def read_job(path: Path | str) -> Job:
 def _read_job(path: Path) -> Job:
     folder, given = path.parent, yaml.read_yaml(path)
     file = yaml.validate(_Job, given, path.name)
-    robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units)
+    robot = robot_of(file.robot, f"{path.name}: robot", folder, file.units, file.estimate)
     document = _with_cameras({key: value for key, value in given.items() if key not in _OF_THE_ROBOT}, folder)
     entries = _entries(document, file, path.name)
     listed = given["measurements"] if isinstance(given["measurements"], list) else []
@@ -355,7 +356,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
         file.options(robot, file.model)
 
 
-def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
+def robot_of(given: object, place: str, folder: Path, units: Units, estimate: Sequence[str] = ()) -> Robot:
     """The robot under a key `robot`.
 
     Args:
@@ -364,15 +365,16 @@ def robot_of(given: object, place: str, folder: Path, units: Units) -> Robot:
         folder: The folder of the file that names it.
         units: Of that file; a URDF's `tolerance`, `base` and `tool` that stand in it are in these unless they state
             their own. A mapping of DH rows is a robot file of its own: m and rad unless it states others.
+        estimate: What is estimated besides what the robot's own key says.
 
     Raises:
         InputError: The entry is no path or mapping, or does not describe a robot.
     """
     if isinstance(given, dict):
-        return robot_from_mapping({"units": units} | given if "urdf" in given else given, place, folder)
+        return robot_from_mapping({"units": units} | given if "urdf" in given else given, place, folder, estimate)
     if not isinstance(given, str) or not given:
         raise InputError(place, f"found {yaml.shown(given)}", "a path, or the mapping of a robot file")
-    return read_robot(folder / given)
+    return read_robot(folder / given, estimate=estimate)
 
 
 def _truth(path: Path, robot: Robot) -> Robot:

@@ -35,13 +35,13 @@ from fg_calib.diagnostics import SetupCheck
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
-from fg_calib.io.robot_file import read_robot, require_same_chain, write_robot, write_urdf
+from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
 from fg_calib.measurements import Table
 from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
 from fg_calib.prediction import ExpectedError
-from fg_calib.robot import SPAN, Robot, pose
+from fg_calib.robot import SPAN, Robot, model, pose
 from fg_calib.statistics import FLAGS, JointErrors
 
 if TYPE_CHECKING:
@@ -681,11 +681,12 @@ def _digest(path: Path) -> str:
 def _write_robot(folder: Path, robot: Robot) -> None:
     units = Units(*robot.units)
     if robot.urdf is not None:
-        file = folder / "robot_calibrated.urdf"
+        file, own = folder / "robot_calibrated.urdf", has_own_zeros(robot)
         write_urdf(file, robot)
-        written = read_robot(file, base_link=robot.urdf.base_link, tip_link=robot.urdf.tip_link)
-        require_same_chain(robot, written, str(file))
-        if not any(p.nominal != 0.0 or p.estimated for p in robot.parameters if p.owner in (0, robot.n_joints + 1)):
+        links = {"base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
+        require_same_chain(robot, read_robot(file, **links, estimate=[model.ZEROS] * own), str(file))
+        ends = [p for p in robot.parameters if p.owner in (0, robot.n_joints + 1)]
+        if not own and not any(p.nominal != 0.0 or p.estimated for p in ends):
             return
     rounded = [
         round(p.nominal / factor, math.ceil(math.log10(factor / RESOLUTION))) * factor if p.estimated else p.nominal
@@ -709,10 +710,11 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     robot = read_robot(file, base_link=links[0], tip_link=links[1])
     names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]
     same = [p.name for p in robot.parameters] == names
-    if not same or not np.allclose(robot.nominal, estimates, 0.0, RESOLUTION):
+    calibrated = robot.with_values(estimates) if same else robot
+    if not same or not np.allclose(robot.nominal, as_read(calibrated).nominal, 0.0, RESOLUTION):
         found = "other values" if same else "other parameters"
         raise InputError(str(file), f"{found} than in result.json", "the files of one calibration")
-    return robot.with_values(estimates)
+    return calibrated
 
 
 def read_table(folder: Path, name: str, result: Result) -> pl.DataFrame | None:

@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, shown
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import Bound, FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
-from fg_calib.robot import Joint, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of
+from fg_calib.robot import Joint, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
@@ -106,7 +106,8 @@ def read_urdf(
         tree = _Tree(_read_joints(root, path.name), links, path.name)
         base_link = tree.root() if base_link is None else tree.known(base_link)
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
-        n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name)
+        zeros = model.ZEROS in listed("estimate", estimate)
+        n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name, zeros)
         if n_joints == 0:
             raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
     except InputError as error:  # elements of xacro may hold what is missing
@@ -125,10 +126,11 @@ def read_urdf(
 _CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
 """Elements of a joint of a URDF."""
 
+_ROWS = "`fg-calib export --to yaml` writes the arm as rows of dh-hayati, whose d is the zero of a slide"
 _XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
 
 
-def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str) -> int:
+def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], place: str, zeros: bool) -> int:
     """Add the joints of a chain, each with whether it is passed backwards; the number of those that move."""
     n_joints = 0
     for joint, backwards in chain:
@@ -142,7 +144,10 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
-        builder.add_urdf_joint(_moving_joint(joint, here), joint.origin, _axis(joint, here), backwards=backwards)
+        moving = _moving_joint(joint, here)
+        if zeros and moving.prismatic:
+            raise InputError(here, "a slide, with estimate: zeros", "joints that turn", _ROWS)
+        builder.add_urdf_joint(moving, joint.origin, _axis(joint, here), backwards=backwards, zero=zeros)
         n_joints += 1
     return n_joints
 
@@ -163,9 +168,28 @@ def write_urdf(path: Path | str, robot: Robot) -> None:
 
 
 def joint_origins(robot: Robot) -> dict[str, dict[str, float]]:
-    """Nominal origins of the joints of a robot from a URDF, by joint and kind, [m] and [rad]."""
-    values = {p.name: p.nominal for p in robot.parameters}
+    """Nominal origins of the joints of a robot from a URDF, zeros in them, by joint and kind, [m] and [rad]."""
+    values = {p.name: p.nominal for p in as_read(robot).parameters}
     return {j.name: {kind: values[f"{j.name}.{kind}"] for kind in model.FRAME_KINDS} for j in robot.joints}
+
+
+def has_own_zeros(robot: Robot) -> bool:
+    """Whether a robot from a URDF has zeros of its joints as parameters."""
+    return robot.urdf is not None and robot.zero_names[0] in names_of(robot.parameters)
+
+
+def as_read(robot: Robot) -> Robot:
+    """A robot as its files read: a URDF holds zeros in the origins, turned about the joints' axes."""
+    values = {p.name: p.nominal for p in robot.parameters}
+    for place, e in enumerate(robot.elements) if has_own_zeros(robot) else ():
+        if e.joint is not None and (zero := values[robot.zero_names[e.joint]]):
+            yaw, pitch = (one.constant for one in robot.elements[place - 2 : place])
+            kinds = [f"{robot.joints[e.joint].name}.{kind}" for kind in ("yaw", "pitch", "roll")]
+            axis, before = rotations.rotation_of(yaw, pitch, 0.0), [values[kind] for kind in kinds]
+            turned = rotations.rotation_of(*before) @ axis @ rotations.rotation_of(zero, 0.0, 0.0) @ axis.T
+            angles = rotations.yaw_pitch_roll(turned, np.array(before)).tolist()
+            values |= dict(zip(kinds, angles, strict=True)) | {robot.zero_names[e.joint]: 0.0}
+    return robot.with_values(list(values.values()))
 
 
 def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
@@ -390,6 +414,10 @@ def _si(kind: str, value: float, units: Units, place: str) -> float:
     return value * units.factor(unit)
 
 
+Names = Annotated[tuple[str, ...], BeforeValidator(lambda one: (one,) if isinstance(one, str) else one)]
+"""A list of names, or one name."""
+
+
 class _Robot(Schema):
     """The keys that both forms of a robot file have.
 
@@ -399,7 +427,8 @@ class _Robot(Schema):
         base: Base frame to frame 0, or to the first link of a URDF.
         tool: Last frame to tool frame.
         fixed: Parameters of the joints that are known exactly, never estimated.
-        estimate: Parameters of base and tool that are estimated, which others are not: tool.x.
+        estimate: Parameters of base and tool that are estimated, which others are not: tool.x; `zeros`: of the joints
+            their zeros alone.
         tolerance: 1 sigma of true minus nominal, by kind (a, theta, tool, ...) or by name: used as priors.
     """
 
@@ -408,18 +437,18 @@ class _Robot(Schema):
     base: FrameValues = FrameValues()
     tool: FrameValues = FrameValues()
     fixed: tuple[str, ...] = ()
-    estimate: tuple[str, ...] = ()
+    estimate: Names = ()
     tolerance: dict[str, Positive] = Field(default_factory=dict)
 
-    def choices(self, place: str) -> dict[str, Any]:
-        """Arguments of `RobotBuilder.build`, [m] and [rad].
+    def choices(self, place: str, estimate: Sequence[str]) -> dict[str, Any]:
+        """Arguments of `RobotBuilder.build`, [m] and [rad]; `estimate` is estimated too.
 
         Raises:
             InputError: A tolerance is too small.
         """
         sigma, where = self.units.sigma, f"{place}: tolerance"
         tolerance = {key: sigma(value, model.unit_of(key), f"{where}: {key}") for key, value in self.tolerance.items()}
-        return {"fixed": self.fixed, "estimate": self.estimate, "tolerance": tolerance}
+        return {"fixed": self.fixed, "estimate": (*self.estimate, *estimate), "tolerance": tolerance}
 
 
 class _Row(Schema):
@@ -445,42 +474,46 @@ class _UrdfRobot(_Robot):
 
 
 @checked
-def read_robot(path: Path | str, *, base_link: str | None = None, tip_link: str | None = None) -> Robot:
+def read_robot(
+    path: Path | str, *, base_link: str | None = None, tip_link: str | None = None, estimate: Sequence[str] = ()
+) -> Robot:
     """The robot in a YAML file or a URDF, recognised by the ending `.urdf`.
 
     Args:
         path: The file.
         base_link: Link of the URDF where the chain starts, instead of the one the file names.
         tip_link: Link of the URDF where the chain ends, instead of the one the file names.
+        estimate: What is estimated besides what the file says (see `RobotBuilder.build`).
 
     Raises:
         InputError: There is no such file, or it does not describe a robot.
     """
     path = Path(path)
     if path.suffix.lower() == ".urdf":
-        return read_urdf(path, base_link=base_link, tip_link=tip_link)
+        return read_urdf(path, base_link=base_link, tip_link=tip_link, estimate=estimate)
     if path.suffix.lower() == ".xacro":
         hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
         raise InputError(path.name, "a file of xacro", "a URDF", hint)
     mapping, links = read_yaml(path), {"base_link": base_link, "tip_link": tip_link}
     name = {} if "urdf" in mapping else {"name": path.stem}
     given = name | mapping | {key: link for key, link in links.items() if link is not None}
-    return robot_from_mapping(given, path.name, path.parent)
+    return robot_from_mapping(given, path.name, path.parent, estimate)
 
 
-def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> Robot:
+def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path, estimate: Sequence[str] = ()) -> Robot:
     """The robot that a mapping of a YAML file describes.
 
     Args:
         mapping: The mapping: with `urdf`, or with `convention` and `joints`.
         place: Its file, and its key there if it is not the whole file.
         folder: Folder that the path of a URDF is relative to.
+        estimate: What is estimated besides what the mapping says.
 
     Raises:
         InputError: The mapping does not describe a robot.
     """
     if "urdf" not in mapping:
-        return _build_dh(validate(_DhRobot, dict(mapping), place), place)
+        return _build_dh(validate(_DhRobot, dict(mapping), place), place, estimate)
     file = validate(_UrdfRobot, dict(mapping), place)
     robot = read_urdf(
         folder / file.urdf,
@@ -490,12 +523,12 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path) -> 
         base=file.base.si(file.units, f"{place}: base"),
         tool=file.tool.si(file.units, f"{place}: tool"),
         place=place,
-        **file.choices(place),
+        **file.choices(place, estimate),
     )
     return replace(robot, units=(file.units.length, file.units.angle))
 
 
-def _build_dh(file: _DhRobot, place: str) -> Robot:
+def _build_dh(file: _DhRobot, place: str, estimate: Sequence[str]) -> Robot:
     builder = RobotBuilder(file.name or "robot", file.convention)
     builder.add_frame("base", file.base.si(file.units, f"{place}: base"), 0, False)
     names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
@@ -516,7 +549,8 @@ def _build_dh(file: _DhRobot, place: str) -> Robot:
         values = {kind: _si(kind, getattr(row, kind), file.units, here) for kind in kinds}
         builder.add_convention_joint(joint, values)
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
-    return replace(builder.build(place=place, **file.choices(place)), units=(file.units.length, file.units.angle))
+    robot = builder.build(place=place, **file.choices(place, estimate))
+    return replace(robot, units=(file.units.length, file.units.angle))
 
 
 @checked
@@ -564,9 +598,11 @@ def robot_text(
         frame = [robot.parameters[i] for i in owned]
         mapping |= {key: {p.kind: units.from_si(p.nominal, p.unit) for p in frame if p.nominal != 0.0}}
     of_frames = [robot.parameters[i] for i in (*base, *tool)]
+    zeros = has_own_zeros(robot)
+    of_joints = [p for p in robot.parameters if p not in of_frames and (not zeros or p.name in robot.zero_names)]
     mapping |= {
-        "fixed": [p.name for p in robot.parameters if p not in of_frames and not p.estimated],
-        "estimate": [p.name for p in of_frames if p.estimated],
+        "fixed": [p.name for p in of_joints if not p.estimated],
+        "estimate": [model.ZEROS] * zeros + [p.name for p in of_frames if p.estimated],
         "tolerance": _tolerances(robot, units),
     }
     mapping = {key: value for key, value in mapping.items() if value or key == "joints"}

@@ -210,7 +210,7 @@ def _detectable(calibrated: Calibrated, found: Sequence[HypothesisTest]) -> dict
     """The offset change of each joint that is found with a probability of `POWER`."""
     least = np.sqrt(hypotheses.quantile(hypotheses.CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
     sizes = {f.hypothesis.names[0]: float(least * f.sigma[0]) for f in found if f.hypothesis.kind == "zero"}
-    names = hypotheses.zero_names(calibrated.robot)
+    names = calibrated.robot.zero_names
     return {name: sizes[name] if np.isfinite(sizes.get(name, np.nan)) else None for name in names}
 
 

@@ -164,7 +164,7 @@ def fit_change(hypothesis: ChangeHypothesis, rows: Linear, n: int) -> Hypothesis
 def single_changes(rows: Linear) -> list[ChangeHypothesis]:
     """Zeros of joints first, then the other parameters that were estimated, those of the tool, the tool, the frame."""
     robot, six = rows.robot, ("rad",) * 3 + ("m",) * 3
-    directions, zeros = named_changes(all_variables(robot)), zero_names(robot)
+    directions, zeros = named_changes(all_variables(robot)), robot.zero_names
     others = [p for p in robot.parameters if p.name not in zeros]
     tool = robot.n_joints + 1
     kinds: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -175,13 +175,6 @@ def single_changes(rows: Linear) -> list[ChangeHypothesis]:
     }
     known = [(name, kind, units, directions[name]) for name, (kind, units) in kinds.items() if name in directions]
     return [ChangeHypothesis((name,), kind, units, rows.of_arm @ D, D) for name, kind, units, D in known]
-
-
-def zero_names(robot: Robot) -> tuple[str, ...]:
-    """Name of each joint's zero: theta3 or d3 where the convention has it, else `<joint>.zero`."""
-    moving = {e.joint: robot.parameters[e.parameter].name for e in robot.elements
-              if e.joint is not None and e.parameter is not None}  # fmt: skip
-    return tuple(moving.get(j, f"{joint.name}.zero") for j, joint in enumerate(robot.joints))
 
 
 def named_changes(v: Variables) -> dict[str, Floats]:
@@ -195,7 +188,7 @@ def named_changes(v: Variables) -> dict[str, Floats]:
     q = random_readings(robot, 20, np.random.default_rng(0))
     J, joints = np.split(forward(chain, robot.trig(q)).jacobian, [v.n_columns], axis=2)
     found: dict[str, Floats] = dict(zip(v.names, E.T[:, :, None], strict=True))
-    for j, name in enumerate(zero_names(robot)):
+    for j, name in enumerate(robot.zero_names):
         own = [v.names.index(p.name) for p in robot.parameters if p.owner == j + 1 and p.name in v.names]
         A, b = (J @ E[:, own]).reshape(-1, len(own)), joints[:, :, j].ravel()
         amounts = np.linalg.lstsq(A, b, rcond=None)[0] if own else np.zeros(0)

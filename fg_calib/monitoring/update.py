@@ -99,11 +99,11 @@ def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequenc
     Growth of a parameter's name counts before that of its kind.
     """
     kinds = {p.name: tolerance_kind(p) or "" for p in known.robot.parameters}
-    names, free = known.variables.names, dict.fromkeys(changed, 1.0)
+    names, free = known.variables.names, dict.fromkeys(known.robot.own_names(changed), 1.0)
     of_kinds = sorted({kinds[name] for name in names if kinds[name]})
     for key, given, possible in (
         ("growth", growth, [*names, *of_kinds]),
-        ("changed", changed, list(named_changes(known.variables))),
+        ("changed", free, list(named_changes(known.variables))),
     ):
         for name in given:
             if name not in possible:

@@ -120,6 +120,9 @@ FRAME_KINDS = ("x", "y", "z", "yaw", "pitch", "roll")
 """A frame's elementary transforms, left to right: Txyz Rz(yaw) Ry(pitch) Rx(roll), as in URDF."""
 
 
+ZEROS = "zeros"
+"""Stands in `estimate` for the zero of each joint: of the arm these alone are estimated."""
+
 MOST_ANGLE = 4.0 * np.pi
 """How large an angle of a robot in rad may be: most of those in deg are larger."""
 
@@ -379,6 +382,25 @@ class Robot:
     def _nominal(self) -> Floats:
         return np.array([p.nominal for p in self.parameters])
 
+    @cached_property
+    def zero_names(self) -> tuple[str, ...]:
+        """Name of each joint's zero: theta3 or d3 where the convention has it, else `<joint>.zero`."""
+        moving = {e.joint: self.parameters[e.parameter].name for e in self.elements
+                  if e.joint is not None and e.parameter is not None}  # fmt: skip
+        return tuple(moving.get(j, f"{joint.name}.zero") for j, joint in enumerate(self.joints))
+
+    def own_names(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Names of parameters, `<joint>.zero` as the robot's own parameter is called."""
+        own = {f"{joint.name}.zero": name for joint, name in zip(self.joints, self.zero_names, strict=True)}
+        return tuple(own.get(name, name) if isinstance(name, str) else name for name in names)
+
+    @property
+    def estimates_zeros_freely(self) -> bool:
+        """Whether of the joints zeros alone are estimated, and nothing that is estimated has a prior."""
+        of_joints = {p.name for p in self.parameters if p.estimated and 1 <= p.owner <= self.n_joints}
+        with_prior = any(p.tolerance is not None for p in self.parameters if p.estimated)
+        return bool(of_joints) and of_joints.issubset(self.zero_names) and not with_prior
+
     @property
     def limits(self) -> Floats:
         """Joint limits, lower and upper, shape (n_joints, 2), [rad] or [m]."""
@@ -488,7 +510,7 @@ class RobotBuilder:
 
     @checked
     def add_urdf_joint(
-        self, joint: Joint, origin: Mapping[str, float], axis: Floats, *, backwards: bool = False
+        self, joint: Joint, origin: Mapping[str, float], axis: Floats, *, backwards: bool = False, zero: bool = False
     ) -> None:
         """Append a URDF joint: its origin as six parameters, then the motion about or along `axis`.
 
@@ -497,6 +519,7 @@ class RobotBuilder:
             origin: x, y, z, roll, pitch, yaw of the joint's origin, [m] and [rad].
             axis: Unit vector in the joint's frame, shape (3,).
             backwards: Append the inverse: the chain runs from the joint's child to its parent.
+            zero: Whether the zero of a joint that turns is a parameter of its own, `<joint>.zero`.
         """
         index, start = len(self._joints), len(self._elements)
         self._joints.append(joint)
@@ -505,13 +528,12 @@ class RobotBuilder:
         yaw, pitch = np.arctan2(axis[1], axis[0]), np.arctan2(np.hypot(axis[0], axis[1]), axis[2])
         if pitch == 0.0:
             yaw = 0.0
-        self._elements += [
-            Element(Axis.RZ, yaw),
-            Element(Axis.RY, pitch),
-            Element(Axis.TZ if joint.prismatic else Axis.RZ, joint=index),
-            Element(Axis.RY, -pitch),
-            Element(Axis.RZ, -yaw),
-        ]
+        self._elements += [Element(Axis.RZ, yaw), Element(Axis.RY, pitch)]
+        if zero:
+            self._add_parameter(f"{joint.name}.zero", "theta", index + 1, 0.0, True, index)
+        else:
+            self._elements.append(Element(Axis.TZ if joint.prismatic else Axis.RZ, joint=index))
+        self._elements += [Element(Axis.RY, -pitch), Element(Axis.RZ, -yaw)]
         if backwards:
             self._elements[start:] = _inverse(self._elements[start:])
 
@@ -546,7 +568,8 @@ class RobotBuilder:
 
         Args:
             fixed: Names of parameters that are known exactly.
-            estimate: Names of base and tool parameters to estimate (they are fixed otherwise).
+            estimate: Names of base and tool parameters to estimate (they are fixed otherwise); with `ZEROS` the zeros
+                are all that is estimated of the joints.
             tolerance: 1-sigma priors by parameter name or by kind, [m] or [rad]; the kinds `base` and `tool`
                 mean the lengths of those frames.
             urdf: The source, for a URDF robot.
@@ -564,7 +587,12 @@ class RobotBuilder:
         behind = len(self._joints) + 1
         if self._convention in CONVENTIONS and all(p.owner != behind for p in self._parameters):
             self.add_frame("tool", {}, behind, False)
-        fixed, estimate = listed("fixed", fixed), listed("estimate", estimate)
+        parts = tuple(self._joints), tuple(self._parameters), tuple(self._elements)
+        robot = Robot(self._name, self._convention, *parts, urdf)
+        fixed, estimate = (robot.own_names(listed(*one)) for one in (("fixed", fixed), ("estimate", estimate)))
+        if ZEROS in estimate:
+            estimate = tuple(name for name in estimate if name != ZEROS)
+            fixed += tuple(p.name for p in self._parameters if 1 <= p.owner < behind and p.name not in robot.zero_names)
         names = {p.name for p in self._parameters}
         if len(names) < len(self._parameters):
             twice = next(name for name, n in Counter(names_of(self._parameters)).items() if n > 1).rpartition(".")[0]
@@ -575,15 +603,7 @@ class RobotBuilder:
         both = sorted(set(fixed) & set(estimate))
         if both:
             raise InputError(f"{place}: estimate", f"{both[0]!r} is under fixed too", "it under one of the two")
-        tolerance = dict(tolerance or {})
-        for key, figure in tolerance.items():
-            check_number(f"tolerance: {key}", figure, above=True)
-        kinds = {tolerance_kind(p) for p in self._parameters} - {None}
-        for name in tolerance:
-            if name not in names and name not in kinds:
-                named = sorted(str(k) for k in kinds)
-                found, hint = f"unknown parameter or kind {name!r}", did_you_mean(name, [*named, *names], NEAR)
-                raise InputError(f"{place}: tolerance", found, known_names(named), hint)
+        tolerance = _checked_tolerance(tolerance or {}, self._parameters, place)
         parameters = tuple(
             replace(
                 p,
@@ -592,7 +612,7 @@ class RobotBuilder:
             )
             for p in self._parameters
         )
-        return Robot(self._name, self._convention, tuple(self._joints), parameters, tuple(self._elements), urdf)
+        return replace(robot, parameters=parameters)
 
     def _add_parameter(
         self, name: str, kind: str, owner: int, nominal: float, estimated: bool, joint: int | None = None
@@ -600,6 +620,19 @@ class RobotBuilder:
         parameter = Parameter(name, kind, owner, float(nominal), estimated=estimated)
         self._elements.append(Element(PARAMETER_KINDS[kind].axis, parameter=len(self._parameters), joint=joint))
         self._parameters.append(parameter)
+
+
+def _checked_tolerance(tolerance: Mapping[str, float], parameters: Sequence[Parameter], place: str) -> dict[str, float]:
+    """1-sigma priors by name or kind, of parameters that there are."""
+    for key, figure in dict(tolerance).items():
+        check_number(f"tolerance: {key}", figure, above=True)
+    names, kinds = names_of(parameters), {tolerance_kind(p) for p in parameters} - {None}
+    for name in tolerance:
+        if name not in names and name not in kinds:
+            named = sorted(str(k) for k in kinds)
+            found, hint = f"unknown parameter or kind {name!r}", did_you_mean(name, [*named, *names], NEAR)
+            raise InputError(f"{place}: tolerance", found, known_names(named), hint)
+    return dict(tolerance)
 
 
 def frame_values(name: str, given: Mapping[str, float] | ArrayLike | None) -> dict[str, float]:
@@ -685,6 +718,7 @@ def names_of(parameters: Iterable[Parameter]) -> list[str]:
 def unit_of(name: str) -> str:
     """The SI unit of a parameter or kind by its name: `alpha3`, `elbow.yaw`; `m` of `base`, `tool`, what is no kind."""
     kind = name.rpartition(".")[2] if "." in name else name.rstrip("0123456789")
+    kind = "theta" if kind == "zero" else kind
     return PARAMETER_KINDS[kind].unit if kind in PARAMETER_KINDS else "m"
 
 

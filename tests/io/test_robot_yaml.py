@@ -54,6 +54,13 @@ def test_a_robot_file_is_converted_to_si(tmp_path):
     assert estimated == {"alpha1", "d1", "theta1", "beta1", "a2", "alpha2", "d2", "theta2", "tool.z"}
 
 
+def test_zeros_are_all_that_is_estimated_of_the_joints_by_either_name(tmp_path):
+    zeros = read(tmp_path, GOOD.replace("[a1, beta2]", "[slide.zero]").replace("[tool.z]", "zeros"))
+    assert [p.name for p in zeros.parameters if p.estimated] == ["theta1"]
+    more = read(tmp_path, GOOD.replace("[tool.z]", "[zeros, tool.z]"))
+    assert [p.name for p in more.parameters if p.estimated] == ["theta1", "d2", "tool.z"]
+
+
 def test_the_chain_is_base_then_joints_then_tool(tmp_path):
     robot = read(tmp_path, GOOD)
     q = np.array([0.3, 0.04])

@@ -204,6 +204,9 @@ MISTAKES = [
      "torso.urdf: joint 'l2': element <orign>; did you mean origin?"),
     (changed('<origin xyz="0.3 0 0.1"', '<origin/><origin xyz="0.3 0 0.1"'), {"tip_link": "left_tip"},
      "torso.urdf: joint 'l2': two elements <origin>, expected one"),
+    (TREE, {"tip_link": "left_tip", "estimate": ["zeros"]},
+     "torso.urdf: joint 'l3': a slide, with estimate: zeros, expected joints that turn; `fg-calib export --to yaml` "
+     "writes the arm as rows of dh-hayati, whose d is the zero of a slide"),
     (changed("</robot>", "<xacro:arm/></robot>"), {},
      "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11; "
      "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"),

@@ -12,7 +12,6 @@ from simulated import true_robot
 from fg_calib import Measurements, Robot, Table, calibrate
 from fg_calib.inputs import InputError
 from fg_calib.measurements.dataset import Labels
-from fg_calib.monitoring.hypotheses import zero_names
 from fg_calib.robot import pose
 
 SMALL = 2.5e-4
@@ -247,10 +246,10 @@ def test_rows_of_another_robot_are_refused(known):
         calibration.check(other)
 
 
-def test_zeros_of_a_urdf_are_called_by_their_joints():
-    assert zero_names(arm())[:2] == ("theta1", "theta2")
+def test_zeros_are_called_by_the_parameters_that_rows_have_for_them():
+    assert arm().zero_names[:2] == ("theta1", "theta2")
     sliding = Robot.from_dh([[0, 0, 0.1, 0], [0, 0, 0.2, 0]], "dh", types=["revolute", "prismatic"])
-    assert zero_names(sliding) == ("theta1", "d2")
+    assert sliding.zero_names == ("theta1", "d2")
 
 
 MISREAD = {
