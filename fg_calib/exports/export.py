@@ -23,6 +23,7 @@ from fg_calib.exports.urdf import (
     tesseract_text,
     ur_kinematics,
 )
+from fg_calib.exports.zeros import Zero, tell_zeros
 from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
 from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, frame_values
@@ -81,7 +82,7 @@ class Export:
         { "schema": "fg-calib/export/1", "version", "to", "robot", "text", "notes": [text], "findings": [text],
           "not_accepted": [text],
           of tables: "convention", "exact", "reasons": [text], "error": {errors},
-          of zeros: "zeros": {joint: {"reading", "unit"}}, "before", "after": {"workspace": {errors}, "measured": ...},
+          of zeros: "zeros": {joint: {see `Zero`}}, "before", "after": {"workspace": {errors}, "measured": ...},
           of ur: "base", "hash", "tool0_T_tool": [[...]], of tesseract: "joints": [names] }
 
         with errors as in `PoseErrors`; SI.
@@ -144,7 +145,7 @@ def export(
         "urdf": lambda: _urdf(robot, comments),
         "ur": lambda: _ur(robot, ur_base, ur_hash),
         "tesseract": lambda: _tesseract(robot),
-        "zeros": lambda: _zeros(robot, nominal, tool, configurations),
+        "zeros": lambda: _zeros(arm, nominal, tool, configurations),
         "yaml": lambda: _yaml(robot),
     }
     text, notes, details = formats[to]() if to in formats else _table(robot, to, far)
@@ -252,25 +253,34 @@ def _yaml(robot: Robot) -> _Content:
     return robot_text(dh.in_table(robot, "dh-hayati").robot), [note], {}
 
 
-def _zeros(robot: Robot, start: Robot | None, tool: ToolOfZeros, configurations: ArrayLike | None) -> _Content:
+def _zeros(arm: Robot | Calibration, start: Robot | None, tool: ToolOfZeros, at: ArrayLike | None) -> _Content:
     if start is None:
         raise InputError("zeros", "an arm without its nominal robot", "a RESULT of calibrate, or a nominal robot")
-    nominal = dh.with_frames_of(start, robot, (robot.n_joints + 1,)) if tool == "calibrated" else start
+    robot = arm.robot if isinstance(arm, Calibration) else arm
     fitted, given = dh.drawn(robot, dh.N_FITTED, 0), dict[str, Floats]()
-    if configurations is not None:
-        given["measured"] = fitted = as_floats("configurations", configurations, f"(n, {robot.n_joints})")
+    if at is not None:
+        given["measured"] = fitted = as_floats("configurations", at, f"(n, {robot.n_joints})")
         if not len(fitted):
             raise InputError("configurations", "none", "at least one")
-    zeros = dh.fit_zeros(nominal, robot, fitted)
+    behind = robot.n_joints + 1
+    kept = (0, behind) if tool == "calibrated" else (0,)
+
+    def fit(one: Robot) -> Floats:
+        return dh.fit_zeros(dh.with_frames_of(start, one, kept), one, fitted)
+
+    nominal, zeros = dh.with_frames_of(start, robot, kept), fit(robot)
+    told = {joint.name: Zero(zero, joint.unit) for joint, zero in zip(robot.joints, zeros.tolist(), strict=True)}
+    if isinstance(arm, Calibration) and not arm.result.evaluated_only:
+        told = tell_zeros(arm, fit)
     notes = [
         "joint zeros, all else nominal: zero is what to add to a joint's reading (angle = reading + zero);",
         "it is subtracted from what is commanded, and from a stored encoder offset (angle = encoder - offset)",
         f"fitted at {len(fitted)} configurations {'given' if given else 'within the joint limits'}",
     ]
-    tools = {which: _frame_words(one, robot.n_joints + 1) for which, one in (("nominal", start), ("calibrated", robot))}
+    tools = {which: _frame_words(one, behind) for which, one in (("nominal", start), ("calibrated", robot))}
     if tools["nominal"] != tools["calibrated"]:
         notes.append(f"with the {tool} tool: {tools[tool] or 'none'} (mm, deg)")
-    details: dict[str, Any] = {"zeros": {}, "before": {}, "after": {}}
+    details: dict[str, Any] = {"zeros": {name: asdict(zero) for name, zero in told.items()}, "before": {}, "after": {}}
     for name, q in (given | {"workspace": dh.drawn(robot, dh.N_JUDGED, 1)}).items():
         where = "over the joint limits" if name == "workspace" else "at the configurations given"
         for when, offsets in (("before", None), ("after", zeros)):
@@ -278,7 +288,10 @@ def _zeros(robot: Robot, start: Robot | None, tool: ToolOfZeros, configurations:
             details[when][name] = asdict(error)
             notes.append(f"{when}, {where}: {_error_words(error)}")
     rows = {}
-    for joint, zero in zip(robot.joints, zeros.tolist(), strict=True):
-        details["zeros"][joint.name] = {"reading": zero, "unit": joint.unit}
-        rows[joint.name] = {"zero": _MM_DEG.from_si(zero, joint.unit), "unit": _MM_DEG.name(joint.unit)}
+    for name, zero in told.items():
+        sigma = "not determined" if not zero.determined else zero.sigma and _MM_DEG.from_si(zero.sigma, zero.unit)
+        row = {"zero": _MM_DEG.from_si(zero.reading, zero.unit), "unit": _MM_DEG.name(zero.unit), "sigma": sigma}
+        rows[name] = {key: value for key, value in (row | {"note": zero.note}).items() if value not in (None, "")}
+        if zero.note:
+            notes.append(f"{name} {'is' if zero.determined else 'is not determined and left at 0'}: {zero.note}")
     return dumped({"robot": robot.name, "zeros": rows}), notes, details

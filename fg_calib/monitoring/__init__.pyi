@@ -1,4 +1,5 @@
 from .check import Check, Explanation, check_rows
+from .hypotheses import named_changes
 from .new_data import Rows
 from .prior_information import Calibrated, at_nominal, counted_before, fingerprints, knowledge_of
 from .update import predicted_before, updated
@@ -13,6 +14,7 @@ __all__ = [
     "counted_before",
     "fingerprints",
     "knowledge_of",
+    "named_changes",
     "predicted_before",
     "updated",
 ]

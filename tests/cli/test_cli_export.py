@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from exported import off, ur10
-from simulated import measure
+from month import placed, slipped
+from simulated import TOOL, measure, write_job
 from sparing import as_case
 
-from fg_calib import Calibration, calibrate, read_robot
+from fg_calib import Calibration, calibrate, export, read_robot
 from fg_calib.exports.dh import drawn, errors
 from fg_calib.io import read_urdf, write_robot
 from fg_calib.robot.model import Robot
@@ -59,6 +61,34 @@ def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     assert (found["schema"], found["to"], found["robot"]) == ("fg-calib/export/1", to, "ur10")
     assert found["notes"] == document.err.splitlines()
     assert found["findings"] == found["not_accepted"] == []
+
+
+ZEROS = np.deg2rad([0.5, -0.3, 0.8, -1.0, 0.4, 6.2])
+
+
+@pytest.mark.parametrize("form", ["dh", "urdf"])
+def test_zeros_that_cannot_be_told_stay_0_and_what_takes_them_up_is_named(form, fg_calib, tmp_path):
+    """Joint 1 from the unknown frame and joint 6 from the tool; the others are found, and nothing else moves."""
+    nominal, rng = ur10("dh"), np.random.default_rng(1)
+    data = measure(slipped(nominal, **{f"theta{i}": z for i, z in enumerate(ZEROS, 1)}), 30, rng, frame=placed(rng))
+    robot = {}
+    if form == "urdf":
+        export(nominal, "urdf").write(tmp_path / "arm.urdf")
+        nominal, robot = read_urdf(tmp_path / "arm.urdf"), {"robot": {"urdf": "arm.urdf"}}
+    job = write_job(tmp_path, nominal, data, model="pose", frame="unknown", estimate=["zeros", *TOOL], **robot)
+    assert fg_calib("calibrate", job, "--out", tmp_path / "result").code == 0
+    rows = yaml.safe_load(fg_calib("export", tmp_path / "result", "--to", "zeros").out)["zeros"]
+    blind = "the measurement is blind to the base: the whole arm moves as one body"
+    assert rows["q1"] == {"zero": 0.0, "unit": "deg", "sigma": "not determined", "note": blind}
+    tilted = ", tool.pitch, tool.roll" * (form == "urdf")  # its tool is seen from the flange's fixed joint
+    assert rows["q6"] == rows["q1"] | {"note": f"taken up by tool.x, tool.y, tool.yaw{tilted}"}
+    for name, zero in zip(["q2", "q3", "q4", "q5"], np.rad2deg(ZEROS[1:5]), strict=True):
+        assert abs(rows[name]["zero"] - zero) < 4.0 * rows[name]["sigma"] < 0.2
+    found = Calibration.load(tmp_path / "result")
+    moved = {name for name, p in found.parameters.items() if p.correction}
+    assert moved <= {*nominal.zero_names[1:5], *TOOL}
+    written = errors(read_robot(tmp_path / "result" / "robot_calibrated.yaml"), found.robot, drawn(found.robot, 100, 0))
+    assert max(written.position_max, written.rotation_max) < 1e-7  # its values are rounded
 
 
 FINDING = "reduced chi-square 7 -- far too large"

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 import yaml
 from exported import ARMS, TREE, UR10, matrix, off, seven, ur10, yourdfpy_poses
+from month import slipped
 from oracle import dh_joint, frame, tool_pose
 from scipy.spatial.transform import Rotation
+from simulated import measure
 from sparing import as_case
 
-from fg_calib import InputError, Robot, export, read_robot
+from fg_calib import InputError, Robot, calibrate, export, read_robot
 from fg_calib.exports.dh import drawn, in_table, poses
 from fg_calib.io import read_urdf
 
@@ -272,6 +274,18 @@ def test_zeros_are_the_best_there_are():
             assert cost(best + step * np.eye(6)[i]) > least
     assert set(made.details["after"]) == {"measured", "workspace"}
     assert made.details["after"]["measured"]["n"] == 40
+
+
+@pytest.mark.parametrize("tolerance", [None, {"theta": 0.05}])
+def test_a_joint_takes_up_the_zeros_that_angles_do_not_tell_from_its_own(tolerance):
+    """Of parallel axes only the sum of their turns is seen, whatever priors make of its parts."""
+    nominal = Robot.from_dh([row[:4] for row in UR10], "dh", estimate=["zeros"], tolerance=tolerance)
+    true = slipped(nominal, theta2=0.01, theta3=0.02, theta4=-0.05)
+    data = measure(true, 30, np.random.default_rng(0), sigma=(1e-4, 1e-4))
+    zeros = export(calibrate(nominal, data, model="rotation"), "zeros").details["zeros"]
+    assert zeros["q4"]["note"] == "sum with q2, q3"
+    assert abs(zeros["q4"]["reading"] + 0.02) < 4.0 * zeros["q4"]["sigma"] < 1e-3
+    assert zeros["q2"] == zeros["q3"] == zeros["q2"] | {"reading": 0.0, "determined": False, "note": "taken up by q4"}
 
 
 # --- what cannot be ---------------------------------------------------------------------------------------------------
