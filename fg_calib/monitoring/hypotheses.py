@@ -236,9 +236,10 @@ def fit_changes(rows: Linear) -> list[HypothesisTest]:
 
 
 def likely_changes(found: Sequence[HypothesisTest]) -> list[HypothesisTest]:
-    """The hypotheses that no other excludes, without those that contain another likely one.
+    """The hypotheses that no other excludes, without those that contain another likely one, the best first.
 
-    Empty where the best explains nothing for certain.
+    Of single parameters, which the rows do not distinguish, zeros of joints come first: a joint slips sooner than its
+    other figures change. Empty where the best explains nothing for certain.
     """
     if not found:
         return []
@@ -247,7 +248,9 @@ def likely_changes(found: Sequence[HypothesisTest]) -> list[HypothesisTest]:
     if not any(f.certain for f in likely):
         return []
     likely = [f for f in likely if not any(is_part_of(g, f) for g in likely)]
-    return sorted(likely, key=lambda f: (round(f.left, 6), f.k))
+    zero = min((f.left for f in likely if f.hypothesis.kind == "zero"), default=0.0)
+    best = [(max(f.left, zero * (len(f.change) == 1)), f.hypothesis.kind != "zero", f.left) for f in likely]
+    return [f for _, f in sorted(zip(best, likely, strict=True), key=lambda one: (*np.round(one[0], 6), one[1].k))]
 
 
 def excludes(other: HypothesisTest, found: HypothesisTest, scale: float) -> bool:

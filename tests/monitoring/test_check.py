@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from month import SIGMA, arm, calibrated, measured, placed, slipped
+from exported import UR10
+from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, slipped
 from scipy import stats
 from simulated import true_robot
 
@@ -73,6 +74,20 @@ def test_the_joint_that_slipped_is_named(known, joint):
     best = found.explanations[0]
     assert abs(best.change[0] - 2e-3) < 4 * best.sigma[0]
     assert found.deploy
+
+
+def test_a_slip_is_named_by_the_joint_where_an_angle_of_hayati_is_alike():
+    """Also to the update, which attributes it to the joint."""
+    robot = Robot.from_dh(UR10, "dh-hayati", tool=[0.05, -0.03, 0.12], tolerance=TOLERANCE | {"beta": 1e-3})
+    calibration, true, _ = calibrated(1, unknown=True, robot=robot, gauge="keep")
+    rng = np.random.default_rng(50)
+    rows = measured(slipped(true, theta4=2e-3), 10, rng, frame=placed(rng))
+    best = calibration.check(rows).explanations[0]
+    assert (best.parameters, best.same) == (("theta4",), ("beta4",))
+    before, after = (
+        one.parameters["theta4"].estimate for one in (calibration, calibration.update(rows, changed="q4.zero"))
+    )
+    assert abs(after - before - best.change[0]) < best.sigma[0]
 
 
 def test_a_slip_too_large_to_be_linear_is_found_in_full(known):
