@@ -16,7 +16,19 @@ import numpy as np
 import yaml
 
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, printable
-from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_CONFIGURATIONS, OF_PAIRS, Table, names_of, read_robot, read_yaml
+from fg_calib.io import (
+    ANGLES,
+    KNOWN,
+    LENGTHS,
+    OF_CONFIGURATIONS,
+    OF_PAIRS,
+    Table,
+    decoded,
+    names_of,
+    read_bytes,
+    read_robot,
+    read_yaml,
+)
 from fg_calib.measurements import COVARIANCE, INSTRUMENTS
 from fg_calib.robot import Robot
 
@@ -35,9 +47,11 @@ _OTHER_NAMES = (
     (r"(?:actual[ _])?(?:q|j|a|axis|joint|theta|th)[ _-]?(?:pos|position|angle)?[ _-]?0*(\d+)", r"q\1"),
     (r"(?:pos_|position_|p|tcp_|t)([xyz])", r"\1"),
     (r"(?:q_|quat_|orientation_)([xyzw])", r"q\1"),
-    ("reflector|smr|marker", "target"),
-    ("configuration|config", "id"),
-    ("dist|length", "distance"),
+    ("reflector|reflektor|smr|marker|prism|ball", "target"),
+    ("post|pole|anker|fixpoint|fixed[ _]point", "anchor"),
+    ("tracker|standpunkt|setup", "station"),
+    ("configuration|config|pose|point|punkt|name|number|no|nr|#", "id"),
+    ("dist|length|l[aä]nge|abstand|range", "distance"),
 )
 """Patterns of other names that tables have for columns, and the known name; joints may count from 0."""
 
@@ -93,6 +107,7 @@ class _Recognised:
         columns: Headers of columns that have another name in the table, by the known name.
         units: Its units of `length` and `angle`, if it has such columns.
         unused: Columns without a meaning.
+        skip_lines: Lines before its header.
         pairs: The file of pairs of its configurations, if there is one.
     """
 
@@ -102,6 +117,7 @@ class _Recognised:
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     unused: tuple[str, ...] = ()
+    skip_lines: int = 0
     pairs: Path | None = None
 
     @property
@@ -126,7 +142,8 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
     Raises:
         InputError: The table cannot be read, is neither of configurations nor of pairs, or mixes units.
     """
-    table = Table.read(path, "table")
+    skip_lines = _lines_before_header(path)
+    table = Table.read(path, "table", skip_lines=skip_lines)
     headers = [_HEADER.match(column) for column in table.columns]
     bare = [match["name"].lower() if match else c.lower() for match, c in zip(headers, table.columns, strict=True)]
     written = [(match["bracket"] or match["suffix"]).lower() if match else "" for match in headers]
@@ -142,7 +159,7 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
     known, every = names_of(sets), dict(joints)
     for k in sorted(range(len(bare)), key=lambda k: table.columns[k] not in known):
         name = bare[k] if bare[k] in known else _known_name(bare[k])
-        if name in known and k not in joints.values():
+        if name in known and k not in joints.values() and (name != "id" or table.frame[:, k].is_unique().all()):
             every.setdefault(name, k)
     kinds = {name: of.unit for of in sets for name in of.names}
     kinds |= {n: "length" if joint.prismatic else "angle" for n, joint in zip(joints, robot.joints, strict=False)}
@@ -162,7 +179,17 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
         columns={name: table.columns[k] for name, k in every.items() if name != table.columns[k]},
         units=units,
         unused=tuple(c for k, c in enumerate(table.columns) if k not in every.values()),
+        skip_lines=skip_lines,
     )
+
+
+def _lines_before_header(path: Path) -> int:
+    """Lines of a CSV before the first with as many cells as the last one has."""
+    if path.suffix.lower() != ".csv":
+        return 0
+    lines = decoded(read_bytes(path), path.name, "cp1252").rstrip().splitlines() or [""]
+    separator = next((one for one in ";\t," if one in lines[-1]), ",")  # commas may be of decimals
+    return next((k for k, line in enumerate(lines) if line.count(separator) >= lines[-1].count(separator)), 0)
 
 
 def _known_name(header: str) -> str:
@@ -296,6 +323,8 @@ def _entry(table: _Recognised, cameras: Sequence[Path], units: Mapping[str, str]
     if "camera" in INSTRUMENTS[str(table.model)].options:
         room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
         lines.append(f"camera: {_path(cameras[0], folder)}  # {room}")
+    if table.skip_lines:
+        lines.append(f"skip_lines: {table.skip_lines}")
     if table.columns:
         lines.append(f"columns: {_flow(dict(table.columns))}  # DECIDE whether these are what the names mean")
     if dict(table.units).items() - units.items():

@@ -1,5 +1,6 @@
 from .arrays import read_arrays
 from .atomic import (
+    decoded,
     exists,
     fill_folder,
     is_folder,
@@ -119,6 +120,7 @@ __all__ = [
     "camera_in",
     "check_choices",
     "configuration_frame",
+    "decoded",
     "exists",
     "fill_folder",
     "first_misfit",

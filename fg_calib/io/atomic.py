@@ -58,11 +58,11 @@ def read_text(path: Path) -> str:
     return decoded(read_bytes(path), path.name)
 
 
-def decoded(content: bytes, name: str) -> str:
-    """UTF-8 text, without a byte order mark.
+def decoded(content: bytes, name: str, other: str = "") -> str:
+    """UTF-8 text, without a byte order mark, or text in another encoding where it is not UTF-8.
 
     Raises:
-        InputError: The text is not UTF-8; the message names the line and the byte.
+        InputError: The text is neither; the message names the line and the byte.
     """
     at, found = content.find(b"\0"), "a null character"
     if at < 0:
@@ -70,6 +70,8 @@ def decoded(content: bytes, name: str) -> str:
             return content.decode("utf-8-sig")
         except UnicodeDecodeError as error:
             at, found = error.start, f"byte {content[error.start]:#04x}"
+            with suppress(UnicodeDecodeError, LookupError):
+                return content.decode(other)
     line = content.count(b"\n", 0, at) + 1
     raise InputError(f"{name}:{line}", found, "UTF-8 text", "is it UTF-16, Latin-1 or Windows text? save it as UTF-8")
 

@@ -67,6 +67,7 @@ class _TableKeys(Schema):
     offset: Literal["estimate"] | None = None
     camera: Any = None
     columns: _Columns | None = None
+    skip_lines: Annotated[int, Field(ge=0, strict=True)] = 0
 
 
 class _Entry(_TableKeys):
@@ -265,6 +266,7 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
         noise=noise.updated(**{key: own.get(key) for key in entry.noise or ()}),
         model=model,
         columns=entry.columns,
+        skip_lines=entry.skip_lines,
     )
     camera, fixed = camera_in(file.camera if entry.camera == "fixed" else entry.camera, f"{place}: camera", folder)
     options = INSTRUMENTS[model].options

@@ -115,6 +115,7 @@ class Table:
         *,
         joints: Iterable[str] = (),
         columns: Mapping[str, Column] | None = None,
+        skip_lines: int = 0,
     ) -> Table:
         """Read a CSV, a Parquet file or a frame.
 
@@ -124,6 +125,7 @@ class Table:
             known: Names of columns that have a meaning, also if written in another case; None if none has.
             joints: Names that the robot gives to columns.
             columns: By known name, what the table calls a column.
+            skip_lines: Lines of a CSV before its header.
 
         Raises:
             InputError: The table cannot be read, it has no rows, or `columns` does not fit.
@@ -134,7 +136,7 @@ class Table:
         is_file = isinstance(table, os.PathLike | str)
         name = Path(table).name if is_file else name
         try:
-            found = _read_file(Path(table)) if is_file else cls(name, (), _as_polars(table, name))
+            found = _read_file(Path(table), skip_lines) if is_file else cls(name, (), _as_polars(table, name))
             header = [column.strip() for column in found.columns or found.frame.columns]
             inputs.check_different(name, header)
             names = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
@@ -253,7 +255,7 @@ class Table:
         return f"{self.name}:{self.lines[row]}" if self.separator else f"{self.name}: row {row}"
 
 
-def _read_file(path: Path) -> Table:
+def _read_file(path: Path, skip_lines: int) -> Table:
     """The columns of a Parquet file or a CSV.
 
     Raises:
@@ -263,15 +265,15 @@ def _read_file(path: Path) -> Table:
 
     ending = path.suffix.lower()
     if ending == ".csv":
-        return _read_csv(path.name, decoded(read_bytes(path), path.name))
+        return _read_csv(path.name, decoded(read_bytes(path), path.name, "cp1252"), skip_lines)
     if ending not in (".parquet", ".pq"):
         hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
         raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
     return Table(path.name, (), pl.read_parquet(BytesIO(read_bytes(path))))
 
 
-def _read_csv(name: str, text: str) -> Table:
-    """The cells of a CSV as texts, without blank rows; the header tells the separator.
+def _read_csv(name: str, text: str, skip_lines: int) -> Table:
+    """The cells of a CSV as texts, without blank rows and lines before the header, which tells the separator.
 
     Raises:
         InputError: The file is empty, a quote is not closed on its line, or a row's cells do not match the header.
@@ -283,7 +285,11 @@ def _read_csv(name: str, text: str) -> Table:
     read = partial(pl.read_csv, has_header=False, infer_schema=False)
     content = text.replace("\r\n", "\n").replace("\r", "\n").encode()
     every = read(content, separator="\x1f", quote_char=None, new_columns=["line"]).with_row_index("number", 1)
-    lines = every.filter(pl.col("line").str.strip_chars(" \t,;") != "")
+    lines = every.filter((pl.col("line").str.strip_chars(" \t,;") != "") & (pl.col("number") > skip_lines))
+    if lines.is_empty():
+        raise InputError(
+            f"{name}: skip_lines", f"found {skip_lines}", f"fewer than the {every.height} lines of the file"
+        )
     unquoted = lines["line"].str.replace_all('"[^"]*"', "") if '"' in text else lines["line"]
     separator = max(",;\t", key=unquoted[0].count)
     header = next(csv.reader([lines["line"][0].removeprefix("#")], delimiter=separator))  # as numpy writes it
@@ -405,6 +411,7 @@ def read_measurements(
     noise: Noise | None = None,
     model: Model | None = None,
     columns: Mapping[str, Column] | None = None,
+    skip_lines: int = 0,
 ) -> Measurements:
     """Configurations and what was measured at them and, with a table of pairs, between them.
 
@@ -416,6 +423,7 @@ def read_measurements(
         noise: Sigmas where the tables specify none, [m] and [rad]; also of what was not measured yet.
         model: The model whose columns are read; those of all models if None.
         columns: By known name, what the table of configurations calls a column.
+        skip_lines: Lines before its header.
 
     Raises:
         InputError: A file is missing, is no table, lacks a column or holds a cell that cannot be used; the message
@@ -425,7 +433,7 @@ def read_measurements(
     for kind, sigma in vars(noise).items():
         if kind not in ("joint", "more") and sigma is not None:  # nothing but joint readings is measured exactly
             inputs.check_number(f"noise: {kind}", sigma, above=True)
-    table = read_table(path, robot, columns or {})
+    table = read_table(path, robot, columns or {}, skip_lines)
     _check_use(table, model)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
@@ -502,12 +510,12 @@ def _joint_sigma(given: float | tuple[float, ...], n_joints: int) -> Floats:
     return np.broadcast_to(np.array(given, dtype=np.float64), n_joints).copy()
 
 
-def read_table(path: Path | str | Any, robot: Robot, columns: Mapping[str, Column] | None = None) -> Table:
-    """A table of configurations of a robot; for `columns` see `read_measurements`."""
-    joints = {joint.name for joint in robot.joints}
-    return Table.read(
-        path, "frame", {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}, joints=joints, columns=columns
-    )
+def read_table(
+    path: Path | str | Any, robot: Robot, columns: Mapping[str, Column] | None = None, skip_lines: int = 0
+) -> Table:
+    """A table of configurations of a robot; for `columns` and `skip_lines` see `read_measurements`."""
+    joints, known = {joint.name for joint in robot.joints}, {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
+    return Table.read(path, "frame", known, joints=joints, columns=columns, skip_lines=skip_lines)
 
 
 def joint_columns(robot: Robot) -> tuple[str, ...]:

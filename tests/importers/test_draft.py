@@ -80,6 +80,22 @@ def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     assert mine.readings == pytest.approx(plain.readings, abs=1e-12)
 
 
+def test_a_protocol_of_an_instrument_is_read_as_it_is(fg_calib, folder):
+    """A preamble, semicolons with decimal commas, other words, bytes of Windows."""
+    folder, write = folder
+    text = pl.read_csv(write()).with_row_index("Punkt", 1).with_columns(Reflektor=pl.lit("groß"))
+    text = text.write_csv(separator=";", decimal_comma=True)
+    (folder / "poses.csv").write_bytes(f"Gerät 7;,\n2026-11-28;14:05\n\n{text}".encode("cp1252"))
+    given = drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.csv")["measurements"][0]
+    assert (given["skip_lines"], given["columns"]) == (3, {"id": "Punkt", "target": "Reflektor"})
+    read = read_job(folder / JOB).tables[0].measurements
+    assert [*read.ids[:2], *read.labels["target"].names] == ["1", "2", "groß"]
+    (folder / JOB).write_text((folder / JOB).read_text().replace("skip_lines: 3", "skip_lines: 99"))
+    ended = fg_calib("inspect", folder / JOB)
+    assert (ended.code, ended.err.count("\n")) == (1, 1)
+    assert "poses.csv: skip_lines: found 99, expected fewer than the 44 lines of the file" in ended.err
+
+
 def test_units_that_no_header_specifies_are_guessed_from_the_values(fg_calib, folder):
     folder, write = folder
     given = drafted(fg_calib, folder, folder / "robot.yaml", write(factors=DEGREES))
