@@ -5,7 +5,7 @@ import pytest
 from simulated import TOOL, measure, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib import Pairing
+from fg_calib import Measurements, Pairing
 from fg_calib.baseline.comparison import real_errors
 from fg_calib.observability.cramer_rao import Bound, cramer_rao
 from fg_calib.robot import pose
@@ -105,6 +105,15 @@ def test_the_bound_is_that_of_a_dense_computation(strategy, pair_errors):
     expected = dense_bound(robot, readings, 1e-4, pairs, pair_errors)
     # 1e-3 of a formed pair's variance counts as its own, which moves variances by as much.
     assert bound.covariance == pytest.approx(expected, rel=3e-3, abs=3e-3 * (3e-3) ** 2)
+
+
+@pytest.mark.parametrize("model", ["pose", "position", "distance"])
+def test_where_no_noise_is_stated_a_millimetre_and_a_milliradian_are_assumed(model):
+    robot = small_arm(tolerance=dict.fromkeys(("a", "alpha", "d", "theta"), 3e-3))
+    readings = spread_readings(30, 4)
+    stated = measure(robot, 30, np.random.default_rng(0), sigma=(1e-3, 1e-3), readings=readings)
+    bounds = [cramer_rao(robot, m, model=model) for m in (Measurements.from_arrays(readings), stated)]
+    assert bounds[0].covariance == pytest.approx(bounds[1].covariance, rel=rounding(1, 10), abs=0)
 
 
 def test_after_the_best_rigid_fit_the_bound_is_what_real_errors_are():
