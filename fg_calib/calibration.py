@@ -30,17 +30,7 @@ from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
-from fg_calib.report import (
-    Drawing,
-    ReportData,
-    draw,
-    format_result,
-    judged,
-    notes_of,
-    pages_of,
-    parameter_table_html,
-    summary,
-)
+from fg_calib.report import Drawing, ReportData, draw, format_result, judged, notebook_html, notes_of, pages_of, summary
 from fg_calib.robot import Robot, names_of
 from fg_calib.statistics import ParameterEstimate, TangentCovariance, cross_validate
 
@@ -550,7 +540,7 @@ class Calibration:
         return format_result(self.report_data)
 
     def _repr_html_(self) -> str:
-        return parameter_table_html(self.result)
+        return notebook_html(self.result)
 
 
 @checked

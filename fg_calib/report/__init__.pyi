@@ -7,7 +7,7 @@ from .compare import (
 )
 from .design import build_design_report, design_document, write_design
 from .figures import Drawing, draw
-from .html import pages_of, parameter_table_html
+from .html import notebook_html, pages_of
 from .inspect import (
     build_identifiability_report,
     build_inspection_report,
@@ -60,10 +60,10 @@ __all__ = [
     "inspection_document",
     "judged",
     "line",
+    "notebook_html",
     "notes_of",
     "observability_document",
     "pages_of",
-    "parameter_table_html",
     "plain",
     "prediction_document",
     "report",

@@ -77,7 +77,7 @@ def build_page(data: text.ReportData) -> str:
     )
 
 
-def parameter_table_html(result: Result) -> str:
+def notebook_html(result: Result) -> str:
     """The summary and the parameters as HTML, for a notebook."""
     (table,) = section(text.PARAMETERS, text.parameter_table(result))
     return _environment().get_template("notebook.html").render(lines=text.summary(result), section=table)
