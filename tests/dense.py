@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.graph.noise_models import JOINT_NOISE
 from fg_calib.measurements import residuals
-from fg_calib.measurements.kind import Frames
+from fg_calib.measurements.kind import Frames, Length
+from fg_calib.measurements.kinds.anchor import AnchorDistance
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.moments import angle_moments, length_moments
 from fg_calib.measurements.residuals import Block, unit_whitening
@@ -76,11 +77,12 @@ class SeriesRows:
             of_poses = np.sum(poses**2, axis=(2, 3))
         for i, part in enumerate(s.kind.parts):
             trace[:, i] += self.joint_factor**2 * self._trace_of_joints(part)
-        value, along = self.r + s.data, of_poses + of_joints
+        offset = self.points[:, 3:].sum(axis=1, keepdims=True)  # what an instrument adds is no length
+        value, along = self.r + s.data - offset, of_poses + of_joints
         across = np.maximum(trace - along, 0.0) / 2.0
         own = zero if s.formed else square
         moments = [
-            (length_moments if isinstance(part, Distance) else angle_moments)(
+            (length_moments if isinstance(part, Length) else angle_moments)(
                 value[:, i], along[:, i], across[:, i], own[:, i]
             )
             for i, part in enumerate(s.kind.parts)
@@ -142,7 +144,7 @@ class SeriesRows:
             for sign in (1.0, -1.0):
                 for times, weight in enumerate(WEIGHTS, 1):
                     R, p = self._arm(self.q + sign * times * STEP * np.eye(len(self.q[0]))[k])
-                    vector = p if isinstance(part, Distance) else (R0.inv() * Rotation.from_matrix(R)).as_rotvec()
+                    vector = p if isinstance(part, Length) else (R0.inv() * Rotation.from_matrix(R)).as_rotvec()
                     change += sign * weight * vector / STEP
             total += sigma**2 * np.sum(change**2, axis=1)
         return total[self.block.ends].sum(axis=1)
@@ -157,8 +159,8 @@ class SeriesRows:
 
 
 def is_pairs(kind):
-    """Whether all rows are distances and angles of pairs."""
-    return all(isinstance(part, Distance | RotationAngle) for part in kind.parts)
+    """Whether all rows are distances and angles of pairs, or lengths to anchors."""
+    return all(isinstance(part, AnchorDistance | Distance | RotationAngle) for part in kind.parts)
 
 
 def dense(problem, parameters):

@@ -5,7 +5,7 @@ the joint readings, through the row's derivatives in the joints. The last two be
 in every measurement that it takes part in: *errors* of 1 sigma, numbered `configuration * width + slot`, with a slot a
 joint, then six for the poses of each table (position, then orientation).
 
-Noise acts on a length or an angle to second order: rows of pairs are `M - measured`, M the mean of what would be
+Noise acts on a length or an angle to second order: their rows are `M - measured`, M the mean of what would be
 measured, with its slope and variance (see `measurements.moments`): at given parameters a row, scaled and shifted.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse
 
 from fg_calib.inputs import Booleans, Floats, InputError, Integers
-from fg_calib.measurements import Block, MeasurementBlock, Measurements, angle_moments, length_moments, residuals
+from fg_calib.measurements import Block, Length, MeasurementBlock, Measurements, moments, residuals
 from fg_calib.robot import Chain, forward, kernels, nearest_rotation, over_spans, rotation_angle, whiten_small
 
 Sparse = scipy.sparse.csr_array
@@ -36,8 +36,8 @@ MIN_SLOPE = 1e-3
 POSE_SLOTS = 6
 """Errors of a measured pose: of its position along the axes, then of its orientation about them."""
 
-_MOMENTS = {kernels.DISTANCE: (0, length_moments), kernels.ROTATION_ANGLE: (1, angle_moments)}
-"""Whether a part of a pair is a length (0) or an angle (1), and its moments, by the code of its kind."""
+_MOMENTS = (moments.length_moments, moments.angle_moments)
+"""Moments of lengths, of pairs and to anchors, and of rotation angles."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class RowNoise:
         self.factors: Floats = np.array([state.factors.get((block.table, family), 1.0) for family in families])
         self._sigma_joint = place.measurements.sigma_joint * state.factors.get(JOINT_NOISE, 1.0)
         self.variance: Floats = (block.sigma * self.factors) ** 2
-        self._of_pairs = [_MOMENTS[part.code] for part in block.kind.parts if part.code in _MOMENTS]
+        self._moments = _moments_of(block)
         self.excess: Floats = np.broadcast_to(0.0, self.variance.shape)
         self.slope: Floats | None = None
         self.columns, self.loading = np.zeros((block.n, 0), np.int64), np.zeros((*self.variance.shape, 0))
@@ -112,7 +112,7 @@ class RowNoise:
         self.n_of_joints = self.columns.shape[1]
         if block.formed:
             self._add_errors(self._pose_loading(), place.chain.n_joints + POSE_SLOTS * place.number)
-        if self._of_pairs:
+        if self._moments:
             self._take_moments()
 
     @cached_property
@@ -155,8 +155,7 @@ class RowNoise:
 
     def residual(self) -> Floats:
         """Residuals of all rows, shape (n, residual_dim), [m] and [rad]."""
-        out: Floats = self._off + self.excess
-        return out
+        return np.asarray(self._off + self.excess, dtype=np.float64)
 
     def lengths(self) -> tuple[Floats, Integers]:
         """Mahalanobis length of each measurement's residual, and its number of rows, shapes (n,).
@@ -218,7 +217,7 @@ class RowNoise:
         axes = rotation_angle(np.swapaxes(R[a], 1, 2) @ R[b])[1]
         directions = _unit(p[b] - p[a]) @ self._world_R_base(p).T, _unit(axes)
         loading = np.zeros((s.n, s.kind.residual_dim, 2, POSE_SLOTS))
-        for i, (k, _) in enumerate(self._of_pairs):
+        for i, k in enumerate(self._moments):
             sigma = (m.sigma_position, m.sigma_orientation)[k]
             if sigma is not None:
                 both = directions[k][:, None] * np.array([1.0, -1.0])[:, None]  # of predicted minus measured
@@ -236,6 +235,7 @@ class RowNoise:
     def _take_moments(self) -> None:
         """Bias, slope and variance of distances and angles of pairs, to second order."""
         s, trace, off = self.block, self._traces(), self._off
+        off = off - self.place.coordinates[s.nuisances[:, 3:]].sum(axis=1, keepdims=True)  # an instrument's, of anchors
         first, private = self.loading, np.zeros_like(self.variance) if s.formed else np.nan_to_num(self.variance)
         self.excess, slope, self.variance = (np.empty(self.variance.shape) for _ in range(3))
         self.loading, self.slope = np.empty(first.shape), slope
@@ -243,9 +243,9 @@ class RowNoise:
         def run(rows: slice) -> None:
             predicted, G = off[rows] + s.data[rows], first[rows]
             along, all_ways = np.einsum("nhk,nhk->nh", G, G), trace[s.ends[rows]].sum(axis=1)
-            for i, (k, moments) in enumerate(self._of_pairs):
+            for i, k in enumerate(self._moments):
                 across = np.maximum(all_ways[:, k] - along[:, i], 0.0) / 2.0
-                found = moments(predicted[:, i], along[:, i], across, private[rows, i])
+                found = _MOMENTS[k](predicted[:, i], along[:, i], across, private[rows, i])
                 self.excess[rows, i], slope[rows, i] = found.excess, found.slope
                 self.variance[rows, i] = np.maximum(found.variance - found.slope**2 * along[:, i], 0.0)
             self.loading[rows] = G * slope[rows][:, :, None]
@@ -260,7 +260,7 @@ class RowNoise:
             J = forward(self.place.chain.without_columns().with_joint_columns(), self.place.trig).jacobian
             J = J * self._sigma_joint
             trace += np.stack([np.sum(J[:, 3:] ** 2, axis=(1, 2)), np.sum(J[:, :3] ** 2, axis=(1, 2))], axis=1)
-        for i, (k, _) in enumerate(self._of_pairs if s.formed else ()):
+        for i, k in enumerate(self._moments if s.formed else ()):
             sigma = (m.sigma_position, m.sigma_orientation)[k]
             if sigma is not None:
                 trace[:, k] += np.sum(sigma**2, axis=1) * self.factors[i] ** 2
@@ -279,12 +279,13 @@ def reach(noises: Sequence[RowNoise], *, test: bool = False) -> Integers:
 
 def same_everywhere(block: MeasurementBlock, sigma_joint: Floats) -> bool:
     """Whether the noise is the same at all parameters: noise of joint readings, and moments of pairs, are not."""
-    return not _has_moments(block) and not (block.kind.ends and np.any(sigma_joint > 0.0))
+    return not _moments_of(block) and not (block.kind.ends and np.any(sigma_joint > 0.0))
 
 
-def _has_moments(block: MeasurementBlock) -> bool:
-    """Whether all its rows are distances and angles of pairs."""
-    return all(part.code in _MOMENTS for part in block.kind.parts)
+def _moments_of(block: MeasurementBlock) -> list[int]:
+    """Of each part which of `_MOMENTS` it has; empty of other kinds."""
+    angles = [(part, part.code == kernels.ROTATION_ANGLE) for part in block.kind.parts]
+    return [int(angle) for part, angle in angles if angle or (isinstance(part, Length) and part.ends)]
 
 
 def whitening_of(covariance: Floats, used: Booleans) -> Floats:
@@ -314,5 +315,4 @@ def _over_rows(run: Callable[[slice], None], n: int) -> None:
 
 def _unit(vectors: Floats) -> Floats:
     """Vectors of length 1 along others (zero for zero), shape (n, 3)."""
-    out: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300)
-    return out
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300), dtype=np.float64)
