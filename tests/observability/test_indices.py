@@ -108,5 +108,7 @@ def test_a_tolerance_says_what_is_weak():
     assert found.weak[0].signal_to_noise == pytest.approx(2.0)
     assert found.sigma == pytest.approx(dict.fromkeys(("a1", "a2", "a3"), 1e-6))
     rows = np.array([[1e6, 1e6], [2e3, -2e3]])  # the sum is seen a thousand times as well as the difference
+    faint = observability_of_rows(np.diag([1e6, 0.1]), parameters[:2], scales=np.full(2, 1e-3), n_measurements=2)
+    assert faint.classes == ("independent", "ineffective")  # seen a thousandth as well as anything is
     (weak,) = observability_of_rows(rows, parameters[::2], scales=np.full(2, 1e-3), n_measurements=2).weak
     assert weak.members == pytest.approx({"a1": np.sqrt(0.8), "a3": -np.sqrt(0.2)}, rel=1e-3)  # in tolerances

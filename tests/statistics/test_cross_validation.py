@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from simulated import measure, small_arm, true_robot
+from touches import corners, touch
 
 from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, calibrate
 from fg_calib.assessment import solve_job
 from fg_calib.measurements.kinds.pose import Position
 from fg_calib.measurements.table import Table
+from fg_calib.statistics.cross_validation import _train_tables, wide
 from fg_calib.statistics.cross_validation import cross_validate as cross_validate_with
-from fg_calib.statistics.cross_validation import wide
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 TOOL = ("tool.x", "tool.y", "tool.z")
@@ -167,3 +168,13 @@ def test_test_rows_alone_have_nothing_to_hold_out():
     robot, m = poses(n=20)
     with pytest.raises(InputError, match="folds: test rows alone"):
         cross_validate(job_of(robot, replace(m, test=np.ones(20, dtype=bool))), 5)
+
+
+def test_of_touches_the_train_rows_and_train_pairs_stay():
+    robot, rng = small_arm(), np.random.default_rng(4)
+    m = touch(robot, corners(robot, 3, rng), 4, rng, distances=[(0, 1, 1e-4), (1, 2, 1e-4)], test=(2,))
+    m = replace(m, groups=replace(m.groups, pairs=replace(m.groups.pairs, test=np.array([False, True]))))
+    (found,) = _train_tables([Table(m, "distance")])
+    groups = found.measurements.groups
+    assert groups.index.tolist() == m.groups.index[:8].tolist()
+    assert (groups.pairs.a.tolist(), groups.pairs.b.tolist()) == ([0], [1])
