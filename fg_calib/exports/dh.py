@@ -69,6 +69,7 @@ from fg_calib.robot import (
     build_chain,
     forward,
     frame_values,
+    pose,
     random_readings,
 )
 
@@ -424,6 +425,15 @@ def fit_zeros(nominal: Robot, calibrated: Robot, readings: Floats) -> Floats:
         Shape (n_joints,), [rad] (prismatic: [m]).
     """
     return _fit(lambda zeros: poses(nominal, readings + zeros), np.zeros(nominal.n_joints), calibrated, readings, 0.0)
+
+
+def step_zeros(nominal: Robot, calibrated: Robot, readings: Floats, zeros: Floats) -> Floats:
+    """Offsets of `fit_zeros` after a step of Gauss-Newton from others: what they are of an arm a little different."""
+    at, weight = pose(nominal, readings + zeros), np.repeat([calibrated.reach, 1.0], 3)
+    J = weight[:, None] * at.jacobian[:, :, -nominal.n_joints :]
+    miss = (weight * _miss(at, poses(calibrated, readings))).ravel()
+    after: Floats = zeros - np.linalg.lstsq(J.reshape(-1, nominal.n_joints), miss, rcond=None)[0]
+    return after
 
 
 def fit_parameters(start: Robot, calibrated: Robot, readings: Floats) -> Robot:

@@ -264,11 +264,12 @@ def _zeros(arm: Robot | Calibration, start: Robot | None, tool: ToolOfZeros, at:
             raise InputError("configurations", "none", "at least one")
     behind = robot.n_joints + 1
     kept = (0, behind) if tool == "calibrated" else (0,)
+    nominal = dh.with_frames_of(start, robot, kept)
+    zeros = dh.fit_zeros(nominal, robot, fitted)
 
     def fit(one: Robot) -> Floats:
-        return dh.fit_zeros(dh.with_frames_of(start, one, kept), one, fitted)
+        return dh.step_zeros(dh.with_frames_of(start, one, kept), one, fitted, zeros)
 
-    nominal, zeros = dh.with_frames_of(start, robot, kept), fit(robot)
     told = {joint.name: Zero(zero, joint.unit) for joint, zero in zip(robot.joints, zeros.tolist(), strict=True)}
     if isinstance(arm, Calibration) and not arm.result.evaluated_only:
         told = tell_zeros(arm, fit)
