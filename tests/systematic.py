@@ -30,14 +30,10 @@ ARMS = {
 def arm(name):
     convention, kinds, rows = ARMS[name]
     hayati = convention.endswith("hayati")
-    return Robot.from_dh(
-        [[*row, 0.0] if hayati else row for row in rows],
-        convention=convention,
-        types=["revolute" if kind == "r" else "prismatic" for kind in kinds],
-        tool=[0.05, -0.03, 0.12],
-        estimate=["tool.x", "tool.y", "tool.z"],
-        tolerance=TOLERANCE | ({"beta": 1e-3} if hayati else {}),
-    )
+    types = ["revolute" if kind == "r" else "prismatic" for kind in kinds]
+    tool = {"tool": [0.05, -0.03, 0.12], "estimate": ["tool.x", "tool.y", "tool.z"]}
+    tolerance = TOLERANCE | ({"beta": 1e-3} if hayati else {})
+    return Robot.from_dh(rows, convention, types=types, tolerance=tolerance, **tool)
 
 
 def measured(name, rng, *, n=60, n_test=0, effect=None, unit=1.0):

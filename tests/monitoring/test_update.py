@@ -229,13 +229,9 @@ def test_rows_that_are_counted_already_are_refused_in_memory():
     calibration, true, rng = calibrated(13)
     first = calibration.solution.problem.data.tables[0].measurements
     more = measured(true, 8, rng, ids="new")
-    longer = Measurements.from_arrays(
-        np.vstack([first.readings, more.readings]),
-        position=np.vstack([first.position, more.position]) * 1e3 * 1e-3,
-        rotation=np.vstack([first.rotation, more.rotation]),
-        sigma_position=5e-5,
-        sigma_orientation=1e-4,
-    )
+    q, p, R = (np.vstack([getattr(m, name) for m in (first, more)]) for name in ("readings", "position", "rotation"))
+    sigmas = {"sigma_position": 5e-5, "sigma_orientation": 1e-4}
+    longer = Measurements.from_arrays(q, position=p * 1e3 * 1e-3, rotation=R, **sigmas)
     for rows in (first, first.select(np.arange(5)), first.select(np.arange(40)[::-1]), longer):
         with pytest.raises(InputError, match="its rows are in the calibration already"):
             calibration.update(rows)

@@ -22,17 +22,9 @@ def test_a_table_is_the_robot_of_a_file_with_its_figures(tmp_path, convention):
     more = {"fixed": ["a1"], "estimate": ["tool.x"], "tolerance": {"a": 1e-3, "theta2": 2e-3, "tool": 1e-2}}
     file = {"convention": convention, "joints": rows, "base": {"z": 0.5}, "tool": {"x": 0.1, "yaw": 0.7}} | more
     (tmp_path / "arm.yaml").write_text(yaml.safe_dump(file))
-    robot = Robot.from_dh(
-        [row[: len(kinds)] for row in ROWS],
-        convention,
-        name="arm",
-        types=["revolute", "prismatic", "revolute"],
-        limits=[None, (0.0, 0.5), None],
-        names=["q1", "q2", "wrist"],
-        base=[0, 0, 0.5],
-        tool=[0.1, 0, 0, 0, 0, 0.7],
-        **more,
-    )
+    more |= {"types": ["revolute", "prismatic", "revolute"], "names": ["q1", "q2", "wrist"], "base": [0, 0, 0.5]}
+    more |= {"limits": [None, (0.0, 0.5), None], "tool": [0.1, 0, 0, 0, 0, 0.7]}
+    robot = Robot.from_dh([row[: len(kinds)] for row in ROWS], convention, name="arm", **more)
     assert robot == read_robot(tmp_path / "arm.yaml")
     write_robot(tmp_path / "again.yaml", robot)
     assert read_robot(tmp_path / "again.yaml") == robot
