@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from fg_calib.inputs import Brief, Options, check_fields
+from fg_calib.inputs import Brief, Floats, Options, check_fields
 from fg_calib.measurements import Measurements, Table
 from fg_calib.robot import Robot
 
@@ -23,6 +23,7 @@ class Job(Brief):
         truth: The robot as it truly is, known from a simulation; None where it is not.
         inputs: SHA-256 of every file read, by its path relative to the job.
         document: The job as its file has it, without its robot, and with its cameras in it.
+        keep_out: Lower and upper corners in the base frame of boxes that new configurations keep out of, [m].
     """
 
     path: Path | None
@@ -32,6 +33,7 @@ class Job(Brief):
     truth: Robot | None = None
     inputs: dict[str, str] = field(default_factory=dict)
     document: dict[str, Any] = field(default_factory=dict)
+    keep_out: tuple[Floats, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self, "job: ")

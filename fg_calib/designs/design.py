@@ -10,9 +10,9 @@ anew from the rows of its poses alone, by the code that assesses a calibration.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ from fg_calib.observability import Observability, ObservedQuantities
 from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import PoseRms
 from fg_calib.robot import Robot, random_readings
-from fg_calib.simulation import MOST_DRAWN, Configurations, Scenario
+from fg_calib.simulation import MOST_DRAWN, Box, Configurations, Scenario
 
 N_POSES = 30
 """Default number of poses of a design."""
@@ -157,6 +157,17 @@ def design(
     return design_from_pool(pool, wanted, draw["random"], n=n, target=target, criterion=criterion)
 
 
+def _kept_out(scenario: Scenario, corners: Sequence[Floats]) -> Scenario:
+    """A scenario that measures nowhere where the arm is inside a box, by lower and upper corners."""
+    boxes = tuple(Box(lower, upper) for lower, upper in corners)
+
+    def free(one: Any) -> Any:
+        return replace(one, keep_out=(*one.keep_out, *boxes))
+
+    instruments = tuple(replace(one, configurations=free(one.configurations)) for one in scenario.instruments)
+    return replace(scenario, configurations=free(scenario.configurations), instruments=instruments)
+
+
 def _build_pool(
     of: Scenario | Job,
     candidates: Configurations | Literal["rows"] | None,
@@ -171,7 +182,7 @@ def _build_pool(
         source, problem = "job" if of.path is None else of.path.name, solve_for_design(of)
         if isinstance(candidates, str):
             return pool_of_rows(problem, source)
-        scenario = scenario_of(problem, candidates, source)
+        scenario = _kept_out(scenario_of(problem, candidates, source), of.keep_out)
         return build_pool(scenario, draw_groups(scenario, n, generator), before=problem)
     if candidates == "rows":
         raise InputError("candidates", "rows of a scenario, which has none", "a job, or configurations")

@@ -115,7 +115,8 @@ def _instrument_of(problem: Problem, number: int, name: str, configurations: Con
     elif model in PAIR_MODELS:
         given["pairing"] = table.pairing
     elif model in POSE_MODELS:
-        given |= {"targets": points("P", "target") or None, "frame": frame}
+        tool_too = "target" in m.labels and bool((m.labels["target"].index < 0).any())
+        given |= {"targets": points("P", "target") or None, "tool_too": tool_too, "frame": frame}
     elif model == "anchor":
         offset = float(places["O", f"offset of {m.source}"][0]) if table.offset else None
         given |= {"anchors": points("A", "anchor"), "offset": offset, "contact": contact}

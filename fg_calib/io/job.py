@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, StrictBool, create_model
 
 from fg_calib import inputs
 from fg_calib.initialization import Camera
-from fg_calib.inputs import LIMITED, FrameKnowledge, InputError, Limits, Model, Options, Pairing, checked
+from fg_calib.inputs import LIMITED, Floats, FrameKnowledge, InputError, Limits, Model, Options, Pairing, checked
 from fg_calib.io import yaml
 from fg_calib.io.atomic import exists, is_folder, noting_reads
 from fg_calib.io.robot_file import Names, read_robot, robot_from_mapping
@@ -49,6 +49,11 @@ class _Point(Schema):
     tolerance: Positive | None = None
 
 
+class _KeepOut(Schema):
+    below: Number | None = None
+    box: tuple[tuple[Number, Number, Number], tuple[Number, Number, Number]] | None = None
+
+
 class _Tolerances(Schema):
     estimate: Any = None
     targets: Positive | None = None
@@ -78,6 +83,9 @@ class _Entry(_TableKeys):
 _CHOICES = ("prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
 """Keys of a job that `Options` checks as they stand."""
 
+FAR_AWAY = 1e9
+"""Where nothing is, in any unit of length."""
+
 _OF_THE_ROBOT = ("robot", "estimate", "truth", "prior", "gauge", "prefer", "folds")
 """Keys of a job that say nothing of how a table is read."""
 
@@ -90,6 +98,7 @@ class _JobKeys(_TableKeys):
     truth: FilePath | None = None
     targets: Mapping[str, _Point] = Field(default_factory=dict)
     anchors: Mapping[str, _Point] = Field(default_factory=dict)
+    keep_out: tuple[_KeepOut, ...] = ()
     tolerance: Annotated[
         _Tolerances, BeforeValidator(lambda one: {"estimate": "kind"} if one == "estimate" else one or {})
     ] = _Tolerances()
@@ -157,7 +166,17 @@ def _read_job(path: Path) -> Job:
         options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)
     alone = tables[0].measurements if isinstance(file.measurements, str) and tables[0].is_plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
-    return Job(path, robot, alone, options, truth, document=document)
+    boxes = tuple(_box(one, file.units, f"{path.name}: keep_out") for one in file.keep_out)
+    return Job(path, robot, alone, options, truth, document=document, keep_out=boxes)
+
+
+def _box(given: _KeepOut, units: Units, place: str) -> Floats:
+    """Lower and upper corner of a box, shape (2, 3), [m]."""
+    corners = np.array([[-FAR_AWAY] * 3, [FAR_AWAY, FAR_AWAY, given.below]] if given.box is None else given.box, float)
+    if (given.below is None) == (given.box is None) or not np.all(corners[0] < corners[1]):
+        found = yaml.shown(given.model_dump(exclude_none=True))
+        raise InputError(place, f"found {found}", "{below: z}, or {box: [lower, upper]} of x, y and z each")
+    return corners * units.factor("m")
 
 
 def is_job(path: Path | str) -> bool:

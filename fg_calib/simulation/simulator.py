@@ -261,7 +261,8 @@ class Measuring:
         if not isinstance(targets, Mapping):
             away = 0.1 * self.workspace()[1] * self.directions(targets)
             targets = self.named("target", [Spot(p) for p in away])
-        n_targets = max(1, len(targets))
+        points = [*([Spot(np.zeros(3))] * i.tool_too), *targets.values()]
+        n_targets = max(1, len(points))
         k, which = np.repeat(np.arange(n), n_targets), np.tile(np.arange(n_targets), n)
         first = self.frame if i.frame is None else choose_frame(i.frame, self.places)
         frames = [first, *(choose_frame("unknown", self.places) for _ in range(i.stations - 1))]
@@ -270,7 +271,7 @@ class Measuring:
         at, labels, measured = self.at(), dict[str, Labels](), dict[str, Any]()
         R = at.rotation[k]
         if placed:
-            t = np.array([s.xyz for s in targets.values()])[which] if targets else np.zeros((len(k), 3))
+            t = np.array([s.xyz for s in points])[which] if points else np.zeros((len(k), 3))
             points = at.position[k] + np.einsum("nij,nj->ni", R, t)
             seen = np.einsum("nij,nj->ni", X, points) + np.array([f.position for f in frames])[station]
             measured["position"] = seen + self.noise("position", len(k), 3)
@@ -280,7 +281,7 @@ class Measuring:
             measured["rotation"] = X @ R @ noise
             measured["sigma_orientation"] = self.sigma("orientation", len(k), 3)
         if targets:
-            labels["target"] = Labels(tuple(targets), which)
+            labels["target"] = Labels(tuple(targets), which - i.tool_too)
         names = [self.name]
         if i.stations > 1:
             names = [f"{self.name}, station s{s + 1}" for s in range(i.stations)]

@@ -15,7 +15,8 @@ from fg_calib.graph import square_root
 from fg_calib.measurements import Noise
 from fg_calib.prediction import errors_at
 from fg_calib.robot import pose
-from fg_calib.simulation.scenario import Errors, GivenReadings, Instrument, Plane, RandomReadings, Spot
+from fg_calib.simulation.obstacles import enters
+from fg_calib.simulation.scenario import Box, Errors, GivenReadings, Instrument, Plane, RandomReadings, Spot
 from fg_calib.statistics import spread_of
 
 NOISE = replace(SIGMA, joint=2e-4)
@@ -137,6 +138,17 @@ def test_rows_of_a_job_are_chosen_among_themselves():
     table = replace(job.tables[0], measurements=job.tables[0].measurements.select(np.sort(rows)))
     expected = error_of(job.robot, [table], plan.task)
     assert plan.expected.position == pytest.approx(expected.position, rel=SAME)
+
+
+def test_the_tool_is_planned_beside_targets_and_boxes_stay_free():
+    job = job_of(
+        Instrument(model="position", name="it", targets={"t": Spot([0.1, 0, 0.1])}, tool_too=True), RandomReadings(30)
+    )
+    box = np.array([[0.3, -99.0, -99.0], [99.0, 99.0, 99.0]])
+    plan = design(replace(job, keep_out=(box,)), n=4, n_candidates=40)
+    assert plan.tables[0].measurements.labels["target"].index.tolist() == [-1, 0] * 4  # -1: the tool
+    assert not enters(job.robot, plan.readings, [Box(*box)]).any()
+    assert enters(job.robot, design(job, n=4, n_candidates=40).readings, [Box(*box)]).any()
 
 
 # --- plans of a job, and what a job of all rows says of itself --------------------------------------------------------
