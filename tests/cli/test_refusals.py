@@ -82,16 +82,6 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
         "noise: position: found 0.0, expected a finite number",
     ),
     "orientations alone": (written("qx,qy,qz,qw\n0,0,0,1\n"), CORRECT, "orientations without x y z"),
-    "a scale of names": (
-        replaced(JOB, "^pairing", "columns: {id: {name: id, scale: 2}}\npairing"),
-        CALIBRATE,
-        "columns: id: scale or zero of a column of names",
-    ),
-    "a tolerance of no targets": (
-        replaced(JOB, "^pairing", "tolerance: {targets: 1}\npairing"),
-        CALIBRATE,
-        "tolerance: targets: of no use without the key targets",
-    ),
     "a table of no frame": (written("x,y,z\n1,2,3\n"), (*CORRECT, "--table", 0), "table: found 0 without world"),
     "a frame that is known": (
         written("x,y,z\n1,2,3\n"),

@@ -276,10 +276,6 @@ def test_pairs_measured_again_are_not_the_same():
     [
         ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),
         ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurement 1: missing key 'model'"),
-        (
-            {"measurements": [{"table": "tracker.csv", "model": "position", "offset": "estimate"}]},
-            "job.yaml: measurement 1: offset: of no use to model position",
-        ),
         ({"measurements": [{"model": "position"}]}, "job.yaml: measurement 1: missing key 'table'"),
         (
             {"pairs": "lengths.csv"},

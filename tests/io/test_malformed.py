@@ -36,7 +36,6 @@ ROBOTS = [
     ('a: 1\nb: \x01\n', 'robot.yaml: not YAML: unacceptable character #x0001 ...'),
     ('name: a\nname: b\n', "robot.yaml:2: key 'name' stands here twice"),
     ('convention: dh\njoints:\n  - {a: 0, alpha: 0, d: 0, theta: 0, beta: 0.1}\n', 'robot.yaml: joint 1: beta: found 0.1, expected none: the convention dh has no beta; dh-hayati has'),
-    ('convention: dh\njoints:\n  - {a: 0, alpha: 0, d: 0, theta: 0}\nbase:\n', 'robot.yaml: base: found nothing, expected a mapping'),
     ("convention: [dh]\njoints: []\n", "robot.yaml: convention: found ['dh'], expected one of dh, mdh, mdh-hayati, dh-hayati (and 1 more)"),
 ]
 
@@ -80,7 +79,9 @@ JOBS = [
     (JOB+"pairs: poses.csv\n", "poses.csv: no a, expected a and b, the two configurations of a pair, and distance or angle"),
     (JOB+"truth: other.yaml\n", 'other.yaml: another robot, expected the parameters of robot, with their true values'),
     (JOB+"noise: {position: 1e-40}\n", 'job.yaml: noise: position: found 1e-40 m, expected 1e-30 m or more'),
-    (JOB+"prefer: a1\n", "job.yaml: prefer: found 'a1', expected a list of names"),
+    (JOB.replace("poses", "groups") + "columns: {id: {name: id, scale: 2}}\n", "groups.csv: columns: id: scale or zero of a column of names, expected name alone"),
+    (JOB+"tolerance: {targets: 1}\n", "job.yaml: tolerance: targets: of no use without the key targets, expected no such key"),
+    ("robot: robot.yaml\nmeasurements: [{table: poses.csv, model: pose, offset: estimate}]\n", "job.yaml: measurement 1: offset: of no use to model pose, expected no such key"),
 ]
 
 
@@ -107,8 +108,6 @@ PAIRS = [
 
 ok = {"q1": [0.0, 1.0], "q2": [0.0, 0.0]}
 FRAMES = [
-    (None, 'frame: found a NoneType, expected a path, or a frame of polars or pandas'),
-    ("", "path: found '', expected a path or an Any"),
     ({**ok,"q1":[True,False]}, 'frame: q1: type Boolean, expected numbers'),
     ({**ok,"q1":[datetime.date(2024,1,1)]*2}, 'frame: q1: type Date, expected numbers'),
 ]
