@@ -89,7 +89,6 @@ def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severi
 @pytest.mark.parametrize(
     ("more", "alone"),
     [
-        ({}, True),
         ({"systematic": Systematic(0.5)}, True),
         ({"systematic": Systematic(1e-9)}, False),
         ({"systematic": Systematic(1e-9), "setup": SetupCheck(explanations=("exchanged",))}, True),

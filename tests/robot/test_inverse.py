@@ -106,16 +106,6 @@ def test_what_cannot_be_reached_is_told_with_its_miss():
     assert 4.0 - 0.3 - 1.8 < found.miss_position[1] < 4.0
 
 
-@pytest.mark.slow
-def test_a_limit_that_is_in_the_way_is_not_passed():
-    """Two links of 2 and 1 m: 2.2 m away needs an elbow of 90 degrees or so, and here it opens by 30 at most."""
-    robot = planar_robot(limits=np.deg2rad([[-180, 180], [-30, 30]]))
-    T = tool_pose(planar_robot(), np.array([0.2, np.deg2rad(90)]))
-    found = solve_inverse(robot, T[None, :3, 3], T[None, :3, :3], generator=np.random.default_rng(6))
-    assert not found.reached[0]
-    assert np.abs(found.readings[0, 1]) <= np.deg2rad(30)
-
-
 def test_what_a_joint_at_its_limit_cannot_do_the_others_do():
     """In one step but for its curvature: three joints for two coordinates, the first cannot turn on."""
     robot, q = Robot.from_dh([[1.0, 0, 0, 0]] * 3, "dh", limits=[[-1.0, 1.0], None, None]), np.array([[1.0, 0.5, 0.5]])
