@@ -38,14 +38,9 @@ def place(tmp_path_factory):
     true = true_robot(robot, rng)
     write_robot(folder / "robot.yaml", robot)
     write_table(folder / "first.csv", measured(true, 30, rng))
-    job = {
-        "robot": "robot.yaml",
-        "measurements": "first.csv",
-        "model": "pose",
-        "units": {"length": "mm", "angle": "deg"},
-        "noise": {"position": 1e3 * SIGMA[0], "orientation": float(np.rad2deg(SIGMA[1]))},
-        "columns": {f"q{i}": f"J{i}" for i in range(1, 7)},
-    }
+    job = {"robot": "robot.yaml", "measurements": "first.csv", "model": "pose"}
+    job |= {"noise": {"position": 1e3 * SIGMA[0], "orientation": float(np.rad2deg(SIGMA[1]))}}
+    job |= {"units": {"length": "mm", "angle": "deg"}, "columns": {f"q{i}": f"J{i}" for i in range(1, 7)}}
     (folder / "job.yaml").write_text(yaml.safe_dump(job))
     assert run("calibrate", folder / "job.yaml", "--out", folder / "result")[0] == 0
     write_table(folder / "healthy.csv", measured(true, 8, rng))
