@@ -85,8 +85,7 @@ def test_zeros_that_cannot_be_told_stay_0_and_what_takes_them_up_is_named(form, 
     for name, zero in zip(["q2", "q3", "q4", "q5"], np.rad2deg(ZEROS[1:5]), strict=True):
         assert abs(rows[name]["zero"] - zero) < 4.0 * rows[name]["sigma"] < 0.2
     found = Calibration.load(tmp_path / "result")
-    moved = {name for name, p in found.parameters.items() if p.correction}
-    assert moved <= {*nominal.zero_names[1:5], *TOOL}
+    assert {name for name, p in found.parameters.items() if p.correction} <= {*nominal.zero_names[1:5], *TOOL}
     written = errors(read_robot(tmp_path / "result" / "robot_calibrated.yaml"), found.robot, drawn(found.robot, 100, 0))
     assert max(written.position_max, written.rotation_max) < 1e-7  # its values are rounded
 

@@ -1,5 +1,7 @@
 """Every format has the forward kinematics of the arm: by yourdfpy and products of matrices."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -246,12 +248,9 @@ def test_zeros_that_are_all_that_is_off_are_found(name, tmp_path):
 
 def shifted(robot, zeros):
     """The robot whose joints stand at other angles by their zeros: each moved in its own sense."""
-    from dataclasses import replace
-
-    elements = tuple(
-        e if e.joint is None else replace(e, constant=e.constant + e.sign * zeros[e.joint]) for e in robot.elements
-    )
-    return replace(robot, elements=elements)
+    moved = [0.0 if e.joint is None else e.sign * zeros[e.joint] for e in robot.elements]
+    elements = (replace(e, constant=e.constant + more) for e, more in zip(robot.elements, moved, strict=True))
+    return replace(robot, elements=tuple(elements))
 
 
 def test_zeros_are_the_best_there_are():
@@ -267,11 +266,7 @@ def test_zeros_are_the_best_there_are():
         turn = Rotation.from_matrix(found[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)).as_rotvec()
         return np.sum((found - wanted)[:, :3, 3] ** 2) + robot.reach**2 * np.sum(turn**2)
 
-    least = cost(best)
-    assert least < cost(np.zeros(6))
-    for i in range(6):
-        for step in (-1e-5, 1e-5):
-            assert cost(best + step * np.eye(6)[i]) > least
+    assert cost(best) < min(cost(zeros) for zeros in (np.zeros(6), *(best + 1e-5 * np.vstack([np.eye(6), -np.eye(6)]))))
     assert set(made.details["after"]) == {"measured", "workspace"}
     assert made.details["after"]["measured"]["n"] == 40
 

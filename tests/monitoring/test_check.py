@@ -77,17 +77,18 @@ def test_the_joint_that_slipped_is_named(known, joint):
 
 
 def test_a_slip_is_named_by_the_joint_where_an_angle_of_hayati_is_alike():
-    """Also to the update, which attributes it to the joint."""
+    """The update attributes it to the joint too, and the check is good again."""
     robot = Robot.from_dh(UR10, "dh-hayati", tool=[0.05, -0.03, 0.12], tolerance=TOLERANCE | {"beta": 1e-3})
     calibration, true, _ = calibrated(1, unknown=True, robot=robot, gauge="keep")
-    rng = np.random.default_rng(50)
-    rows = measured(slipped(true, theta4=2e-3), 10, rng, frame=placed(rng))
+    true, rng = slipped(true, theta4=2e-3), np.random.default_rng(50)
+    rows = measured(true, 10, rng, frame=placed(rng))
     best = calibration.check(rows).explanations[0]
     assert (best.parameters, best.same) == (("theta4",), ("beta4",))
-    before, after = (
-        one.parameters["theta4"].estimate for one in (calibration, calibration.update(rows, changed="q4.zero"))
-    )
-    assert abs(after - before - best.change[0]) < best.sigma[0]
+    updated = calibration.update(rows, changed="q4.zero")
+    change = updated.parameters["theta4"].estimate - calibration.parameters["theta4"].estimate
+    assert abs(change - best.change[0]) < best.sigma[0]
+    assert updated.trustworthy
+    assert updated.check(measured(true, 12, rng, frame=placed(rng))).verdict == "pass"
 
 
 def test_a_slip_too_large_to_be_linear_is_found_in_full(known):

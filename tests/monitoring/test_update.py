@@ -112,27 +112,12 @@ def test_anchors_are_those_of_before_only_where_that_is_said():
     old, new = (lengths(true, anchors, rng, n, i) for n, i in ((90, "x"), (45, "y")))
     calibration = calibrate(robot, old)
     off, of_sigma = difference(calibration.update(new, anchors_stay=True), calibrate(robot, [old, new]))
-    assert off < 1e-5
-    assert of_sigma < 1e-5
+    assert max(off, of_sigma) < 1e-5
     others = replace(
         new.measurements, labels={"anchor": Labels(("d", "e", "f"), new.measurements.labels["anchor"].index)}
     )
     off, of_sigma = difference(calibration.update(new), calibrate(robot, [old, replace(new, measurements=others)]))
-    assert off < 1e-5
-    assert of_sigma < 1e-5
-
-
-@pytest.mark.slow
-def test_what_has_changed_is_learned_anew_and_the_check_is_good_again():
-    calibration, true, rng = calibrated(6)
-    true = slipped(true, theta3=5e-3)
-    rows = measured(true, 12, rng)
-    assert calibration.check(rows).explanations[0].parameters == ("theta3",)
-    updated = calibration.update(rows, changed="theta3")
-    off = updated.parameters["theta3"].estimate - true.nominal[true.index("theta3")]
-    assert abs(off) < 4 * updated.parameters["theta3"].sigma
-    assert updated.trustworthy
-    assert updated.check(measured(true, 12, rng)).verdict == "pass"
+    assert max(off, of_sigma) < 1e-5
 
 
 def test_an_update_at_odds_with_what_was_known_points_to_the_check():
@@ -190,8 +175,7 @@ def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
     updated, batch = calibrate(arm(), old).update(new), calibrate(arm(), [old, new])
     assert classes(updated) == classes(batch)
     assert reasons(updated) == reasons(batch)
-    assert "independent" in classes(updated).values()
-    assert "relative" in classes(updated).values()
+    assert {"independent", "relative"} <= set(classes(updated).values())
 
 
 @pytest.mark.parametrize("change", [{"growth": {"theta": 1e-9, "d": 1e-9}}, {"changed": ["theta3"]}])
