@@ -90,7 +90,7 @@ MISTAKES = {
     "a bare unit": (lambda: read_measurements("poses.csv", ROBOT, units="mm"), "units: found 'mm', expected a Units, "
                     "such as Units(length='mm')"),
     "options as a mapping": (lambda: solve(problem(), {"max_iterations": 5}), "options: found {'max_iterations': 5}, "
-                             "expected a SolverOptions, such as SolverOptions(max_iterations=100)"),
+                             "expected a SolverOptions, such as SolverOptions(max_iterations=200)"),
     **{f"a name to keep {f.__name__}": (
         lambda f=f: f(prefer=["A2"]), "prefer: unknown parameter 'A2', expected one of base.x, base.y, base.z, "
         "base.yaw, base.pitch, base.roll, theta1, d1, a1, alpha1, theta2, d2, ...; did you mean a2?"

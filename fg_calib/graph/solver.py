@@ -64,7 +64,7 @@ class SolverOptions:
         decrement: Converged when the optimum, with rows whitened at the estimate, is nearer than this, [sigma].
     """
 
-    max_iterations: int = 100
+    max_iterations: int = 200
     decrement: float = 3e-7
 
     def __post_init__(self) -> None:

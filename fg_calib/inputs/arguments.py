@@ -38,7 +38,7 @@ EXAMPLES = {
     "Options": "Options(model='pose')",
     "Pairing": "Pairing('chain')",
     "Robot": "Robot.from_dh(...)",
-    "SolverOptions": "SolverOptions(max_iterations=100)",
+    "SolverOptions": "SolverOptions(max_iterations=200)",
     "Units": "Units(length='mm')",
 }
 """Example of an object of a class, for messages."""
