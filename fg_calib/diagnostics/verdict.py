@@ -200,12 +200,13 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     fits = not (doubts or solution.estimated_noise is not None)
     found[check_fit] = list(check_fit(case))  # which names an effect only if the set-up is right
     lacking = list(check_missing(case))
-    explained = any(s.severity == "error" for s in lacking)  # why residuals are systematic
+    offsets = list(check_offsets(case))
+    explained = bool(offsets) or any(s.severity == "error" for s in lacking)  # why residuals are systematic
     statements = [*check_setup(case, fits=fits), *check_optima(case)]
     statements += () if explained else check_systematic(case, doubts=doubts)
     statements += [s for each in found.values() for s in each]
     statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
-    statements += [*check_excitation(identifiability), *check_offsets(case), *lacking]
+    statements += [*check_excitation(identifiability), *offsets, *lacking]
     errors, warnings, notes = (texts(statements, severity) for severity in ("error", "warning", "note"))
     return Verdict(errors, warnings, notes, case.setup, systematic, change, case.variance)
 
@@ -431,8 +432,9 @@ CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (
 
 def check_systematic(case: Case, *, doubts: bool) -> Iterator[Statement]:
     """Check whether residuals are systematic, which is the cause of other doubts, if it is not a wrong set-up."""
-    text = f"systematic residuals: {case.effect}; sigmas are {np.sqrt(case.variance):.2g} times what noise alone makes"
-    text += " them, as regions of joint space disagree; where no row is, errors may be larger: rely on the test rows"
+    text, grown = f"systematic residuals: {case.effect}; ", float(np.sqrt(case.variance))
+    grows = f"sigmas are {grown:.2g} times what noise alone makes them, as regions of joint space disagree; "
+    text += f"{grows * (grown >= NOTABLE_RATIO)}where no row is, errors may be larger: rely on the test rows"
     yield Statement("error" if doubts else "warning", text, case.effect)
 
 
@@ -456,7 +458,11 @@ def check_missing(case: Case) -> Iterator[Statement]:
     asked = case.high and not case.setup.explanations and case.problem.knowledge is None
     for motion in case.identifiability.missing:
         certain = asked and case.regression is not None and effects.explains_misfit(case.regression, motion)
-        yield Statement("error" if certain else "note", str(motion))
+        few = not any(
+            p.estimated and p.owner in motion.axes and p.kind != "theta" for p in case.problem.robot.parameters
+        )
+        text = f"{motion}; estimate more than zeros first" if few else str(motion)
+        yield Statement("error" if certain and not few else "note", text)
 
 
 def check_excitation(found: Identifiability) -> Iterator[Statement]:

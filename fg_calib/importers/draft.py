@@ -108,6 +108,7 @@ class _Recognised:
         units: Its units of `length` and `angle`, if it has such columns.
         unused: Columns without a meaning.
         skip_lines: Lines before its header.
+        repeats: Whether several rows have the same joint readings, whose errors they share.
         pairs: The file of pairs of its configurations, if there is one.
     """
 
@@ -118,6 +119,7 @@ class _Recognised:
     units: Mapping[str, str] = field(default_factory=dict)
     unused: tuple[str, ...] = ()
     skip_lines: int = 0
+    repeats: bool = False
     pairs: Path | None = None
 
     @property
@@ -180,16 +182,18 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
         units=units,
         unused=tuple(c for k, c in enumerate(table.columns) if k not in every.values()),
         skip_lines=skip_lines,
+        repeats=bool(joints) and table.frame[:, list(joints.values())].is_duplicated().any(),
     )
 
 
 def _lines_before_header(path: Path) -> int:
-    """Lines of a CSV before the first with as many cells as the last one has."""
+    """Lines of a CSV before the first with as many cells as most have."""
     if path.suffix.lower() != ".csv":
         return 0
     lines = decoded(read_bytes(path), path.name, "cp1252").rstrip().splitlines() or [""]
-    separator = next((one for one in ";\t," if one in lines[-1]), ",")  # commas may be of decimals
-    return next((k for k, line in enumerate(lines) if line.count(separator) >= lines[-1].count(separator)), 0)
+    separator = next((one for one in ";\t," if one in lines[len(lines) // 2]), ",")  # commas may be of decimals
+    counts = [line.count(separator) for line in lines]
+    return counts.index(max(counts, key=counts.count))
 
 
 def _known_name(header: str) -> str:
@@ -256,6 +260,7 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     factors = {"": 1.0, "length": LENGTHS[units["length"]], "angle": ANGLES[units["angle"]]}
     sigmas = {kind: _GUESSES.get(kind, ("length", 1e-4)) for table in tables for kind in table.noise}
     noise = {kind: float(f"{sigma / factors[of]:.2g}") for kind, (of, sigma) in sigmas.items()}
+    joint = float(f"{1e-4 / factors['angle']:.2g}") if any(table.repeats for table in tables) else 0.0
     arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
     tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
     return _TEMPLATE.format(
@@ -263,7 +268,7 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
         notes=_NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool)),
         entries="\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent)),
         units=_flow(units),
-        noise=_flow({**noise, "joint": 0.0, "estimate": True}),
+        noise=_flow({**noise, "joint": joint, "estimate": True}),
     )
 
 

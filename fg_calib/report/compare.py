@@ -307,7 +307,7 @@ def _conclusions(found: Check) -> Iterator[str]:
         yield f"not distinguishable by these rows: {', '.join(named(e.parameters) for e in likely)}"
         yield "do not deploy any of these changes yet: measure more configurations"
     elif likely and found.verdict == "fail" and found.deploy:
-        yield f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check again"
+        yield f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check others"
     elif likely and found.verdict == "fail":
         yield "do not deploy: residuals above noise remain after the most likely change"
 

@@ -432,7 +432,7 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
         lost = f"{n} of {sum(len(s.train) for s in blocks)} measurements lost more than half their weight"
         yield f"loss {problem.options.loss}: {lost} and do not count in chi-square"
     yield from _undetermined(solution, assessed)
-    if not assessed.fit.residuals.split.any():
+    if not assessed.fit.residuals.split.any() and not problem.options.folds:
         yield "no test rows: the prediction of new configurations was not checked"
     few = assessed.fit.goodness.gross is not None or not assessed.fit.chi_square.too_large
     if few and np.any(assessed.fit.goodness.suspect & assessed.fit.residuals.used) and weights is None:

@@ -157,6 +157,13 @@ def lengths(rng, offset, n=60):
     return robot, replace(table, measurements=m.with_values({"distance": m.value("distance") + offset}))
 
 
+def test_a_large_forgotten_offset_is_named_and_not_what_it_looks_like():
+    robot, table = lengths(np.random.default_rng(1), 0.3)
+    verdict = assess(solve(build_problem(robot, [table]))).verdict
+    assert any("use offset: estimate" in text for text in verdict.errors)
+    assert not any("systematic residuals" in text for text in (*verdict.errors, *verdict.warnings))
+
+
 def test_a_forgotten_offset_is_reported_with_its_size():
     robot, table = lengths(np.random.default_rng(1), 5e-3)
     solution = solve(build_problem(robot, [table]))

@@ -124,6 +124,9 @@ def test_sigmas_in_a_table_need_no_value_of_noise(fg_calib, folder):
     given = drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.parquet")
     assert given["measurements"][0]["table"] == "poses.parquet"
     assert given["noise"] == {"joint": 0.0, "estimate": True}
+    pl.concat([table, table]).write_parquet(folder / "poses.parquet")  # rows that share errors of the joints
+    (folder / JOB).unlink()
+    assert drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.parquet")["noise"]["joint"] == 1e-4
 
 
 def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
