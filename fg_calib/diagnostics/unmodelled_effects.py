@@ -374,11 +374,18 @@ def regress(solution: Solution) -> Regression:
     r_prior, J_prior = prior_rows(problem.variables, parameters)
     r_unknown, J_unknown = unknown_prior_rows(problem.variables, parameters)
     J_prior = np.pad(J_prior, ((0, 0), (0, problem.variables.n_nuisance)))
+    own = basis_of(J[:, ~more])
+    left, dof = r[:, 0] - own @ (own.T @ r[:, 0]), problem.n_independent - own.shape[1]
+    scale = np.clip(np.sqrt(float(left @ left) / dof), 0.1, 1.0) if dof >= LEAST_LEFT else 1.0
+    J, r = J / scale, r / scale  # of noise specified too large: else columns take up the pull of the priors
     n = problem.n_independent + len(r_prior) + len(r_unknown)
     basis, r = (
         basis_of(np.concatenate([J[:, ~more], J_prior, J_unknown])),
         np.concatenate([r[:, 0], r_prior, r_unknown]),
     )
+    if solution.problem.state.weights is not None:
+        most = MOST_TYPICAL * 1.4826 * float(np.median(np.abs(r)))
+        r = np.clip(r, -most, most)  # before outliers spread over all rows
     fit = LinearFit(r - basis @ (basis.T @ r), basis, n - basis.shape[1])
     return Regression(problem, fit, J[:, more], all_names[more])
 

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from fg_calib import statistics
 from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
@@ -22,19 +23,7 @@ from fg_calib.inputs import CalibrationError, Floats
 from fg_calib.measurements import missing_values
 from fg_calib.observability import NOT_EXCITED, Identifiability
 from fg_calib.robot import SCALES, pose
-from fg_calib.statistics import (
-    CONFIDENCE,
-    FACTOR,
-    FINE,
-    LEAST_REDUNDANCY,
-    OUTLIER_WEIGHT,
-    ChiSquare,
-    Fit,
-    GrossErrors,
-    PredictedFit,
-    Spread,
-    has_joint_noise,
-)
+from fg_calib.statistics import CONFIDENCE, FACTOR, FINE, LEAST_REDUNDANCY, OUTLIER_WEIGHT, Fit, GrossErrors, Spread
 
 Severity = Literal["error", "warning", "note"]
 
@@ -247,7 +236,7 @@ def check_fit(case: Case) -> Iterator[Statement]:
 
 
 def check_chi_square(
-    chi2: ChiSquare,
+    chi2: statistics.ChiSquare,
     gross: GrossErrors | None = None,
     *,
     evaluated: bool = False,
@@ -294,7 +283,7 @@ def check_kept_noise(case: Case) -> Iterator[Statement]:
     if estimated is None:
         return
     kept = [kind.kind for kind in case.fit.goodness.kinds if (kind.table, kind.kind) not in estimated]
-    kept += ["the joint readings"] * (has_joint_noise(case.problem) and JOINT_NOISE not in estimated)
+    kept += ["the joint readings"] * (statistics.has_joint_noise(case.problem) and JOINT_NOISE not in estimated)
     text = f"the noise of {', '.join(dict.fromkeys(kept))} could not be estimated: fewer than {LEAST_REDUNDANCY:g}"
     text += " degrees of freedom are left to it; it is as specified, or 1 mm and 1 mrad where nothing was"
     text += "; nothing says whether it is right: measure more" * (not estimated)
@@ -510,7 +499,7 @@ def chi2_in_words(chi2: float, expected: float, p_value: float) -> str:
     return f"chi-square {chi2:.4g} where {expected:.4g} is expected (p-value {probability(p_value)})"
 
 
-def predicted_in_words(fit: PredictedFit) -> str:
+def predicted_in_words(fit: statistics.PredictedFit) -> str:
     """`test rows: chi-square 1012 where 1000 is expected (p-value 0.4), of 1000 of the 9990 rows, evenly spaced`."""
     some = f", of {fit.n} of the {fit.n_rows} rows, evenly spaced" if fit.n < fit.n_rows else ""
     return f"test rows: {chi2_in_words(fit.chi2, fit.expected, fit.p_value)}{some}"

@@ -7,7 +7,7 @@ import pytest
 from instruments import measured_by
 from reported import format_report
 from scipy.stats import binom, kstest
-from simulated import measure, plus, true_robot
+from simulated import measure, plus, small_arm, true_robot
 from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
 
 from fg_calib import calibrate
@@ -145,6 +145,14 @@ def test_outliers_are_no_change(row):
     for rows in (row, [row, 10]):
         spoilt = replace(m, position=plus(m.position, rows, 0.005))
         assert find_change(regress(solve(problem_of(robot, spoilt, "position")))) is None
+
+
+def test_noise_specified_too_large_is_no_effect():
+    """Else the columns of effects take up the pull of the priors, beside which residuals are small."""
+    rng, robot = np.random.default_rng(5), small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
+    m = measure(true_robot(robot, rng), 60, rng, sigma=(1e-4, 1e-4))
+    wide = replace(m, sigma_position=5.0 * m.sigma_position, sigma_orientation=5.0 * m.sigma_orientation)
+    assert find_systematic(regress(solve(build_problem(robot, wide, model="pose")))).p_value > 1e-3
 
 
 # --- instrument offsets ------------------------------------------------------------------------------------------
