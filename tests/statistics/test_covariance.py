@@ -10,11 +10,13 @@ from tolerances import rounding
 
 from fg_calib.assessment import assess
 from fg_calib.graph.build import build_problem
+from fg_calib.graph.normal_system import SIGNAL_FLOOR
 from fg_calib.graph.solver import solve
 from fg_calib.inputs import Pairing
 from fg_calib.measurements.dataset import Measurements
 from fg_calib.robot.kinematics import pose
 from fg_calib.robot.model import Robot
+from fg_calib.statistics.covariance import held_frames
 from fg_calib.statistics.goodness_of_fit import chi2_bounds
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3, "beta": 2e-3, "tool": 5e-3}
@@ -236,3 +238,9 @@ def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all(rms < 1.0 + 3.0 / np.sqrt(24.0))  # three standard errors of 12 draws
     assert np.all(rms > 0.4)
+
+
+def test_a_frame_that_nothing_determines_takes_its_part_of_what_turned_along():
+    scales, at_nominal, here = np.array([2.0, 0.5, 3.0]), np.array([0.0, 1.0, 0.0]), np.array([0.6, 0.8, 0.0])
+    (found,) = SIGNAL_FLOOR * held_frames((here * scales)[None], (at_nominal * scales)[None], scales, 1).T
+    assert np.abs(found) == pytest.approx(0.8 * here * scales, rel=1e-12)
