@@ -23,7 +23,7 @@ from hashlib import file_digest, sha256
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import scipy
@@ -464,6 +464,10 @@ def versions() -> dict[str, str]:
     return {"fg-calib": __version__, "python": platform.python_version(), **libraries}
 
 
+def _refuse_constant(word: str) -> NoReturn:
+    raise ValueError(f"{word} is no number")
+
+
 @checked
 def read_result(path: Path | str) -> Result:
     """The result in a folder that `calibrate --out` wrote, or in its `result.json`.
@@ -479,7 +483,7 @@ def read_result(path: Path | str) -> Result:
     if not exists(file):
         raise InputError(str(path), "no result.json", "what `fg-calib calibrate --out` wrote")
     try:
-        document = json.loads(read_text(file))
+        document = json.loads(read_text(file), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
         raise InputError(str(file), f"not JSON: {str(error).partition(';')[0]}", hint="was it cut off?") from None
     schema = document.get("schema") if isinstance(document, dict) else None

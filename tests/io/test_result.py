@@ -101,6 +101,7 @@ def move(parameter):
     ("damage", "message"),
     [
         (lambda f: (f / "result.json").write_text("{"), "result.json: not JSON: .*; was it cut off?"),
+        (lambda f: (f / "result.json").write_text('{"n": NaN}'), "result.json: not JSON: NaN is no number"),
         (lambda f: (f / "result.json").write_text("[]"), "result.json: schema nothing, expected"),
         (lambda f: (f / "result.json").unlink(), "result: no result.json, expected what"),
         (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
