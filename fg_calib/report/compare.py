@@ -270,7 +270,7 @@ def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
     p = "" if found.p_value is None else f", p-value {probability(found.p_value)}"
     chi2 = f"chi-square {found.chi2:.5g} with {found.dof} degrees of freedom{p}, {found.n} measurements"
     detectable = zip(found.detectable.items(), joint_units, strict=True)
-    sizes = [f"{name} {'none' if of is None else in_words(of, unit, '.2g')}" for (name, of), unit in detectable]
+    sizes = [f"{name} {'not seen' if of is None else in_words(of, unit, '.2g')}" for (name, of), unit in detectable]
     return tables.report(
         line(*WORDS.get(found.verdict, ("NOT EVALUATED", "bold yellow"))),
         *(*found.reasons, *found.cautions, chi2),

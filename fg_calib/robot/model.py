@@ -568,8 +568,8 @@ class RobotBuilder:
 
         Args:
             fixed: Names of parameters that are known exactly.
-            estimate: Names of base and tool parameters to estimate (they are fixed otherwise); with `ZEROS` the zeros
-                are all that is estimated of the joints.
+            estimate: Names of base and tool parameters to estimate (they are fixed otherwise); with `ZEROS` zeros and
+                what else is named are all that is estimated of the joints.
             tolerance: 1-sigma priors by parameter name or by kind, [m] or [rad]; the kinds `base` and `tool`
                 mean the lengths of those frames.
             urdf: The source, for a URDF robot.
@@ -592,7 +592,8 @@ class RobotBuilder:
         fixed, estimate = (robot.own_names(listed(*one)) for one in (("fixed", fixed), ("estimate", estimate)))
         if ZEROS in estimate:
             estimate = tuple(name for name in estimate if name != ZEROS)
-            fixed += tuple(p.name for p in self._parameters if 1 <= p.owner < behind and p.name not in robot.zero_names)
+            free = {*robot.zero_names, *estimate}
+            fixed += tuple(p.name for p in self._parameters if 1 <= p.owner < behind and p.name not in free)
         names = {p.name for p in self._parameters}
         if len(names) < len(self._parameters):
             twice = next(name for name, n in Counter(names_of(self._parameters)).items() if n > 1).rpartition(".")[0]
