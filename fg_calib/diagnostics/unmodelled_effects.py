@@ -327,7 +327,7 @@ def forgotten_offsets(regression: Regression) -> tuple[Offset, ...]:
     for table in _offsets(regression.problem).values():
         spread = np.std(np.concatenate([s.data[s.train, 0] for s in blocks if s.table == table]))
         column = fit.padded(regression.named(f"{OFFSET}{table},"))[:, 0]
-        p, _, after = fit.test(1e6 * column[:, None])  # exact however large residuals are: it is linear
+        p, _, after = fit.test(1e6 * column[:, None])  # kept however short: an offset is linear
         if p < P_VALUE:
             new = column - fit.fitted @ (fit.fitted.T @ column)
             sigma = np.sqrt(float(after.r @ after.r) / after.dof / float(new @ new))

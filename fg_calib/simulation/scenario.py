@@ -545,7 +545,7 @@ class Instrument:
         configurations: Where it measures; where the scenario's instruments do if None. Test rows are those of the
             scenario's validation.
         targets: Points of the tool by name, or how many; the tool point itself if None.
-        tool_too: Whether the tool point is measured beside targets.
+        tool_too: Whether the tool point is measured as well as targets.
         stations: How many measure in turn; each has a frame of its own.
         frame: world_T_base: the base itself, unknown (drawn), or given; the scenario's if None. Of several stations
             the first has it, the others' are drawn. camera_T_base of a fixed camera; if None it looks at the

@@ -81,6 +81,14 @@ def test_what_residuals_follow_is_said_first_and_a_loss_that_takes_it_for_outlie
     assert any(text.startswith("least squares predicts the test rows better") for text in errors) == (loss == "gnc")
 
 
+def test_an_effect_is_seen_among_outliers_that_a_loss_rejects():
+    sag = of_joint(1, lambda *at: 10.0 * gravity(*at))
+    robot, m = measured("6R", np.random.default_rng(1), effect=sag)
+    spoiled = replace(m, position=plus(m.position, slice(0, 60, 20), 0.01))
+    solution = solve(build_problem(robot, spoiled, model="position", frame="unknown", loss="huber"))
+    assert find_systematic(regress(solution)).p_value < 1e-3
+
+
 @pytest.mark.parametrize("instrument", ["targets", "planes", "anchors known"])
 def test_noise_of_instruments_with_landmarks_is_not_systematic_and_a_gain_is(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(1), n=80)
@@ -148,7 +156,7 @@ def test_outliers_are_no_change(row):
 
 
 def test_noise_specified_too_large_is_no_effect():
-    """Else the columns of effects take up the pull of the priors, beside which residuals are small."""
+    """Else the columns of effects take up the pull of the priors, as residuals are small."""
     rng, robot = np.random.default_rng(5), small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
     m = measure(true_robot(robot, rng), 60, rng, sigma=(1e-4, 1e-4))
     wide = replace(m, sigma_position=5.0 * m.sigma_position, sigma_orientation=5.0 * m.sigma_orientation)

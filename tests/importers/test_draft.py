@@ -94,6 +94,9 @@ def test_a_protocol_of_an_instrument_is_read_as_it_is(fg_calib, folder):
     ended = fg_calib("inspect", folder / JOB)
     assert (ended.code, ended.err.count("\n")) == (1, 1)
     assert "poses.csv: skip_lines: found 99, expected fewer than the 44 lines of the file" in ended.err
+    (folder / "tail.csv").write_text(write().read_text() + "Ende\n")
+    ended = fg_calib("init", folder / "robot.yaml", folder / "tail.csv", "--out", folder / "tail.yaml")
+    assert "tail.csv:42: 1 cell, expected 9 as in the header" in ended.err
 
 
 def test_units_that_no_header_specifies_are_guessed_from_the_values(fg_calib, folder):

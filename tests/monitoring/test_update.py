@@ -44,6 +44,15 @@ def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
     assert updated.result.options.gauge == gauge
 
 
+def test_a_second_update_counts_what_was_known_once():
+    rng, robot = np.random.default_rng(0), fine_arm()
+    true = true_robot(robot, rng)
+    old, new = tables_of(FINE, False, "pose", rng, true)
+    more = Table(measured(true, 12, rng, sigma=FINE, ids="c"), "pose")
+    twice = calibrate(robot, old).update(new).update(more)
+    assert max(difference(twice, calibrate(robot, [old, new, more]))) < 1e-5
+
+
 @pytest.mark.parametrize("unknown", [False, True])
 def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
     """Linearised at the old estimate, d2, d3 and d4 of parallel axes went off by metres, theta2 by 70 sigma."""
