@@ -195,11 +195,7 @@ def draw_groups(scenario: Scenario, n: int, generator: np.random.Generator) -> d
 
 
 def build_pool(
-    scenario: Scenario,
-    found: Mapping[str, Candidates],
-    *,
-    given: Floats | None = None,
-    before: Problem | None = None,
+    scenario: Scenario, found: Mapping[str, Candidates], *, given: Floats | None = None, before: Problem | None = None
 ) -> Pool:
     """Build the pool of poses at which a scenario's instruments may measure.
 

@@ -19,15 +19,7 @@ from operator import attrgetter
 
 import numpy as np
 
-from fg_calib.graph import (
-    SIGNAL_FLOOR,
-    Problem,
-    Solution,
-    SolverOptions,
-    directions,
-    solve,
-    with_factors,
-)
+from fg_calib.graph import SIGNAL_FLOOR, Problem, Solution, SolverOptions, directions, solve, with_factors
 from fg_calib.inputs import CalibrationError, Floats, checked
 from fg_calib.measurements import Kind
 from fg_calib.parallel import one_blas_thread

@@ -14,15 +14,7 @@ from numpy.typing import ArrayLike
 from fg_calib import __version__
 from fg_calib.calibration import Calibration
 from fg_calib.exports import dh
-from fg_calib.exports.urdf import (
-    BASE_LINK,
-    TOOL_LINK,
-    UrBase,
-    dumped,
-    new_urdf,
-    tesseract_text,
-    ur_kinematics,
-)
+from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
 from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
 from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text

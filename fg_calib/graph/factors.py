@@ -42,10 +42,7 @@ class CheckedFactor(gtsam.CustomFactor):
     """
 
     def __init__(
-        self,
-        variables: Sequence[Variable],
-        n_rows: int,
-        linearise: Callable[[gtsam.Values], tuple[Floats, Floats]],
+        self, variables: Sequence[Variable], n_rows: int, linearise: Callable[[gtsam.Values], tuple[Floats, Floats]]
     ) -> None:
         spans = [v.columns for v in variables]
         n_columns = max(s.stop for s in spans)

@@ -15,20 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fg_calib import io
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, printable
-from fg_calib.io import (
-    ANGLES,
-    KNOWN,
-    LENGTHS,
-    OF_CONFIGURATIONS,
-    OF_PAIRS,
-    Table,
-    decoded,
-    names_of,
-    read_bytes,
-    read_robot,
-    read_yaml,
-)
+from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_PAIRS, Table, decoded, names_of, read_bytes, read_robot, read_yaml
 from fg_calib.measurements import COVARIANCE, INSTRUMENTS
 from fg_calib.robot import Robot
 
@@ -157,7 +146,7 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
         expected = f"columns {numbered}, or the joints' names {names}; or a and b of pairs"
         hint = f"the columns are {', '.join(table.columns)}"
         raise InputError(table.name, "neither joint readings nor pairs", expected, hint)
-    sets = (OF_PAIRS if is_pairs else OF_CONFIGURATIONS).values()
+    sets = (OF_PAIRS if is_pairs else io.OF_CONFIGURATIONS).values()
     known, every = names_of(sets), dict(joints)
     for k in sorted(range(len(bare)), key=lambda k: table.columns[k] not in known):
         name = bare[k] if bare[k] in known else _known_name(bare[k])

@@ -179,13 +179,7 @@ def check(key: str, value: object, possible: Any) -> Any:
 
 
 def check_number(
-    key: str,
-    value: object,
-    *,
-    least: float = 0.0,
-    above: bool = False,
-    whole: bool = False,
-    most: int | None = None,
+    key: str, value: object, *, least: float = 0.0, above: bool = False, whole: bool = False, most: int | None = None
 ) -> None:
     """Check that an option is a number of the right kind and size.
 

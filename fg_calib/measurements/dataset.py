@@ -10,17 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.inputs import (
-    Booleans,
-    Floats,
-    FrozenArrays,
-    InputError,
-    Integers,
-    Pairing,
-    Reader,
-    brief,
-    check_number,
-)
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Pairing, Reader, brief, check_number
 from fg_calib.robot import Robot, rotation_angle
 
 _log = logging.getLogger(__name__)

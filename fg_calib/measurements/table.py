@@ -8,29 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from fg_calib import inputs
 from fg_calib.initialization import Camera
-from fg_calib.inputs import (
-    PAIR_MODELS,
-    POSE_MODELS,
-    Booleans,
-    Brief,
-    Floats,
-    FrameKnowledge,
-    FrozenArrays,
-    InputError,
-    Integers,
-    Model,
-    Pairing,
-    as_figures,
-    as_floats,
-    as_indices,
-    as_mask,
-    as_sigmas,
-    check_fields,
-    check_number,
-    listed,
-    shown,
-)
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Model, Pairing, as_floats, listed, shown
 from fg_calib.measurements.dataset import Labels, Measurements, Pairs
 from fg_calib.measurements.kind import Kind, check_kind
 from fg_calib.measurements.landmarks import Landmark, LandmarkKind, Landmarks
@@ -157,7 +137,7 @@ class CustomMeasurements(Brief):
         if not isinstance(self.kind, Kind):
             raise InputError("own: kind", f"found {shown(self.kind)}", "an object of a class derived from Kind")
         check_kind(self.kind)
-        kind, data = self.kind, as_figures("own: data", self.data, "finite numbers")
+        kind, data = self.kind, inputs.as_figures("own: data", self.data, "finite numbers")
         data = as_floats("own: data", data[:, None] if data.ndim == 1 else data, f"(n, {kind.width})")
         starts, names = as_floats("own: unknowns", self.unknowns, "(n, k)"), listed("own: names", self.names)
         if kind.n_nuisances and (not starts.size or kind.n_nuisances % starts.shape[1]):
@@ -166,12 +146,12 @@ class CustomMeasurements(Brief):
         if names and (len(set(names)) != len(starts) or not all(isinstance(name, str) and name for name in names)):
             raise InputError("own: names", f"found {shown(self.names)}", f"{len(starts)} different words")
         found = {"data": data, "unknowns": starts, "names": names}
-        found["sigma"] = as_sigmas("own: sigma", self.sigma, (len(data), kind.residual_dim))
+        found["sigma"] = inputs.as_sigmas("own: sigma", self.sigma, (len(data), kind.residual_dim))
         if self.test is not None:
-            found["test"] = as_mask("own: test", self.test, len(data))
+            found["test"] = inputs.as_mask("own: test", self.test, len(data))
         for name, most in (("ends", None), ("which", len(starts) - 1)):
             if getattr(self, name) is not None:
-                found[name] = as_indices(f"own: {name}", getattr(self, name), len(data), most)
+                found[name] = inputs.as_indices(f"own: {name}", getattr(self, name), len(data), most)
         for name, value in found.items():
             object.__setattr__(self, name, value)
 
@@ -211,7 +191,7 @@ class CustomMeasurements(Brief):
 
 
 @dataclass(frozen=True)
-class KnownPoint(FrozenArrays):
+class KnownPoint(inputs.FrozenArrays):
     """Position of a target on the tool, or of an anchor in the base frame.
 
     Attributes:
@@ -225,7 +205,7 @@ class KnownPoint(FrozenArrays):
     def __post_init__(self) -> None:
         object.__setattr__(self, "xyz", as_floats("xyz", self.xyz, "(3)"))
         if self.tolerance is not None:
-            check_number("tolerance", self.tolerance, above=True)
+            inputs.check_number("tolerance", self.tolerance, above=True)
         super().__post_init__()
 
 
@@ -248,7 +228,7 @@ class Table(Brief):
     measurements: Measurements
     model: Model | None = "distance-rotation"
     pairing: Pairing = field(default_factory=Pairing)
-    frame: FrameKnowledge = "known"
+    frame: inputs.FrameKnowledge = "known"
     own: tuple[CustomMeasurements, ...] = ()
     known: Mapping[str, KnownPoint] = field(default_factory=dict)
     offset: bool = False
@@ -256,7 +236,7 @@ class Table(Brief):
     fixed_camera: bool = False
 
     def __post_init__(self) -> None:
-        check_fields(self, "table: ")
+        inputs.check_fields(self, "table: ")
         object.__setattr__(self, "own", tuple(self.own))
         if self.model is None and self.frame == "unknown":
             raise InputError(
@@ -271,7 +251,7 @@ class Table(Brief):
     @property
     def uses_pairs(self) -> bool:
         """Whether its model is one of pairs."""
-        return self.model in PAIR_MODELS
+        return self.model in inputs.PAIR_MODELS
 
     def by_itself(self) -> Table:
         """Copy without known places that none of its own rows is of."""
@@ -304,7 +284,7 @@ class Table(Brief):
     @property
     def unknown_frame(self) -> bool:
         """Whether its world_T_base is estimated."""
-        return self.frame == "unknown" and (self.model in POSE_MODELS or self.fixed_camera)
+        return self.frame == "unknown" and (self.model in inputs.POSE_MODELS or self.fixed_camera)
 
 
 def by_station(table: Table) -> tuple[Table, ...]:

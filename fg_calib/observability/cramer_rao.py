@@ -30,20 +30,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fg_calib import inputs
 from fg_calib.graph import correlation, named_triangle, predicted_problem, true_problem
-from fg_calib.inputs import (
-    Booleans,
-    Brief,
-    Floats,
-    FrameKnowledge,
-    InputError,
-    Model,
-    Options,
-    PairErrors,
-    Pairing,
-    check_names,
-    checked,
-)
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Model, Options, PairErrors, Pairing, checked
 from fg_calib.measurements import Measurements, Table
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, build_chain, forward, without_rigid_motion
@@ -102,7 +91,7 @@ def cramer_rao(
     *,
     model: Model | None = None,
     pairing: Pairing | None = None,
-    frame: FrameKnowledge = "known",
+    frame: inputs.FrameKnowledge = "known",
     prior: bool = True,
     kept: Sequence[str] | None = None,
     pair_errors: PairErrors = "shared",
@@ -130,7 +119,7 @@ def cramer_rao(
         ProblemError: A table lacks what its model needs.
     """
     names = tuple(p.name for p in robot.parameters if p.estimated)
-    check_names("kept", () if kept is None else kept, names, "or fixed parameter")
+    inputs.check_names("kept", () if kept is None else kept, names, "or fixed parameter")
     k = np.array([kept is None or name in kept for name in names])
     if isinstance(measurements, Measurements):
         problem = predicted_problem(

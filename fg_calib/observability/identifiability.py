@@ -13,18 +13,9 @@ from typing import Literal
 
 import numpy as np
 
+from fg_calib import inputs
 from fg_calib.graph import SIGNAL_FLOOR, STRUCTURAL_FLOOR, Problem, named_triangle, predicted_problem, random_problem
-from fg_calib.inputs import (
-    Brief,
-    Floats,
-    FrameKnowledge,
-    Model,
-    Pairing,
-    ProblemError,
-    check_names,
-    check_number,
-    checked,
-)
+from fg_calib.inputs import Brief, Floats, FrameKnowledge, Model, ProblemError, check_names, check_number, checked
 from fg_calib.measurements import Measurements
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
@@ -127,7 +118,7 @@ def observe_configurations(
     model: Model,
     *,
     frame: FrameKnowledge = "known",
-    pairing: Pairing | None = None,
+    pairing: inputs.Pairing | None = None,
     prefer: Sequence[str] = (),
 ) -> Identifiability:
     """Identifiability by a model at given configurations, with their noise; measured values are not looked at.
@@ -154,10 +145,7 @@ def observe_configurations(
 
 
 def identifiability_of(
-    problem: Problem,
-    parameters: Floats,
-    kind: Literal["structural", "practical"],
-    prefer: Sequence[str] = (),
+    problem: Problem, parameters: Floats, kind: Literal["structural", "practical"], prefer: Sequence[str] = ()
 ) -> Identifiability:
     """Identifiability by the train rows of a problem, without priors, around a parameter vector."""
     floor = STRUCTURAL_FLOOR if kind == "structural" else SIGNAL_FLOOR

@@ -239,11 +239,7 @@ def _accuracy(J: Floats, names: Sequence[str], scales: Floats) -> dict[str, Any]
 
 
 def _groups(
-    null: Floats,
-    dead: NDArray[np.bool_],
-    scales: Floats,
-    parameters: Sequence[Parameter],
-    prefer: Sequence[str],
+    null: Floats, dead: NDArray[np.bool_], scales: Floats, parameters: Sequence[Parameter], prefer: Sequence[str]
 ) -> tuple[RelativeGroup, ...]:
     """Connected relative groups with sparse relations, from an orthonormal basis of the null space."""
     alive: list[int] = np.flatnonzero(~dead).tolist()

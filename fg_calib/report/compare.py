@@ -195,10 +195,7 @@ def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -
     head: list[Content] = [line(f"OLD  {folders[0]}", "bold"), *summary(old), line("")]
     head += [line(f"NEW  {folders[1]}", "bold"), *summary(new)]
     columns = ("", "|unit", "old|q", "new|q", "change|q:+", "sigma of it|q", "in sigma|+z.1f")
-    return tables.report(
-        *head,
-        *section("Parameters", table_of(columns, rows), INDEPENDENT),
-    )
+    return tables.report(*head, *section("Parameters", table_of(columns, rows), INDEPENDENT))
 
 
 def _largest_change(before: Run, run: Run) -> dict[str, Any] | None:

@@ -19,28 +19,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.inputs import (
-    NEAR,
-    AngleUnit,
-    Floats,
-    InputError,
-    LengthUnit,
-    Reader,
-    as_figures,
-    as_floats,
-    check,
-    check_names,
-    check_number,
-    check_sizes,
-    checked,
-    did_you_mean,
-    escaped,
-    known_names,
-    listed,
-    require,
-    shape_of,
-    shown,
-)
+from fg_calib import inputs
+from fg_calib.inputs import NEAR, Floats, InputError, as_floats, check_names, checked, escaped, listed, shape_of, shown
 from fg_calib.robot.rotations import yaw_pitch_roll
 
 MOST_JOINTS = 200
@@ -271,9 +251,9 @@ class Robot:
     parameters: tuple[Parameter, ...]
     elements: tuple[Element, ...]
     urdf: UrdfSource | None = field(default=None, repr=False)
-    units: tuple[LengthUnit, AngleUnit] = field(default=("m", "rad"), repr=False, compare=False)
+    units: tuple[inputs.LengthUnit, inputs.AngleUnit] = field(default=("m", "rad"), repr=False, compare=False)
 
-    from_urdf = Reader("read_urdf")
+    from_urdf = inputs.Reader("read_urdf")
 
     @classmethod
     @checked
@@ -313,14 +293,14 @@ class Robot:
         Raises:
             InputError: A figure, name or shape that cannot be used; the message names the joint.
         """
-        check("convention", convention, tuple(CONVENTIONS))
+        inputs.check("convention", convention, tuple(CONVENTIONS))
         five = shape_of("rows", rows, "numbers of shape (n, 4)")[1:] == (5,)
         figures = as_floats("rows", rows, "(n, 5)" if five else "(n, 4)")
         kinds = CONVENTIONS[convention]
         if figures.shape[1] > 4 and "beta" not in kinds:
             raise InputError("rows", f"shape {figures.shape}", f"(n, 4): the convention {convention} has no beta")
         angles = figures[:, [unit_of(kind) == "rad" for kind in DH_COLUMNS[: figures.shape[1]]]]
-        require(np.abs(angles) <= MOST_ANGLE, "rows", angles, IN_RAD, "are they in deg?")
+        inputs.require(np.abs(angles) <= MOST_ANGLE, "rows", angles, IN_RAD, "are they in deg?")
         builder = RobotBuilder(name, convention)
         builder.add_frame("base", frame_values("base", base), 0, False)
         for joint, row in zip(_joints(len(figures), types, limits, names), figures, strict=True):
@@ -433,8 +413,8 @@ class Robot:
         """
         names = names_of(self.parameters)
         if not isinstance(name, str) or name not in names:
-            hint = did_you_mean(name, names, NEAR)
-            raise InputError(self.name, f"no parameter {shown(name)}", known_names(names), hint)
+            hint = inputs.did_you_mean(name, names, NEAR)
+            raise InputError(self.name, f"no parameter {shown(name)}", inputs.known_names(names), hint)
         return names.index(name)
 
     def owned_by(self, owner: int) -> list[int]:
@@ -460,11 +440,11 @@ class Robot:
         Raises:
             InputError: There are more or fewer values than parameters.
         """
-        figures, n = as_figures(self.name, values, "values of the parameters"), len(self.parameters)
+        figures, n = inputs.as_figures(self.name, values, "values of the parameters"), len(self.parameters)
         if figures.shape != (n,):
             found = f"{len(figures)} values" if figures.ndim == 1 else f"shape {figures.shape}"
             raise InputError(self.name, found, f"{n}, one a parameter")
-        check_sizes(self.name, figures)
+        inputs.check_sizes(self.name, figures)
         pairs = zip(self.parameters, figures.tolist(), strict=True)
         return replace(self, parameters=tuple(p if p.nominal == v else replace(p, nominal=v) for p, v in pairs))
 
@@ -626,13 +606,13 @@ class RobotBuilder:
 def _checked_tolerance(tolerance: Mapping[str, float], parameters: Sequence[Parameter], place: str) -> dict[str, float]:
     """1-sigma priors by name or kind, of parameters that there are."""
     for key, figure in dict(tolerance).items():
-        check_number(f"tolerance: {key}", figure, above=True)
+        inputs.check_number(f"tolerance: {key}", figure, above=True)
     names, kinds = names_of(parameters), {tolerance_kind(p) for p in parameters} - {None}
     for name in tolerance:
         if name not in names and name not in kinds:
             named = sorted(str(k) for k in kinds)
-            found, hint = f"unknown parameter or kind {name!r}", did_you_mean(name, [*named, *names], NEAR)
-            raise InputError(f"{place}: tolerance", found, known_names(named), hint)
+            found, hint = f"unknown parameter or kind {name!r}", inputs.did_you_mean(name, [*named, *names], NEAR)
+            raise InputError(f"{place}: tolerance", found, inputs.known_names(named), hint)
     return dict(tolerance)
 
 
@@ -693,12 +673,12 @@ def _joints(
             raise InputError(key, f"{count} for {n} joints", "one a joint")
     joints: list[Joint] = []
     for i, (kind, given, name) in enumerate(zip(kinds, ranges, called, strict=True), start=1):
-        check(f"types: joint {i}", kind, JointType)
+        inputs.check(f"types: joint {i}", kind, JointType)
         if not isinstance(name, str) or not name:
             raise InputError(f"names: joint {i}", f"found {shown(name)}", "a word")
         if name in called[: i - 1]:
             raise InputError(f"names: joint {i}", f"found {name!r}, as before", "different names")
-        pair = (-np.inf, np.inf) if given is None else as_figures(f"limits: joint {i}", given, "lower and upper")
+        pair = (-np.inf, np.inf) if given is None else inputs.as_figures(f"limits: joint {i}", given, "lower and upper")
         lower, upper = pair if np.shape(pair) == (2,) else (np.nan, np.nan)
         if not lower < upper:
             raise InputError(f"limits: joint {i}", f"found {shown(given)}", "lower below upper, or None")

@@ -33,18 +33,9 @@ import numpy as np
 from pydantic import computed_field
 from scipy import special
 
+from fg_calib import inputs
 from fg_calib.graph import Solution, problem_of
-from fg_calib.inputs import (
-    Figure,
-    Floats,
-    FrozenArrays,
-    InputError,
-    Integers,
-    Limits,
-    ProblemError,
-    check_number,
-    checked,
-)
+from fg_calib.inputs import Figure, Floats, FrozenArrays, InputError, Integers, Limits, ProblemError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Labels, Table
 from fg_calib.parallel import Failure, map_jobs
@@ -126,7 +117,7 @@ def cross_validate(
         ProblemError: The measurements of all but one fold do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    check_number("folds", n, least=2, whole=True)
+    inputs.check_number("folds", n, least=2, whole=True)
     for table in job.tables:
         if table.own:
             raise InputError("folds", f"custom measurements in {table.measurements.source}", "tables without")

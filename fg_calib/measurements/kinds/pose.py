@@ -113,10 +113,7 @@ class PoseTracker(Instrument):
     """
 
     optional_labels = ("target",)
-    columns = (
-        *POSE_COLUMNS,
-        Column(("target",), "", "Which point of the tool was seen; empty: the tool itself"),
-    )
+    columns = (*POSE_COLUMNS, Column(("target",), "", "Which point of the tool was seen; empty: the tool itself"))
     is_pose = True
 
     def __init__(self, model: str, orientation: bool, position: bool) -> None:
