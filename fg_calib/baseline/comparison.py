@@ -19,6 +19,8 @@ References:
     Orbit. International Journal of Aerospace Engineering.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal

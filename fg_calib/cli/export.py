@@ -1,5 +1,7 @@
 """`fg-calib export`."""
 
+from __future__ import annotations
+
 import sys
 from pathlib import Path
 from typing import Annotated, Literal

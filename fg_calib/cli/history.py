@@ -1,5 +1,7 @@
 """`fg-calib history`."""
 
+from __future__ import annotations
+
 from fg_calib.cli.output import Json, ResultFolder, show_result
 
 

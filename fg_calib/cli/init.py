@@ -1,5 +1,7 @@
 """`fg-calib init`."""
 
+from __future__ import annotations
+
 import shlex
 from pathlib import Path
 from typing import Annotated

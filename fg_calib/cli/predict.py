@@ -1,5 +1,7 @@
 """`fg-calib predict`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -1,5 +1,7 @@
 """`fg-calib simulate`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

@@ -114,8 +114,7 @@ def _poses_of(problem: Problem, number: int, residual_dim: int, pose_of: Integer
     s = problem.data.blocks[number]
     if not s.kind.ends:
         return np.full(len(s.train) * residual_dim, -1)
-    found: Integers = np.repeat(pose_of[problem.data.places[s.table][s.ends[s.train]]].max(axis=1), residual_dim)
-    return found
+    return np.repeat(pose_of[problem.data.places[s.table][s.ends[s.train]]].max(axis=1), residual_dim)
 
 
 def _stack(rows: Floats, which: Integers, n_poses: int) -> Floats:
@@ -178,8 +177,7 @@ class System(FrozenArrays):
     def information(self, chosen: Integers) -> Floats:
         """Information with some candidates measured, shape (n, n)."""
         A = self.rows[chosen].reshape(-1, self.rows.shape[2])
-        out: Floats = self.known + A.T @ A
-        return out
+        return self.known + A.T @ A
 
 
 def build_system(poses: PoseRows, given: Floats, task: Floats) -> System:
@@ -241,8 +239,7 @@ class Task(FrozenArrays):
             rotation = rotation - rigid
         n = position.shape[2]
         flat = np.vstack([position.reshape(-1, n), self.lever * rotation.reshape(-1, n)])
-        out: Floats = flat.T @ flat / len(self.readings)
-        return out
+        return flat.T @ flat / len(self.readings)
 
 
 @dataclass(frozen=True)

@@ -58,20 +58,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, InputError, shown
-from fg_calib.robot import (
-    CONVENTIONS,
-    PARAMETER_KINDS,
-    Axis,
-    Element,
-    Poses,
-    Robot,
-    RobotBuilder,
-    build_chain,
-    forward,
-    frame_values,
-    pose,
-    random_readings,
-)
+from fg_calib.robot import Axis, Element, Poses, Robot, RobotBuilder, build_chain, forward, model, pose, random_readings
 
 TableConvention = Literal["dh", "mdh", "dh-hayati"]
 
@@ -140,10 +127,10 @@ def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHE
     farthest = farthest * robot.reach
     rows, base, tool, nearly = _rows(links, convention, farthest)
     builder = RobotBuilder(robot.name, convention)
-    builder.add_frame("base", frame_values("base", _tidy(base)), 0, False)
+    builder.add_frame("base", model.frame_values("base", _tidy(base)), 0, False)
     for joint, row in zip(robot.joints, rows, strict=True):
         builder.add_convention_joint(joint, {"beta": 0.0} | {kind: _turn(kind, row[kind]) for kind in row})
-    builder.add_frame("tool", frame_values("tool", _tidy(tool)), robot.n_joints + 1, False)
+    builder.add_frame("tool", model.frame_values("tool", _tidy(tool)), robot.n_joints + 1, False)
     return TableRobot(builder.build(), nearly)
 
 
@@ -342,7 +329,7 @@ def transform(**values: float) -> Floats:
     """Elementary transforms by kind (theta, d, a, alpha, beta), multiplied from left to right, shape (4, 4)."""
     T = np.eye(4)
     for kind, value in values.items():
-        axis = PARAMETER_KINDS[kind].axis
+        axis = model.PARAMETER_KINDS[kind].axis
         if axis < Axis.RX:
             T[:3, 3] += value * T[:3, axis]
         else:
@@ -352,7 +339,7 @@ def transform(**values: float) -> Floats:
 
 def row_transform(convention: str, row: dict[str, float]) -> Floats:
     """One row of a table at reading 0, in the order of its convention, shape (4, 4)."""
-    return transform(**{kind: row.get(kind, 0.0) for kind in CONVENTIONS[convention]})
+    return transform(**{kind: row.get(kind, 0.0) for kind in model.CONVENTIONS[convention]})
 
 
 # --- the nearest arm of fewer values ----------------------------------------------------------------------------------
@@ -432,8 +419,7 @@ def step_zeros(nominal: Robot, calibrated: Robot, readings: Floats, zeros: Float
     at, weight = pose(nominal, readings + zeros), np.repeat([calibrated.reach, 1.0], 3)
     J = weight[:, None] * at.jacobian[:, :, -nominal.n_joints :]
     miss = (weight * _miss(at, poses(calibrated, readings))).ravel()
-    after: Floats = zeros - np.linalg.lstsq(J.reshape(-1, nominal.n_joints), miss, rcond=None)[0]
-    return after
+    return zeros - np.linalg.lstsq(J.reshape(-1, nominal.n_joints), miss, rcond=None)[0]
 
 
 def fit_parameters(start: Robot, calibrated: Robot, readings: Floats) -> Robot:
@@ -458,8 +444,7 @@ def _fit(predict: Callable[[Floats], Poses], start: Floats, wanted: Robot, readi
         return np.concatenate([(weight * _miss(predict(x), at)).ravel(), hold * (x - start)])
 
     found = least_squares(residual, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
-    values: Floats = found.x
-    return values
+    return found.x
 
 
 def _miss(found: Poses, wanted: Poses) -> Floats:

@@ -15,19 +15,7 @@ from fg_calib.graph.problem import Problem, named_rows, problem_at, start_of, ta
 from fg_calib.graph.variables import Variables
 from fg_calib.inputs import Floats, Integers, Options, Pairing, ProblemError, check_names, checked
 from fg_calib.job import Job
-from fg_calib.measurements import (
-    INSTRUMENTS,
-    Dataset,
-    Frames,
-    Measurements,
-    Table,
-    build_dataset,
-    check_copies,
-    check_rows,
-    is_ours,
-    missing_values,
-    predict_measurements,
-)
+from fg_calib.measurements import INSTRUMENTS, Frames, Measurements, Table, build, check_rows, is_ours, missing_values
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, forward, names_of, random_readings
 
@@ -77,7 +65,7 @@ def build_problem(
             _log.warning("%s: not used, model %s is of poses", source, table.model)
         for text in missing_values(table):
             _log.warning("%s", text)
-    check_copies(tables)
+    build.check_copies(tables)
     return problem_of_tables(robot, tables, options)
 
 
@@ -107,7 +95,7 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
         none = [p.tolerance is None and p.estimated and 1 <= p.owner <= n for p in parameters]
         first = (replace(p, tolerance=FIRST_TOLERANCE) if t else p for p, t in zip(parameters, none, strict=True))
         robot = replace(robot, parameters=tuple(first))
-    data = build_dataset(robot, tables)
+    data = build.build_dataset(robot, tables)
     variables = variables_of(robot, data, options)
     start = start_of(robot, data, variables)
     _check_own_kinds(robot, data, variables, start)
@@ -195,7 +183,7 @@ def predicted_problem(
     """
     options = Options(model, pairing or Pairing(), frame, gauge="none", pair_errors=pair_errors)
     options = replace(options, model=INSTRUMENTS[options.model].random_model(Table(measurements)))
-    m = predict_measurements(robot, measurements, options.model)
+    m = build.predict_measurements(robot, measurements, options.model)
     return true_problem(robot, Table(m, options.model, options.pairing, options.frame), options)
 
 
@@ -211,7 +199,7 @@ def true_problem(
         options: Whether pairs share errors; the tables' own choices count for the rest.
         places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
     """
-    data, places = build_dataset(robot, tables_of(tables, options)), places or {}
+    data, places = build.build_dataset(robot, tables_of(tables, options)), places or {}
     starts = {i: places[key] for i, key in enumerate(data.landmarks.keys) if key in places}
     data = replace(data, landmarks=data.landmarks.with_starts(starts))
     variables = variables_of(robot, data, options)
@@ -229,7 +217,7 @@ def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Flo
     return dict(places) | {("X", problem.data.labels[v.number]): parameters[v.places] for v in problem.variables.frames}
 
 
-def _coordinates(data: Dataset, variables: Variables) -> dict[tuple[str, str], Integers]:
+def _coordinates(data: build.Dataset, variables: Variables) -> dict[tuple[str, str], Integers]:
     """Index of landmarks and unknown frames (see `places_of`) in a parameter vector; -1 where not estimated."""
     parts = np.split(variables.coordinates, np.cumsum(data.landmarks.sizes)[:-1])
     frames = {("X", data.labels[v.number]): v.places for v in variables.frames}
@@ -254,7 +242,7 @@ def random_problem(
     return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 
-def _check_own_kinds(robot: Robot, data: Dataset, variables: Variables, start: Floats) -> None:
+def _check_own_kinds(robot: Robot, data: build.Dataset, variables: Variables, start: Floats) -> None:
     """Compare the derivatives of custom kinds with differences at some measurements, where they are started."""
     at = variables.at(start)
     for s in (s for s in data.blocks if not is_ours(s.kind)):

@@ -367,8 +367,7 @@ def all_errors(noises: Sequence[RowNoise], rows: WhitenedRows) -> Sparse:
 def whitener_of(noise: RowNoise, part: WhitenedBlock) -> Floats:
     """Matrices that whitened the train rows of a block, shape (n, residual_dim, residual_dim)."""
     h, plain = part.block.residual_dim, noise.rows_at(noise.block.train)
-    out: Floats = unpack(part.block.whitening, h) @ np.linalg.inv(unpack(plain.whitening, h))
-    return out
+    return unpack(part.block.whitening, h) @ np.linalg.inv(unpack(plain.whitening, h))
 
 
 def _whiten(

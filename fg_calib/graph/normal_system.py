@@ -217,8 +217,7 @@ class NormalSystem:
     @cached_property
     def residual(self) -> Floats:
         """Marginal residuals after the step, e = r + A s, in sigma of the private noise, shape (n,)."""
-        out: Floats = self._rows[:, -1] + self.A @ self.step
-        return out
+        return self._rows[:, -1] + self.A @ self.step
 
     @cached_property
     def weighted_residual(self) -> Floats:
@@ -256,8 +255,7 @@ class NormalSystem:
     def project(self, f: Floats) -> Floats:
         """Data f, shape (n, k), times P = C^-1 - C^-1 A cov A^T C^-1; P r is `weighted_residual`."""
         weighed = self.states.weigh(f)
-        out: Floats = weighed - self._weighed_root @ (self.full_root.T @ (self.A.T @ weighed))
-        return out
+        return weighed - self._weighed_root @ (self.full_root.T @ (self.A.T @ weighed))
 
     @cached_property
     def _weighed_root(self) -> Floats:

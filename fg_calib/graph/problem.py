@@ -503,8 +503,7 @@ def estimate_sensitivity(problem: Problem, parameters: Floats, wanted: Integers)
         return np.zeros((v.n_columns + v.n_nuisance, 0))
     J = problem.rows.private(v.at(parameters))[:, :-1]
     L = all_errors(problem.noises, problem.rows)[:, wanted]
-    out: Floats = (L.T @ problem.rows.states.weigh(J)).T / loss_variance(problem)
-    return out
+    return (L.T @ problem.rows.states.weigh(J)).T / loss_variance(problem)
 
 
 def loss_variance(problem: Problem) -> float:

@@ -106,8 +106,7 @@ def tuning(loss: Loss, dim: int) -> float:
 def constants(loss: Loss, residual_dim: NDArray[np.int64]) -> Floats:
     """The constant of a loss for measurements of so many rows each, shape (n,)."""
     of_dim = [tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)]
-    out: Floats = np.array(of_dim)[residual_dim]
-    return out
+    return np.array(of_dim)[residual_dim]
 
 
 @dataclass(frozen=True)

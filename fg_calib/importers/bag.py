@@ -28,6 +28,8 @@ is that at which it correlates most with the speed of the measured positions, to
 by more than that at both ends.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -412,8 +414,7 @@ def sigmas_of_means(residuals: Sequence[Floats], tau: float) -> Floats:
     square = np.array([np.mean(r**2, axis=0) for r in residuals])
     part = np.minimum(tau / n, 0.5)
     freedom = np.maximum(2.0 * n * tau / (tau**2 + 1.0) - 1.0, 3.0)
-    sigma: Floats = np.maximum(np.sqrt(square * part / (1.0 - part) * freedom / (freedom - 2.0)), MIN_SIGMA)
-    return sigma
+    return np.maximum(np.sqrt(square * part / (1.0 - part) * freedom / (freedom - 2.0)), MIN_SIGMA)
 
 
 # --- the table of stops -----------------------------------------------------------------------------------------------

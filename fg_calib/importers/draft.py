@@ -3,6 +3,8 @@
 Lines marked DECIDE hold what only the user knows.
 """
 
+from __future__ import annotations
+
 import os
 import re
 from collections.abc import Mapping, Sequence

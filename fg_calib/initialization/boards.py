@@ -145,8 +145,7 @@ def _turned_towards(direction: Floats) -> Floats:
     """The rotation that takes z to a direction ahead, shape (3, 3)."""
     angle = np.arctan2(np.linalg.norm(direction[:2]), direction[2])
     axis = np.array([-direction[1], direction[0], 0.0]) / max(float(np.linalg.norm(direction[:2])), 1e-300)
-    rotation: Floats = Rotation.from_rotvec(angle * axis).as_matrix()
-    return rotation
+    return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def _place(R: Floats, points: Floats, seen: Floats) -> Floats:

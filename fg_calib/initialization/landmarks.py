@@ -140,8 +140,7 @@ def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:
         return np.vstack([away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None], np.zeros((3, 3))])
 
     found = [leastsq(misses, start, Dfun=slopes, full_output=True, maxfev=MOST_STEPS)[0] for start in starts]
-    best: Floats = min(found, key=lambda a: float(np.sum(misses(a) ** 2)))
-    return best
+    return min(found, key=lambda a: float(np.sum(misses(a) ** 2)))
 
 
 def plane_from_distances(points: Floats, distance: Floats) -> tuple[Floats, Floats]:

@@ -1,5 +1,7 @@
 """Measurements from arrays in Python: the columns of a table, without a file."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any
 

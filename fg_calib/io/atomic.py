@@ -1,5 +1,7 @@
 """Files: read or refused in one line, and written whole or not at all."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 import stat

@@ -131,8 +131,7 @@ class Labels(FrozenArrays):
     def only_of(self, chosen: Booleans) -> Booleans:
         """Which names have rows, all of them chosen, shape (n_names,)."""
         inside, outside = (np.isin(np.arange(len(self.names)), self.index[rows]) for rows in (chosen, ~chosen))
-        only: Booleans = inside & ~outside
-        return only
+        return inside & ~outside
 
 
 @dataclass(frozen=True)
@@ -230,13 +229,11 @@ class Measurements(FrozenArrays):
 
     def value(self, name: str) -> Floats | None:
         """Measured values, by a field or a column that one instrument alone has; None where there are none."""
-        found: Floats | None = self.columns.get(name, getattr(self, name, None))
-        return found
+        return self.columns.get(name, getattr(self, name, None))
 
     def sigma(self, noise: str) -> Floats | None:
         """1 sigma by kind of noise; None where it is not specified."""
-        found: Floats | None = self.sigmas.get(noise, getattr(self, f"sigma_{noise}", None))
-        return found
+        return self.sigmas.get(noise, getattr(self, f"sigma_{noise}", None))
 
     def with_values(self, values: Mapping[str, Floats]) -> Measurements:
         """Copy with other measured values, by the names that `value` takes."""

@@ -20,6 +20,8 @@ them, nor needs to.
 What to measure next are the random configurations where the two likeliest changes move the tool most differently.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -311,8 +313,7 @@ def motion(rows: Linear, found: HypothesisTest) -> Floats:
     """
     v = all_variables(rows.robot)
     J = forward(v.chains[0].at(v.nominal()), v.robot.trig(random_configurations(rows.robot))).jacobian
-    out: Floats = (J @ (found.hypothesis.directions @ found.change)).reshape(-1, 2, 3)
-    return out
+    return (J @ (found.hypothesis.directions @ found.change)).reshape(-1, 2, 3)
 
 
 def rms_motion(motion: Floats) -> Floats:

@@ -98,8 +98,7 @@ def judged_configurations(data: Dataset) -> tuple[Integers, Literal["test", "tra
 
 def _evenly(rows: Integers) -> Integers:
     """At most `MAX_CONFIGURATIONS` rows, evenly spaced."""
-    chosen: Integers = rows[np.unique(np.linspace(0, len(rows) - 1, MAX_CONFIGURATIONS).round().astype(np.int64))]
-    return chosen
+    return rows[np.unique(np.linspace(0, len(rows) - 1, MAX_CONFIGURATIONS).round().astype(np.int64))]
 
 
 def errors_at(covariance: TangentCovariance, readings: Floats) -> tuple[PoseRms, PoseRms]:

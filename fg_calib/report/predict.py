@@ -1,5 +1,7 @@
 """Expected errors of a calibrated arm, and joint positions that correct them: for the terminal and for programs."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

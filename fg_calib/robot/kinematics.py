@@ -77,8 +77,7 @@ class Chain(Brief):
 
     def values(self, parameters: Floats) -> Floats:
         """Value of each element without its reading at parameter values as `at` takes them, shape (n_elements,)."""
-        out: Floats = self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
-        return out
+        return self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
 
     def without_columns(self) -> Chain:
         """Copy without derivatives."""

@@ -59,8 +59,7 @@ def rotation_of(yaw: float, pitch: float, roll: float) -> Floats:
     """The matrix Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3); angles in [rad]."""
     from scipy.spatial.transform import Rotation
 
-    matrix: Floats = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-    return matrix
+    return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
 
 
 def nearest_rotation(M: Floats) -> Floats:

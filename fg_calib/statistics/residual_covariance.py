@@ -152,8 +152,7 @@ class RowModel:
 
     def of_core(self, covariance: ResidualCovariance) -> Floats:
         """Derivatives of rows in the core, landmarks following it, shape (n, n_columns)."""
-        out: Floats = covariance.P[:, : len(self._follow)] @ self._follow
-        return out
+        return covariance.P[:, : len(self._follow)] @ self._follow
 
     def of_all(self, covariance: Floats) -> Floats:
         """The covariance of core and landmarks, of that of the core: shape (n_all, n_all)."""

@@ -192,8 +192,7 @@ class ResidualTable(FrozenArrays):
     @property
     def measurement_number(self) -> Integers:
         """A number for the measurement of each row, the same for all its rows, shape (n,)."""
-        number: Integers = self.block.astype(np.int64) * 2**32 + self.measurement
-        return number
+        return self.block.astype(np.int64) * 2**32 + self.measurement
 
     @cached_property
     def begins(self) -> Booleans:
@@ -237,8 +236,7 @@ class ResidualTable(FrozenArrays):
 
     def _lengths(self, rows: Integers, values: Floats) -> Floats:
         """Length of the rows of each measurement of one kind, shape (m,)."""
-        out: Floats = np.sqrt(np.add.reduceat(values[rows] ** 2, np.flatnonzero(self.begins[rows])))
-        return out
+        return np.sqrt(np.add.reduceat(values[rows] ** 2, np.flatnonzero(self.begins[rows])))
 
     def of_configurations(self, held_out: Booleans) -> tuple[Integers, Floats, dict[str, Floats]]:
         """How many rows that count each configuration takes part in, the sum of their squares, and RMS by kind.

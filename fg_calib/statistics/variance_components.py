@@ -29,6 +29,8 @@ References:
     Patterson and Thompson (1971), Recovery of inter-block information when block sizes are unequal. Biometrika 58(3).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -271,8 +273,7 @@ def _steps(found: NoiseComponents, kept: frozenset[graph.NoiseName]) -> Floats:
 def _solve(T: Floats, b: Floats) -> Floats:
     """T^-1 b, of least length where T is singular; T symmetric, scaled to a diagonal of 1."""
     by = 1.0 / np.sqrt(np.maximum(np.diag(T), TINY))
-    out: Floats = by * (np.linalg.pinv(T * by[:, None] * by, rcond=FLAT, hermitian=True) @ (by * b))
-    return out
+    return by * (np.linalg.pinv(T * by[:, None] * by, rcond=FLAT, hermitian=True) @ (by * b))
 
 
 def _scaled(problem: graph.Problem, factors: Mapping[graph.NoiseName, float]) -> graph.Problem:

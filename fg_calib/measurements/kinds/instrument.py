@@ -8,19 +8,10 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from fg_calib import measurements
 from fg_calib.initialization import FrameStart
 from fg_calib.inputs import Booleans, Floats, ProblemError
-from fg_calib.measurements import (
-    Frames,
-    Kind,
-    Labels,
-    Landmark,
-    LandmarkKind,
-    Landmarks,
-    MeasurementBlock,
-    Measurements,
-    Table,
-)
+from fg_calib.measurements import Kind, Labels, Landmark, LandmarkKind, Landmarks, MeasurementBlock, Measurements, Table
 from fg_calib.robot import Poses
 
 Blocks = Sequence[MeasurementBlock]
@@ -254,7 +245,7 @@ class Instrument:
         data = np.zeros((n, sum(sizes)))
         for kind, chosen in (each for each in kinds if each[1].any()):
             rows = np.flatnonzero(chosen)
-            at = Frames(poses.rotation[rows, None], poses.position[rows, None])
+            at = measurements.Frames(poses.rotation[rows, None], poses.position[rows, None])
             data[rows, : kind.width] = kind.predict(at, nuisances[rows, : kind.n_nuisances])
         parts = np.split(data, np.cumsum(sizes)[:-1], axis=1) if sizes else []
         return m.with_values({of.field: v.reshape(n, *of.shape) for of, v in zip(self.measured, parts, strict=True)})

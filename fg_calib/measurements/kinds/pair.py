@@ -6,32 +6,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fg_calib import measurements
 from fg_calib.initialization import FrameStart
 from fg_calib.inputs import PAIR_MODELS, Floats, ProblemError, once
-from fg_calib.measurements import (
-    Coincidence,
-    Frames,
-    Kind,
-    Labels,
-    Landmark,
-    LandmarkKind,
-    Landmarks,
-    Length,
-    MeasurementBlock,
-    Measurements,
-    Pairs,
-    Rows,
-    Table,
-    directions,
-    form_pairs,
-    no_pairs,
-    stack,
-)
+from fg_calib.measurements import Coincidence, Kind, Landmarks, Length, MeasurementBlock, Measurements, Rows, Table
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Places, Quantity
 from fg_calib.measurements.kinds.pose import ORIENTATION, POSE_COLUMNS, POSITION
 from fg_calib.robot import Poses, kernels, over_spans
 
-POINT = LandmarkKind(
+POINT = measurements.LandmarkKind(
     "L", "point", "the unknown contact points", "Contact points (in the base frame), mm", must_be_fitted=False
 )
 
@@ -85,11 +68,11 @@ class RotationAngle(Kind):
     ends, residual_dim, width = 2, 1, 1
     code = kernels.ROTATION_ANGLE
 
-    def rows(self, at: Frames, data: Floats, nuisances: Floats) -> Rows:
+    def rows(self, at: measurements.Frames, data: Floats, nuisances: Floats) -> Rows:
         """See `Kind.rows`."""
         A, B = at.rotation[:, 0], at.rotation[:, 1]
         twice = np.cross(A, B, axis=1).sum(axis=2)  # 2 k sin(angle), (n, 3)
-        sine, k = directions(twice)
+        sine, k = measurements.directions(twice)
         angle = np.arctan2(sine, np.einsum("nij,nij->n", A, B) - 1.0)
         D = np.zeros((len(k), 2, 1, 6))
         D[:, 0, 0, :3], D[:, 1, 0, :3] = -k, k
@@ -124,7 +107,7 @@ def quantities_of(model: str | None) -> list[PairQuantity]:
     return [of for of, use in zip(PAIR_QUANTITIES, wanted, strict=True) if use]
 
 
-def usable_pairs(table: Table) -> Pairs:
+def usable_pairs(table: Table) -> measurements.Pairs:
     """The pairs of a table with something to use; each measurement has its sigma.
 
     Raises:
@@ -135,11 +118,11 @@ def usable_pairs(table: Table) -> Pairs:
     if m.pairs is not None:
         pairs = m.pairs
     elif m.groups is not None and lacking:  # contact points suffice
-        pairs = no_pairs(m.source)
+        pairs = measurements.no_pairs(m.source)
     elif lacking:
         raise ProblemError(m.source, f"no columns {lacking[0].columns}", f"{lacking[0].words} for model {table.model}")
     else:
-        pairs = form_pairs(m, table.pairing)
+        pairs = measurements.form_pairs(m, table.pairing)
     measured = np.zeros(pairs.n_pairs, dtype=np.bool_)
     for of in quantities:
         there = np.isfinite(getattr(pairs, of.name))
@@ -199,7 +182,7 @@ class PairGauge(Instrument):
         there[point, 0] = False
         spans = over_spans(lambda i, j: np.all(q[pairs.a[i:j]] == q[pairs.b[i:j]], axis=1), pairs.n_pairs)
         same = np.concatenate([np.zeros(0, dtype=np.bool_), *spans])
-        for kind, chosen in ((stack(*(of.kind for of in used)), there.any(axis=1)), (SamePoint(), point)):
+        for kind, chosen in ((measurements.stack(*(of.kind for of in used)), there.any(axis=1)), (SamePoint(), point)):
             rows = np.flatnonzero(chosen)
             if not len(rows):
                 continue
@@ -246,12 +229,16 @@ def contact_blocks(table: Table, number: int, landmarks: Landmarks) -> list[Meas
     if groups is None:
         return []
     found, rows, pairs = list[MeasurementBlock](), np.flatnonzero(groups.index >= 0), groups.pairs
-    place = landmarks.add([Landmark(POINT, name, np.full(3, np.nan)) for name in groups.names], m.source)
+    place = landmarks.add([measurements.Landmark(POINT, name, np.full(3, np.nan)) for name in groups.names], m.source)
     if len(rows):
         if (sigma := m.sigma("point")) is None or not np.isfinite(sigma[rows]).all():
             raise ProblemError(m.source, "no sigma for contact points", "noise.point or a column sigma_point")
         touched = groups.index[rows]
-        fields: dict[str, Any] = {"nuisances": place[touched], "of": Labels(groups.names, touched), "source": m.source}
+        fields: dict[str, Any] = {
+            "nuisances": place[touched],
+            "of": measurements.Labels(groups.names, touched),
+            "source": m.source,
+        }
         arrays = rows, np.zeros((len(rows), 0)), sigma[rows, None]
         found.append(MeasurementBlock.of_rows(TouchedPoint(), number, *arrays, test=m.test[rows], **fields))
     if n := pairs.n_pairs:
