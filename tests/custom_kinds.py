@@ -3,9 +3,7 @@
 import numpy as np
 from simulated import small_arm, true_robot
 
-from fg_calib.measurements import Kind, Rows
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import CustomMeasurements, Table
+from fg_calib.measurements import CustomMeasurements, Kind, Measurements, Rows, Table
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -5,12 +5,9 @@ from oracle import central_differences
 from scipy.spatial.transform import Rotation
 
 from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.measurements import residuals
-from fg_calib.measurements.kind import Frames, Length
+from fg_calib.measurements import Block, Frames, Length, angle_moments, length_moments, residuals, unit_whitening
 from fg_calib.measurements.kinds.anchor import AnchorDistance
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle
-from fg_calib.measurements.moments import angle_moments, length_moments
-from fg_calib.measurements.residuals import Block, unit_whitening
 from fg_calib.robot.kinematics import forward
 
 STEP, WEIGHTS = 5e-4, np.array([45.0, -9.0, 1.0]) / 60.0

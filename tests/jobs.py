@@ -4,8 +4,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.io.robot_file import read_robot
-from fg_calib.io.tables import write_csv
+from fg_calib.io import read_robot, write_csv
 
 SIGMA = (5e-5, 1e-4)
 """1 sigma of a position, [m], and of an orientation, [rad]."""

@@ -4,10 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
-from fg_calib import Pairing
+from fg_calib import Noise, Pairing, Scenario
 from fg_calib.initialization import Camera
-from fg_calib.measurements.dataset import Noise
-from fg_calib.simulation.scenario import Errors, Instrument, Placement, RandomReadings, Scenario, Spot, board_corners
+from fg_calib.simulation.scenario import Errors, Instrument, Placement, RandomReadings, Spot, board_corners
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA = Noise(1e-4, 2e-4, 0.0, distance=1e-4, angle=2e-4, point=1e-4, pixel=0.1)

@@ -7,11 +7,9 @@ import yaml
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 
+from fg_calib import Measurements, Robot, Table
 from fg_calib.io import Units, write_csv, write_robot
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Robot
+from fg_calib.robot import pose
 from fg_calib.simulation import table_columns
 
 PAPER_A = [0, 0, 0, 5, 5, 0, 0]

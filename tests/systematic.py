@@ -6,9 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from simulated import measure, true_robot
 
-from fg_calib import Robot
-from fg_calib.graph.build import build_problem
-from fg_calib.inputs import Pairing
+from fg_calib import Pairing, Robot, build_problem
 
 QUARTER = np.pi / 2
 PLACED = (Rotation.from_rotvec([0.3, 0.2, -0.5]), np.array([1.0, 2.0, 3.0]))

@@ -9,19 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, small_arm, true_robot
 
-from fg_calib import (
-    Calibration,
-    InputError,
-    Measurements,
-    Options,
-    ProblemError,
-    assess,
-    build_problem,
-    calibrate,
-    solve,
-)
+from fg_calib import Calibration, Measurements, Options, ProblemError, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.inputs import FrozenArrays
+from fg_calib.inputs import FrozenArrays, InputError
 from fg_calib.robot import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3, "tool": 2e-3}

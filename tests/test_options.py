@@ -7,19 +7,11 @@ import numpy as np
 import pytest
 from simulated import measure, planar_robot
 
-from fg_calib import (
-    Noise,
-    Pairing,
-    SolverOptions,
-    build_problem,
-    observe_configurations,
-    observe_structure,
-    simulate,
-    solve,
-)
+from fg_calib import Noise, Pairing, SolverOptions, build_problem, simulate, solve
 from fg_calib.diagnostics import check_setup
 from fg_calib.inputs import InputError, options
 from fg_calib.io import Units, read_measurements
+from fg_calib.observability import observe_configurations, observe_structure
 from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot import pose
 from fg_calib.simulation.scenario import Errors, RandomReadings, Scenario

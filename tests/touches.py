@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from fg_calib.measurements.dataset import Groups, Measurements, Pairs, no_pairs
-from fg_calib.robot.inverse import solve_inverse
-from fg_calib.robot.kinematics import pose
+from fg_calib.measurements import Groups, Measurements, Pairs, no_pairs
+from fg_calib.robot import pose, solve_inverse
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 

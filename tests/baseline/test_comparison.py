@@ -13,13 +13,11 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
+from fg_calib import InputError, Job, Options, compare, read_job
+from fg_calib.baseline import ESTIMATORS, real_errors
 from fg_calib.baseline import comparison as comparison_module
-from fg_calib.baseline.comparison import ESTIMATORS, compare, real_errors
-from fg_calib.inputs import InputError, Options
-from fg_calib.io.job import read_job
-from fg_calib.job import Job
-from fg_calib.report.compare import comparison_document
-from fg_calib.robot.kinematics import pose
+from fg_calib.report import comparison_document
+from fg_calib.robot import pose
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
 FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0, -30.0, 2.0]))

@@ -9,16 +9,10 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
-from fg_calib.assessment import assess
+from fg_calib import InputError, Measurements, Pairing, SolverOptions, Table, assess, build_problem, solve
 from fg_calib.baseline import least_squares
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.inputs import InputError, Pairing
-from fg_calib.measurements.build import build_dataset
-from fg_calib.measurements.dataset import Measurements, Pairs, form_pairs
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib.measurements import Pairs, build_dataset, form_pairs
+from fg_calib.robot import pose, rotation_angle
 
 PAPERS = ["distance", "distance-rotation", "pose"]
 TO_THE_END = SolverOptions(decrement=1e-9)

@@ -10,8 +10,7 @@ from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import small_arm, true_robot
 
-from fg_calib.io import Units
-from fg_calib.io.robot_file import write_robot
+from fg_calib.io import Units, write_robot
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 ARM = small_arm(tolerance=TOLERANCE)

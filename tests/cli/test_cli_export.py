@@ -12,10 +12,9 @@ from month import placed, slipped
 from simulated import TOOL, measure, write_job
 from sparing import as_case
 
-from fg_calib import Calibration, calibrate, export, read_robot
+from fg_calib import Calibration, Robot, calibrate, export, read_robot
 from fg_calib.exports.dh import drawn, errors
 from fg_calib.io import read_urdf, write_robot
-from fg_calib.robot.model import Robot
 
 TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 5e-4, "theta": 5e-4, "beta": 5e-4}
 

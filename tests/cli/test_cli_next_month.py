@@ -11,8 +11,7 @@ from simulated import true_robot
 from typer.testing import CliRunner
 
 from fg_calib.cli import entry
-from fg_calib.io import read_result, write_robot
-from fg_calib.io.tables import write_csv
+from fg_calib.io import read_result, write_csv, write_robot
 
 
 def run(*words):

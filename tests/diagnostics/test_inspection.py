@@ -9,9 +9,8 @@ from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, true_robot
 
-from fg_calib import Job, Options, Robot, calibrate, simulate
+from fg_calib import Job, Options, ProblemError, Robot, calibrate, simulate
 from fg_calib.diagnostics import inspect_job
-from fg_calib.inputs import ProblemError
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker next to the robot."""

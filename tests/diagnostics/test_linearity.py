@@ -7,13 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
-from fg_calib import Measurements, Robot
-from fg_calib.assessment import assess
+from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
 from fg_calib.diagnostics import linearity, verdict
 from fg_calib.diagnostics.linearity import AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve, unsolved
-from fg_calib.inputs import Pairing
+from fg_calib.graph import unsolved
 from fg_calib.robot import pose
 
 WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}

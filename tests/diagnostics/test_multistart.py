@@ -7,17 +7,11 @@ from scipy.stats import chi2
 from simulated import small_arm, true_robot
 from touches import reach_faces
 
-from fg_calib import calibrate
-from fg_calib.assessment import assess, solve_job
+from fg_calib import Measurements, Table, assess, build_problem, calibrate, read_job, read_robot, solve
+from fg_calib.assessment import solve_job
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.graph import solver
-from fg_calib.graph.build import build_problem, problem_of
-from fg_calib.graph.solver import solve
-from fg_calib.io.job import read_job
-from fg_calib.io.robot_file import read_robot
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
+from fg_calib.graph import problem_of, solver
+from fg_calib.robot import pose
 
 ROBOT = """\
 name: pointer

@@ -10,14 +10,12 @@ from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
-from fg_calib.assessment import assess, solve_job
+from fg_calib import SolverError, assess, build_problem, read_job, solve
+from fg_calib.assessment import solve_job
 from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
 from fg_calib.graph import solver
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, SolverError
-from fg_calib.io.job import read_job
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS
 
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker next to the robot."""

@@ -9,11 +9,9 @@ from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, true_robot
 from sparing import diagonal
 
+from fg_calib import Table, build_problem, solve
 from fg_calib.diagnostics.setup_check import OTHER_TOOL, check_problem
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Pairs
-from fg_calib.measurements.table import Table
+from fg_calib.measurements import Pairs
 
 TOLERANCE = {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.05, "beta": 0.05, "tool": 0.001}
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))

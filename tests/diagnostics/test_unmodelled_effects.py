@@ -10,21 +10,11 @@ from scipy.stats import binom, kstest
 from simulated import measure, plus, small_arm, true_robot
 from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
 
-from fg_calib import calibrate
-from fg_calib.assessment import assess
-from fg_calib.diagnostics.unmodelled_effects import (
-    LIKE_NOISE,
-    find_change,
-    find_systematic,
-    forgotten_offsets,
-    regress,
-)
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.graph.variables import prior_rows
-from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.covariance import spread_of
-from fg_calib.statistics.variance_components import estimate_noise
+from fg_calib import assess, build_problem, calibrate, solve
+from fg_calib.diagnostics.unmodelled_effects import LIKE_NOISE, find_change, find_systematic, forgotten_offsets, regress
+from fg_calib.graph import prior_rows
+from fg_calib.robot import pose
+from fg_calib.statistics import estimate_noise, spread_of
 
 
 def gravity(true, q):

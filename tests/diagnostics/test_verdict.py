@@ -9,15 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, plus, small_arm, true_robot
 
-from fg_calib.assessment import assess
-from fg_calib.diagnostics.setup_check import SetupCheck
+from fg_calib import assess, build_problem, solve
+from fg_calib.diagnostics import SetupCheck
 from fg_calib.diagnostics.unmodelled_effects import Change, Systematic
 from fg_calib.diagnostics.verdict import Case, check_chi_square
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.goodness_of_fit import ChiSquare, GrossErrors
-from fg_calib.statistics.variance_components import estimate_noise
+from fg_calib.robot import pose
+from fg_calib.statistics import ChiSquare, GrossErrors, estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 FRAME = (Rotation.from_rotvec([0.3, 0.2, -0.5]), np.array([1.0, 2.0, 3.0]))

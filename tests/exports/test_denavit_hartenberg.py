@@ -6,17 +6,7 @@ from exported import matrix
 from scipy.spatial.transform import Rotation
 
 from fg_calib import Robot
-from fg_calib.exports.dh import (
-    FARTHEST,
-    PARALLEL,
-    common_normal,
-    drawn,
-    errors,
-    in_table,
-    left_over,
-    plane_crossing,
-    row_transform,
-)
+from fg_calib.exports import dh
 from fg_calib.robot.model import CONVENTIONS
 
 EXACT = 1e-9
@@ -34,12 +24,12 @@ def lines(M):
 def test_a_and_alpha_are_distance_and_angle_of_the_axes(seed):
     rng = np.random.default_rng(seed)
     M = matrix(Rotation.random(random_state=seed).as_matrix(), rng.uniform(-1, 1, 3))
-    row = common_normal(M)
+    row = dh.common_normal(M)
     distance, angle = lines(M)
     assert abs(row["a"]) == pytest.approx(distance)
     assert abs(row["alpha"]) == pytest.approx(angle)
     assert abs(row["theta"]) <= np.pi / 2 + 1e-9
-    rest = left_over(M, row)  # a turn about z and a shift along it
+    rest = dh.left_over(M, row)  # a turn about z and a shift along it
     assert rest[2] == pytest.approx([0, 0, 1, rest[2, 3]], abs=1e-12)
     assert rest[:2, 3] == pytest.approx([0, 0], abs=1e-12)
 
@@ -49,8 +39,8 @@ def test_hayatis_row_ends_on_the_next_axis_within_the_plane_of_the_frame(seed):
     rng = np.random.default_rng(seed)
     R = Rotation.from_rotvec([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-3, 3)]).as_matrix()
     M = matrix(R @ np.diag([1, -1, -1]) if seed % 2 else R, rng.uniform(-1, 1, 3))
-    row = plane_crossing(M)
-    at = row_transform("dh-hayati", row)
+    row = dh.plane_crossing(M)
+    at = dh.row_transform("dh-hayati", row)
     assert at[2, 3] == 0.0
     assert np.cross(at[:3, 3] - M[:3, 3], M[:3, 2]) == pytest.approx(np.zeros(3), abs=1e-12)
     assert at[:3, 2] == pytest.approx(M[:3, 2], abs=1e-12)
@@ -74,11 +64,11 @@ def test_nearly_parallel_axes_have_the_table_that_is_claimed(convention, tilt):
     said = 0
     for case in CASES:
         robot = nearly(tilt, *case)
-        table = in_table(robot, convention)
-        q = drawn(robot, 20, 0)
-        error = errors(table.robot, robot, q)
+        table = dh.in_table(robot, convention)
+        q = dh.drawn(robot, 20, 0)
+        error = dh.errors(table.robot, robot, q)
         lengths = [abs(p.nominal) for p in table.robot.parameters if p.kind in ("a", "d")]
-        assert max(lengths) <= (FARTHEST + 1) * robot.reach
+        assert max(lengths) <= (dh.FARTHEST + 1) * robot.reach
         if table.nearly:
             said += 1
             (one,) = table.nearly
@@ -88,7 +78,7 @@ def test_nearly_parallel_axes_have_the_table_that_is_claimed(convention, tilt):
             assert error.position_max <= 2.0 * tilt * robot.reach + EXACT
         else:
             assert max(error.position_max, error.rotation_max) < EXACT, case
-    assert (said == 0) == (convention == "dh-hayati" or tilt <= PARALLEL)
+    assert (said == 0) == (convention == "dh-hayati" or tilt <= dh.PARALLEL)
 
 
 @pytest.mark.sampled(8)
@@ -99,10 +89,10 @@ def test_there_and_back_is_the_same_arm(there, back):
     rows = rng.uniform(-1, 1, (5, 5 if "hayati" in there else 4))
     types = ["revolute", "prismatic", "revolute", "prismatic", "revolute"]
     robot = Robot.from_dh(rows, there, types=types, tool=rng.uniform(-1, 1, 6), base=rng.uniform(-1, 1, 6))
-    other = in_table(robot, back).robot
-    again = in_table(other, "dh").robot
-    q = drawn(robot, 1000, 0)
+    other = dh.in_table(robot, back).robot
+    again = dh.in_table(other, "dh").robot
+    q = dh.drawn(robot, 1000, 0)
     for found in (other, again):
         assert found.joints == robot.joints
-        error = errors(found, robot, q)
+        error = dh.errors(found, robot, q)
         assert max(error.position_max, error.rotation_max) < EXACT

@@ -7,13 +7,9 @@ import numpy as np
 import pytest
 from simulated import TOOL, measure, small_arm, true_robot
 
+from fg_calib import DistanceFactor, InputError, ProblemError, RotationAngleFactor, SolverError, build_problem, solve
 from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError, ProblemError, SolverError
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib.robot import pose, rotation_angle
 
 TOLERANCE = dict.fromkeys(("a", "d", "theta", "alpha", "tool"), 1e-3)
 TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}

@@ -9,14 +9,9 @@ from custom_kinds import ANCHORS, SIGMA, AnchorDistance, lengths_to_anchors
 from reported import format_report, result_document
 from simulated import measure
 
-from fg_calib import Calibration, calibrate
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import InputError
+from fg_calib import Calibration, CustomMeasurements, InputError, Table, assess, build_problem, calibrate, solve
 from fg_calib.measurements import Kind, Rows
 from fg_calib.measurements.kinds.pair import Distance
-from fg_calib.measurements.table import CustomMeasurements, Table
 from fg_calib.observability.reasons import NOT_EXCITED
 from fg_calib.robot.kinematics import pose
 

@@ -8,13 +8,10 @@ from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.monitoring.prior_information import knowledge_of
-from fg_calib.robot.kinematics import pose
-from fg_calib.statistics.covariance import Spread
+from fg_calib import Measurements, assess, build_problem, solve
+from fg_calib.monitoring import knowledge_of
+from fg_calib.robot import pose
+from fg_calib.statistics import Spread
 
 TOLERANCE = {"a": 1e-3, "d": 2e-3, "alpha": 1e-3, "theta": 1.5e-3, "tool": 2e-3}
 TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}

@@ -10,13 +10,7 @@ from simulated import measure, paper_robot, small_arm, true_robot
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, reach, touch
 
-from fg_calib import calibrate
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import Pairing
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import KnownPoint, Table
+from fg_calib import KnownPoint, Measurements, Pairing, Table, assess, build_problem, calibrate, solve
 from fg_calib.robot.kinematics import pose
 
 TOLERANCE = dict.fromkeys(("a", "d", "alpha", "theta"), 2e-3)

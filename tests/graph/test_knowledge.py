@@ -8,8 +8,7 @@ from instruments import measured_by
 from oracle import central_differences
 from simulated import TOOL, small_arm
 
-from fg_calib import calibrate
-from fg_calib.graph.build import build_problem
+from fg_calib import build_problem, calibrate
 from fg_calib.graph.knowledge import Knowledge
 
 UNKNOWNS = [("A", "a0"), ("A", "a1")]

@@ -12,15 +12,10 @@ from simulated import small_arm, true_robot, write_job
 from sparing import diagonal
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
-from fg_calib.assessment import assess
-from fg_calib.calibration import calibrate
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.inputs import ProblemError
+from fg_calib import KnownPoint, Noise, ProblemError, SolverOptions, Table, assess, build_problem, calibrate, solve
 from fg_calib.io.tables import read_measurements
-from fg_calib.measurements.dataset import Groups, Measurements, Noise, Pairs, no_pairs
-from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.robot.kinematics import pose
+from fg_calib.measurements.dataset import Groups, Measurements, Pairs, no_pairs
+from fg_calib.robot import pose
 from fg_calib.statistics.residual_table import residual_table
 
 RIGID = ("a1", "alpha1", "d1", "theta1")

@@ -7,12 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import measure, small_arm, true_robot
 
-from fg_calib import InputError, Measurements, Pairing, Table, assess, solve
-from fg_calib.graph import solver
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.noise_models import whitening_of
-from fg_calib.graph.problem import relinearized_at, subsampled
-from fg_calib.robot.kinematics import pose
+from fg_calib import InputError, Measurements, Pairing, Table, assess, build_problem, solve
+from fg_calib.graph import relinearized_at, solver, subsampled, whitening_of
+from fg_calib.robot import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 

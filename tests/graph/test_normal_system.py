@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import scipy.sparse
 
-from fg_calib.graph import error_states
+from fg_calib import SolverError
+from fg_calib.graph import NormalSystem, determined, eliminate, error_states
 from fg_calib.graph.error_states import SchurComplement
-from fg_calib.graph.normal_system import NormalSystem, determined, eliminate
-from fg_calib.inputs import SolverError
 
 WIDTH, H, N_CORE, N_LANDMARKS = 3, 2, 6, 4
 

@@ -14,16 +14,10 @@ from simulated import TOOL, measure, small_arm, true_robot
 from sparing import as_case
 from touches import TOOL_POINT, corners, touch
 
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.factors import DistanceFactor, RotationAngleFactor
-from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import joint_errors, relinearized_at
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import Pairing
-from fg_calib.measurements.dataset import Pairs
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib import DistanceFactor, Pairing, RotationAngleFactor, Table, build_problem, solve
+from fg_calib.graph import JOINT_NOISE, joint_errors, relinearized_at
+from fg_calib.measurements import Pairs
+from fg_calib.robot import pose, rotation_angle
 
 TOLERANCE = dict.fromkeys(("a", "d", "alpha", "theta", "tool"), 2e-3)
 TOLERANCE |= {f"tool.{k}": 3e-3 for k in ("roll", "pitch", "yaw")}

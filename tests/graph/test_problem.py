@@ -7,12 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
-from fg_calib.graph.build import build_problem
+from fg_calib import Measurements, Pairing, ProblemError, build_problem, solve
 from fg_calib.graph.problem import named_rows
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import Pairing, ProblemError
-from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.robot.kinematics import build_chain, pose
+from fg_calib.measurements import Pairs
+from fg_calib.robot import build_chain, pose
 
 
 def direct_pairs(distance, angle, sigma=(1e-3, 1e-3), test=None):

@@ -9,11 +9,9 @@ from dense import SeriesRows, dense, priors
 from simulated import measure, plus, small_arm, true_robot
 from sparing import diagonal
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import relinearized_at
-from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, cost, effect, tuning, weight
-from fg_calib.graph.solver import solve
+from fg_calib import assess, build_problem, solve
+from fg_calib.graph import effect, relinearized_at, tuning, weight
+from fg_calib.graph.robust import EFFICIENCY, HALF_WEIGHT, Weighting, cost
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 SMOOTH = ("huber", "cauchy", "geman-mcclure")

@@ -12,14 +12,10 @@ from scipy.spatial.transform import Rotation
 from simulated import measure, paper_robot, small_arm, true_robot
 from touches import corners, touch
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import ProblemError
+from fg_calib import ProblemError, Table, assess, build_problem, solve
 from fg_calib.io import Units, write_csv, write_robot
-from fg_calib.measurements.dataset import Groups, Pairs, no_pairs
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
+from fg_calib.measurements import Groups, Pairs, no_pairs
+from fg_calib.robot import pose
 from fg_calib.simulation import table_columns
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -13,18 +13,10 @@ from sparing import diagonal
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, touch
 
-from fg_calib.assessment import assess
-from fg_calib.graph import solver
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import SolverOptions, solve
-from fg_calib.inputs import InputError, Pairing, SolverError
-from fg_calib.io.robot_file import read_robot
-from fg_calib.io.tables import read_measurements
-from fg_calib.measurements.dataset import Noise
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Robot
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib import InputError, Noise, Pairing, Robot, SolverError, SolverOptions, Table, assess, read_robot, solve
+from fg_calib.graph import build_problem, solver
+from fg_calib.io import read_measurements
+from fg_calib.robot import pose, rotation_angle
 
 TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 1e-3, "theta": 1e-3, "beta": 1e-3}
 FRAME = (Rotation.from_rotvec(np.pi * np.array([0.0, 0.6, 0.8])), np.array([7.0, -30.0, 2.0]))

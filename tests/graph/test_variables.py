@@ -9,13 +9,10 @@ from oracle import central_differences
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
+from fg_calib import ProblemError, SolverError, assess, build_problem, solve
+from fg_calib.graph import build_variables, corrections_of, frame_of, pose_of, prior_rows
 from fg_calib.graph.factors import CheckedFactor
-from fg_calib.graph.solver import solve
-from fg_calib.graph.variables import build_variables, corrections_of, frame_of, pose_of, prior_rows
-from fg_calib.inputs import ProblemError, SolverError
-from fg_calib.robot.kinematics import forward
+from fg_calib.robot import forward
 
 BASE = [name.replace("tool", "base") for name in TOOL]
 KINDS = ("x", "y", "z", "yaw", "pitch", "roll")

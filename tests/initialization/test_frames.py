@@ -5,14 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
-from fg_calib.initialization.hand_eye import (
-    Frame,
-    Unknown,
-    _frame_rotations,
-    start_from_distances,
-    start_from_most_poses,
-    start_from_poses,
-)
+from fg_calib.initialization import Frame, hand_eye
+from fg_calib.initialization.hand_eye import Unknown, start_from_distances, start_from_most_poses, start_from_poses
 
 ALL = np.ones(3, dtype=bool)
 IDENTITY = Frame(np.eye(3), np.zeros(3))
@@ -62,7 +56,7 @@ def test_without_noise_every_candidate_is_the_frames_rotation():
     """The linear one is that of an unknown tool point; about the means the point is taken to be known."""
     flange, T = flange_poses(), Frame(np.eye(3), np.array([0.3, -0.2, 0.9]))
     position, unknown = measured(flange, FAR[2], T)[1], Unknown(True, False, ALL)
-    found = _frame_rotations(*flange, position, T.translation, unknown)
+    found = hand_eye._frame_rotations(*flange, position, T.translation, unknown)
     assert [rotation == pytest.approx(FAR[2].rotation, abs=rounding(1, 100)) for rotation in found] == [True] * 3
 
 

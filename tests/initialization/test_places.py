@@ -4,13 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fg_calib.initialization.hand_eye import Frame
-from fg_calib.initialization.landmarks import (
-    anchors_from_lengths,
-    offset_from_lengths,
-    plane_from_distances,
-    targets_from_positions,
-)
+from fg_calib.initialization import Frame, anchors_from_lengths
+from fg_calib.initialization.landmarks import offset_from_lengths, plane_from_distances, targets_from_positions
 
 SIGMA = 1e-3
 ORIGIN = Frame(np.eye(3), np.zeros(3))

@@ -6,12 +6,8 @@ import yaml
 from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
 
-from fg_calib.calibration import calibrate, calibrate_job
-from fg_calib.inputs import InputError
-from fg_calib.io.job import read_camera, read_job
-from fg_calib.io.robot_file import write_robot
-from fg_calib.io.tables import read_measurements, write_csv
-from fg_calib.measurements.dataset import Noise
+from fg_calib import InputError, Noise, calibrate, calibrate_job, read_job
+from fg_calib.io import read_camera, read_measurements, write_csv, write_robot
 from fg_calib.measurements.kinds.board import COVARIANCE
 
 INTRINSICS = {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2")}

@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from fg_calib.inputs import InputError, Options, Pairing
-from fg_calib.io.job import read_job
+from fg_calib import InputError, Options, Pairing, read_job
 
 ROBOT = """\
 convention: mdh

@@ -8,10 +8,9 @@ import pytest
 from oracle import dh_joint, frame, tool_pose
 from tolerances import rounding
 
-from fg_calib.inputs import InputError
-from fg_calib.io import Units
-from fg_calib.io.robot_file import read_robot, write_robot
-from fg_calib.robot.model import CONVENTIONS, Axis, Element, Joint, Robot, RobotBuilder
+from fg_calib import InputError, Robot, read_robot
+from fg_calib.io import Units, write_robot
+from fg_calib.robot import CONVENTIONS, Axis, Element, Joint, RobotBuilder
 
 GOOD = """\
 name: two

@@ -8,11 +8,9 @@ import pytest
 from oracle import frame
 from tolerances import rounding
 
-from fg_calib.inputs import InputError
-from fg_calib.io import Units
-from fg_calib.io.tables import Column, read_measurements
-from fg_calib.measurements.dataset import Noise
-from fg_calib.robot.model import Joint, RobotBuilder
+from fg_calib import InputError, Noise
+from fg_calib.io import Column, Units, read_measurements
+from fg_calib.robot import Joint, RobotBuilder
 
 LIMIT = 2.09
 

@@ -6,8 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Measurements, Noise, Options, Robot
-from fg_calib.io import Units, read_measurements
-from fg_calib.io.tables import write_csv
+from fg_calib.io import Units, read_measurements, write_csv
 from fg_calib.measurements.dataset import check_readings
 
 RNG = np.random.default_rng(3)

@@ -10,7 +10,7 @@ from sparing import diagonal
 from tolerances import rounding
 
 from fg_calib.initialization import Camera
-from fg_calib.measurements import Frames, LandmarkKind, check_rows, residuals
+from fg_calib.measurements import Block, Frames, LandmarkKind, check_rows, pack, residuals, unit_whitening, unpack
 from fg_calib.measurements.kind import Stacked
 from fg_calib.measurements.kinds.anchor import AnchorContact, AnchorDistance
 from fg_calib.measurements.kinds.board import BoardPose
@@ -18,9 +18,7 @@ from fg_calib.measurements.kinds.pair import Distance, PointDistance, RotationAn
 from fg_calib.measurements.kinds.pixel import Pixel, RoomPixel
 from fg_calib.measurements.kinds.plane import PlaneDistance
 from fg_calib.measurements.kinds.pose import Orientation, Position, TargetPosition
-from fg_calib.measurements.residuals import Block, pack, unit_whitening, unpack
-from fg_calib.robot.kernels import LANES
-from fg_calib.robot.kinematics import build_chain
+from fg_calib.robot import LANES, build_chain
 
 CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]
 COMPILED = [

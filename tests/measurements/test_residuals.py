@@ -8,12 +8,10 @@ from oracle import random_robot, tool_pose
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
-from fg_calib.measurements import residuals, stack
+from fg_calib.measurements import Block, pack, residuals, stack
 from fg_calib.measurements.kinds.pair import Distance, RotationAngle
 from fg_calib.measurements.kinds.pose import Orientation
-from fg_calib.measurements.residuals import Block, pack
-from fg_calib.robot.kernels import LANES
-from fg_calib.robot.kinematics import SPAN, build_chain
+from fg_calib.robot import LANES, SPAN, build_chain
 
 
 def random_pairs(n, rng):

@@ -10,8 +10,7 @@ from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, slipped
 from scipy import stats
 from simulated import true_robot
 
-from fg_calib import Measurements, Robot, Table, calibrate
-from fg_calib.inputs import InputError
+from fg_calib import InputError, Measurements, Robot, Table, calibrate
 from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 from simulated import measure, small_arm
 
-from fg_calib.inputs import Pairing
-from fg_calib.measurements.dataset import form_pairs
-from fg_calib.measurements.table import Table
+from fg_calib import Pairing, Table
+from fg_calib.measurements import form_pairs
 from fg_calib.monitoring.prior_information import MAX_FINGERPRINTS, counted_before, fingerprints
 
 ARM = small_arm()

@@ -6,8 +6,7 @@ from scenarios import SIGMA, TOLERANCE
 from scipy import stats
 from simulated import small_arm
 
-from fg_calib import calibrate
-from fg_calib.measurements.dataset import Noise
+from fg_calib import Noise, calibrate
 from fg_calib.simulation.scenario import Errors
 
 FEW = ("anchors", "stations", "offset")

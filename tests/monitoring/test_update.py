@@ -7,8 +7,7 @@ import pytest
 from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
-from fg_calib import Measurements, Table, calibrate
-from fg_calib.inputs import InputError
+from fg_calib import InputError, Measurements, Table, calibrate
 from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 

@@ -7,13 +7,10 @@ import pytest
 from instruments import TARGETS, measured_by
 from touches import corners, touch
 
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.problem import named_triangle
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.observability.identifiability import identifiability_of
-from fg_calib.observability.reasons import BASE, NO_CAUSE, NOT_EXCITED, find_confounding
-from fg_calib.robot.model import Robot
+from fg_calib import KnownPoint, Measurements, Robot, Table, build_problem
+from fg_calib.graph import named_triangle
+from fg_calib.observability import NOT_EXCITED, identifiability_of
+from fg_calib.observability.reasons import BASE, NO_CAUSE, find_confounding
 
 TARGETS_DO = "confounded with the unknown places of the targets on the tool"
 

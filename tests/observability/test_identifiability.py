@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from simulated import measure, paper_robot
 
-from fg_calib.observability.identifiability import observe_configurations, observe_structure
+from fg_calib import Robot, observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
-from fg_calib.robot.model import Robot
 
 MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")
 OFF_AXIS = {"x": 0.1, "y": 0.05, "z": 0.2, "roll": 0.3}

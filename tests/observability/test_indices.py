@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from simulated import measure, paper_robot
 
-from fg_calib.graph.build import build_problem
-from fg_calib.inputs import Pairing
+from fg_calib import Pairing, build_problem
 from fg_calib.observability.identifiability import observability_of
 from fg_calib.observability.indices import RelativeGroup, _chained, observability_indices, observability_of_rows
-from fg_calib.robot.model import Parameter
+from fg_calib.robot import Parameter
 
 # Ranks and groups recomputed independently for Jia et al. (2019), Tables 3 and 4 and the other four measurements.
 BASE_FREE = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]

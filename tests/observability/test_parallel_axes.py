@@ -7,12 +7,9 @@ import pytest
 from jobs import UR5E, ur5e
 from simulated import measure, small_arm, true_robot
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.io.robot_file import read_robot
-from fg_calib.observability.parallel_axes import missing_motions
-from fg_calib.robot.model import Axis, Robot
+from fg_calib import Robot, assess, build_problem, read_robot, solve
+from fg_calib.observability import missing_motions
+from fg_calib.robot import Axis
 
 QUARTER, SIGMA = np.pi / 2, (5e-5, 1e-4)
 TILT, SHIFT = (Axis.RY,), (Axis.TY,)

@@ -5,13 +5,10 @@ import pytest
 from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib import InputError, build_problem, calibrate, predict, solve
-from fg_calib.prediction import workspace
-from fg_calib.prediction.tool_pose import ToolPoseUncertainty, errors_at
-from fg_calib.prediction.workspace import predict_errors, summed_up
+from fg_calib import InputError, Robot, build_problem, calibrate, predict, solve
+from fg_calib.prediction import ToolPoseUncertainty, errors_at, predict_errors, summed_up, workspace
 from fg_calib.robot import pose
-from fg_calib.robot.model import Robot
-from fg_calib.statistics.covariance import spread_of
+from fg_calib.statistics import spread_of
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
 JOINTS = np.array([1e-4, 2e-4, 5e-5, 3e-4])

@@ -11,8 +11,7 @@ from simulated import small_arm
 from fg_calib import Robot
 from fg_calib.prediction import correction
 from fg_calib.prediction.correction import reach
-from fg_calib.robot import pose
-from fg_calib.robot.inverse import REACHED, random_readings
+from fg_calib.robot import REACHED, pose, random_readings
 
 NEAR = np.array([0.3, -0.4, 0.1, 0.5])
 

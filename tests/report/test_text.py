@@ -7,8 +7,7 @@ import numpy as np
 from reported import format_report
 from simulated import measure, planar_robot, plus, small_arm, true_robot
 
-from fg_calib import Measurements, Pairing, assess, build_problem, solve
-from fg_calib.robot.model import Robot
+from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
 
 
 def planar_arm(tolerance=None) -> Robot:

@@ -6,10 +6,9 @@ from oracle import random_robot, tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
-from fg_calib.inputs import InputError
-from fg_calib.robot.inverse import REACHED, _Search, random_readings, solve_inverse
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import CONVENTIONS, Robot
+from fg_calib import InputError, Robot
+from fg_calib.robot import CONVENTIONS, REACHED, pose, random_readings, solve_inverse
+from fg_calib.robot.inverse import _Search
 
 
 def poses_of(robot, q):

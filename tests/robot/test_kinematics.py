@@ -10,9 +10,8 @@ from simulated import planar_robot
 from sparing import diagonal
 from tolerances import rounding
 
-from fg_calib.robot.kernels import LANES
-from fg_calib.robot.kinematics import SPAN, build_chain, forward, pose
-from fg_calib.robot.model import BASES, CONVENTIONS, Axis, Basis, Element, Joint, Parameter, RobotBuilder
+from fg_calib.robot import CONVENTIONS, LANES, SPAN, Axis, Parameter, build_chain, forward, pose
+from fg_calib.robot.model import BASES, Basis, Element, Joint, RobotBuilder
 
 CASES = [(c, n) for c in [*CONVENTIONS, "urdf"] for n in (1, 2, 3, 6, 7, 12)]
 

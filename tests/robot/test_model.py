@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Robot, read_robot
 from fg_calib.io import read_urdf, write_robot
-from fg_calib.robot import pose
-from fg_calib.robot.model import CONVENTIONS, RobotBuilder
+from fg_calib.robot import CONVENTIONS, RobotBuilder, pose
 
 ROWS = [[0.0, -1.5, 0.34, 0.1, 0.01], [0.6, 0.0, 0.02, -0.2, 0.02], [0.1, 1.2, 0.0, 0.3, -0.03]]  # a alpha d theta beta
 

@@ -5,15 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tolerances import rounding
 
-from fg_calib.robot.rotations import (
-    inverse_right_jacobian,
-    left_jacobian,
-    nearest_rotation,
-    rotation_angle,
-    rotation_of,
-    rotation_vector,
-    yaw_pitch_roll,
-)
+from fg_calib.robot import left_jacobian, nearest_rotation, rotation_angle, rotation_of, rotation_vector, yaw_pitch_roll
+from fg_calib.robot.rotations import inverse_right_jacobian
 
 RNG = np.random.default_rng(0)
 

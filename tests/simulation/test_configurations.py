@@ -8,11 +8,10 @@ import pytest
 from oracle import tool_pose
 from simulated import paper_robot, planar_robot, small_arm
 
-from fg_calib.robot.inverse import REACHED, random_readings
-from fg_calib.robot.model import Robot
-from fg_calib.simulation.obstacles import enters, link_points
-from fg_calib.simulation.scenario import BoardViews, Box, GivenReadings, Placement, TargetViews
-from fg_calib.simulation.views import draw_candidates, number_of
+from fg_calib.robot import REACHED, Robot, random_readings
+from fg_calib.simulation import BoardViews, Box, GivenReadings, Placement, TargetViews, draw_candidates, link_points
+from fg_calib.simulation.obstacles import enters
+from fg_calib.simulation.views import number_of
 
 LIMIT = np.deg2rad(170.0)
 ARM = Robot.from_dh(

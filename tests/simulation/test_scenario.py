@@ -8,8 +8,7 @@ import yaml
 from simulated import paper_robot
 from tolerances import rounding
 
-from fg_calib import Noise, Pairing, simulate
-from fg_calib.inputs import InputError
+from fg_calib import InputError, Noise, Pairing, simulate
 from fg_calib.simulation import RandomReadings, Spot, read_scenario, write_simulation
 
 ROBOT = """\

@@ -16,23 +16,10 @@ from scipy.spatial.transform import Rotation
 from simulated import planar_robot
 from tolerances import rounding
 
-from fg_calib.inputs import InputError
-from fg_calib.io.job import read_job
-from fg_calib.measurements.dataset import Noise
-from fg_calib.robot.model import Robot
-from fg_calib.simulation.scenario import (
-    BoardViews,
-    Box,
-    Errors,
-    GivenReadings,
-    Placement,
-    RandomReadings,
-    Scenario,
-    read_scenario,
-)
-from fg_calib.simulation.simulator import simulate
+from fg_calib import InputError, Noise, Robot, Scenario, read_job, simulate
+from fg_calib.simulation import Box, Errors, GivenReadings, Placement, RandomReadings, read_scenario, write_simulation
+from fg_calib.simulation.scenario import BoardViews
 from fg_calib.simulation.views import view_board
-from fg_calib.simulation.write import write_simulation
 
 FILES = ("calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml")
 BOARD = np.array([0.0, 6.5, 2.55])

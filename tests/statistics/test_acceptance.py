@@ -8,8 +8,7 @@ import pytest
 from instruments import measured_by
 from simulated import measure, small_arm, true_robot, write_job
 
-from fg_calib import InputError, calibrate
-from fg_calib.inputs import Limits, Options
+from fg_calib import InputError, Limits, Options, calibrate
 
 TOOL = ("tool.x", "tool.y", "tool.z")
 

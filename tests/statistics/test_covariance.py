@@ -8,14 +8,9 @@ from scipy.stats import chi2, kstest
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.normal_system import SIGNAL_FLOOR
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import Pairing
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.model import Robot
+from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
+from fg_calib.graph import SIGNAL_FLOOR
+from fg_calib.robot import pose
 from fg_calib.statistics.covariance import held_frames
 from fg_calib.statistics.goodness_of_fit import chi2_bounds
 

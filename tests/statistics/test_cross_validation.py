@@ -8,10 +8,9 @@ from instruments import measured_by
 from simulated import measure, small_arm, true_robot
 from touches import corners, touch
 
-from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, calibrate
+from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, Table, calibrate
 from fg_calib.assessment import solve_job
 from fg_calib.measurements.kinds.pose import Position
-from fg_calib.measurements.table import Table
 from fg_calib.statistics.cross_validation import _train_tables, wide
 from fg_calib.statistics.cross_validation import cross_validate as cross_validate_with
 

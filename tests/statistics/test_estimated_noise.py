@@ -10,15 +10,9 @@ from simulated import measure, small_arm, true_robot
 from sparing import as_case
 from touches import reach, reach_faces
 
-from fg_calib.assessment import assess
-from fg_calib.calibration import calibrate
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import relinearized_at
-from fg_calib.graph.solver import solve
-from fg_calib.measurements.dataset import Measurements
-from fg_calib.measurements.table import KnownPoint, Table
-from fg_calib.robot.kinematics import pose
+from fg_calib import KnownPoint, Measurements, Table, assess, build_problem, calibrate, solve
+from fg_calib.graph import JOINT_NOISE, relinearized_at
+from fg_calib.robot import pose
 
 SIGMA = 1e-4
 TOUCHED = ("faces", "contacts")

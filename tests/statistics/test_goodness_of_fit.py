@@ -9,20 +9,13 @@ from scipy.stats import kstest
 from simulated import measure, plus, small_arm, true_robot
 from touches import SIGMA, TOOL_POINT, corners, touch
 
-from fg_calib import calibrate
-from fg_calib.assessment import assess
+from fg_calib import Pairing, Table, assess, build_problem, calibrate, solve
+from fg_calib.graph import NoiseState
 from fg_calib.graph import problem as problem_module
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.noise_models import NoiseState
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import Pairing
-from fg_calib.measurements.dataset import Pairs
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
-from fg_calib.robot.rotations import rotation_angle
+from fg_calib.measurements import Pairs
+from fg_calib.robot import pose, rotation_angle
+from fg_calib.statistics import FLAGS, KindFit, estimate_noise
 from fg_calib.statistics import variance_components as noise
-from fg_calib.statistics.goodness_of_fit import FLAGS, KindFit
-from fg_calib.statistics.variance_components import estimate_noise
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 

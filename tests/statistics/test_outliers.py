@@ -10,10 +10,7 @@ from simulated import measure, plus, small_arm, true_robot
 from sparing import diagonal
 from systematic import measured, of_joint, problem_of
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.inputs import Pairing
+from fg_calib import Pairing, assess, build_problem, solve
 from fg_calib.statistics.outliers import _names
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}

@@ -10,25 +10,12 @@ from scipy.stats import chi2, multivariate_normal, norm
 from simulated import TOOL, measure, small_arm, true_robot
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
-from fg_calib.assessment import assess
-from fg_calib.graph import square_root, unknown_prior_rows
-from fg_calib.graph.build import FIRST_TOLERANCE, build_problem
-from fg_calib.graph.solver import solve
-from fg_calib.graph.variables import prior_rows
-from fg_calib.inputs import InputError, Options
-from fg_calib.statistics.covariance import spread_of
-from fg_calib.statistics.priors import (
-    COMMON_SIGMA,
-    GROUP_SIGMA,
-    Corrections,
-    ScalePosterior,
-    _beyond,
-    _corrections,
-    _judged_rows,
-    estimate_tolerances,
-    fit_scales,
-)
-from fg_calib.statistics.variance_components import estimate_noise
+from fg_calib import InputError, Options, assess, build_problem, solve
+from fg_calib.graph import prior_rows, square_root, unknown_prior_rows
+from fg_calib.graph.build import FIRST_TOLERANCE
+from fg_calib.statistics import estimate_noise, estimate_tolerances, spread_of
+from fg_calib.statistics import priors as priors_module
+from fg_calib.statistics.priors import COMMON_SIGMA, GROUP_SIGMA, Corrections, ScalePosterior, fit_scales
 
 GROUP = np.array([0, 0, 0, 1, 1, 2])
 
@@ -253,32 +240,34 @@ def test_corrections_of_parameters_and_places_covary_as_the_information_on_both_
     P = np.pad(P, ((0, 0), (0, v.n_nuisance)))
     H = rows.T @ rows + P.T @ P  # the rows of places are among the others
     every = np.vstack([P, unknown_prior_rows(v, x)[1]])
-    A = _judged_rows(solution, spread_of(solution))[2]
+    A = priors_module._judged_rows(solution, spread_of(solution))[2]
     np.testing.assert_allclose(A, np.eye(len(every)) - every @ np.linalg.solve(H, every.T), atol=1e-7)
 
 
 def test_a_correction_beyond_its_prior_is_named_and_what_follows_it_is_not():
     """The second is 9 sigma off because the first is 10: without that prior it is met."""
     A = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 0.25]])
-    found = list(_beyond(("a", "b", "c"), np.array([10.0, 9.0, 2.5]), A, 3))
+    found = list(priors_module._beyond(("a", "b", "c"), np.array([10.0, 9.0, 2.5]), A, 3))
     assert [(one.name, one.z, one.is_place) for one in found] == [("a", 10.0, False), ("c", 2.5, False)]
     assert found[1].sigma == 0.5
-    assert not list(_beyond(("a", "b", "c"), np.array([2.5, 2.5, 1.0]), A, 3))
+    assert not list(priors_module._beyond(("a", "b", "c"), np.array([2.5, 2.5, 1.0]), A, 3))
     # On an axis that data do not see a place is off by rounding.
-    assert not list(_beyond(("a", "a", "a"), np.array([2.5, 0.0, 3e-3]), np.diag([1.0, 1.0, 0.0]), 0))
+    assert not list(priors_module._beyond(("a", "a", "a"), np.array([2.5, 0.0, 3e-3]), np.diag([1.0, 1.0, 0.0]), 0))
 
 
 def test_a_correction_is_judged_by_what_it_varies_by_without_the_priors_before_it():
     """The second is 2.1 from what the first makes of it, 0.9 of it, and varies by 1 - 0.9^2: 4.8 sigma."""
     A = np.array([[1.0, 0.9], [0.9, 1.0]])
-    assert [one.name for one in _beyond(("a", "b"), np.array([30.0, 29.1]), A, 2)] == ["a", "b"]
-    assert [one.name for one in _beyond(("a", "b"), np.array([30.0, 28.3]), A, 2)] == ["a"]
+    assert [one.name for one in priors_module._beyond(("a", "b"), np.array([30.0, 29.1]), A, 2)] == ["a", "b"]
+    assert [one.name for one in priors_module._beyond(("a", "b"), np.array([30.0, 28.3]), A, 2)] == ["a"]
 
 
 def test_what_has_no_prior_follows_the_corrections():
     """The information on the corrections is that of the rows, the measurement frame moved along."""
     problem, _ = drawn_problem(frame="unknown")
     solution, n = solve(problem), len(prior_rows(problem.variables, problem.start)[0])
-    corrections, follow = _corrections(solution, problem.variables, np.ones(n), np.zeros(n, dtype=np.int64))
+    corrections, follow = priors_module._corrections(
+        solution, problem.variables, np.ones(n), np.zeros(n, dtype=np.int64)
+    )
     rows = solution.problem.linearize(solution.parameters).left.A @ follow
     np.testing.assert_allclose(rows.T @ rows, corrections.information, rtol=1e-6, atol=1e-6 * np.max(rows**2))

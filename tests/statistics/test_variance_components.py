@@ -10,17 +10,10 @@ from scipy.optimize import minimize
 from simulated import measure, small_arm, true_robot
 from touches import TOOL_POINT, corners, touch
 
-from fg_calib.assessment import assess
-from fg_calib.graph.build import build_problem
-from fg_calib.graph.error_states import whitener_of
-from fg_calib.graph.noise_models import JOINT_NOISE
-from fg_calib.graph.problem import relinearized_at
-from fg_calib.graph.solver import solve
-from fg_calib.graph.variables import prior_rows
-from fg_calib.inputs import Pairing
-from fg_calib.measurements.dataset import Measurements, Pairs
-from fg_calib.measurements.table import Table
-from fg_calib.robot.kinematics import pose
+from fg_calib import Measurements, Pairing, Table, assess, build_problem, solve
+from fg_calib.graph import JOINT_NOISE, prior_rows, relinearized_at, whitener_of
+from fg_calib.measurements import Pairs
+from fg_calib.robot import pose
 from fg_calib.statistics import variance_components as estimation
 from fg_calib.statistics.variance_components import NoiseComponents, estimate_noise, noise_components
 
