@@ -16,15 +16,12 @@ def named(path: Path | str, options: Options | None = None, robots: Sequence[Rob
     return path, options, robots
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((3,), "path: found 3, expected a path"),
-        (("",), "path: found '', expected a path"),
-        (("a", "pose"), "options: found 'pose', expected an Options, such as Options"),
-        (("a", None, [None]), "robots: found .*, expected a list of Robot"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    ((3,), "path: found 3, expected a path"),
+    (("",), "path: found '', expected a path"),
+    (("a", "pose"), "options: found 'pose', expected an Options, such as Options"),
+    (("a", None, [None]), "robots: found .*, expected a list of Robot"),
+])  # fmt: skip
 def test_an_argument_that_does_not_fit_is_one_line(arguments, message):
     with pytest.raises(InputError, match=message):
         named(*arguments)

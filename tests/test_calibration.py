@@ -229,32 +229,20 @@ def test_a_calibration_goes_to_other_processes(found):
         assert str(again) == str(result)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "error", "message"),
-    [
-        ({"model": "positon"}, InputError, "model: found 'positon', .*did you mean position?"),
-        ({"modle": "position"}, InputError, "options: unknown option 'modle'"),
-        ({"options": Options("pose"), "frame": "unknown"}, InputError, "options: both options and frame=..."),
-        ({"options": "pose"}, InputError, "options: found 'pose', expected an Options, such as"),
-        ({"robot": None}, InputError, "robot: found None, expected a Robot, such as"),
-        ({"robot": "robot.yaml"}, InputError, "robot: found 'robot.yaml', expected a Robot, such as Robot.from_dh"),
-        (
-            {"measurements": Q},
-            InputError,
-            r"measurements: found ndarray of shape \(4, 4\), expected a Measurements or a Table",
-        ),
-        (
-            {"measurements": Measurements.from_arrays(Q[:, :3], position=np.zeros((4, 3)))},
-            InputError,
-            "measurements: readings of 3 joints, expected 4",
-        ),
-        (
-            {"measurements": Measurements.from_arrays(Q, position=np.zeros((4, 3)), source="mine")},
-            ProblemError,
-            "mine: no sigma for position",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "error", "message"), [
+    ({"model": "positon"}, InputError, "model: found 'positon', .*did you mean position?"),
+    ({"modle": "position"}, InputError, "options: unknown option 'modle'"),
+    ({"options": Options("pose"), "frame": "unknown"}, InputError, "options: both options and frame=..."),
+    ({"options": "pose"}, InputError, "options: found 'pose', expected an Options, such as"),
+    ({"robot": None}, InputError, "robot: found None, expected a Robot, such as"),
+    ({"robot": "robot.yaml"}, InputError, "robot: found 'robot.yaml', expected a Robot, such as Robot.from_dh"),
+    ({"measurements": Q}, InputError,
+     r"measurements: found ndarray of shape \(4, 4\), expected a Measurements or a Table"),
+    ({"measurements": Measurements.from_arrays(Q[:, :3], position=np.zeros((4, 3)))}, InputError,
+     "measurements: readings of 3 joints, expected 4"),
+    ({"measurements": Measurements.from_arrays(Q, position=np.zeros((4, 3)), source="mine")}, ProblemError,
+     "mine: no sigma for position"),
+])  # fmt: skip
 def test_mistakes_are_named(wrong, error, message):
     robot, m, _ = given("priors")
     arguments = {"robot": robot, "measurements": m} | ({} if "options" in wrong else {"model": "position"}) | wrong

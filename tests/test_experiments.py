@@ -13,15 +13,9 @@ import common  # noqa: E402
 import verify  # noqa: E402
 
 QUICK = [
-    ("paper", "identifiability"),
-    ("paper", "claims"),
-    ("real_data", "panda"),
-    ("validation", "landmarks"),
-    ("validation", "outliers"),
-    ("validation", "monitoring"),
-    ("design", "criteria"),
-    ("speed", "steps"),
-]
+    ("paper", "identifiability"), ("paper", "claims"), ("real_data", "panda"), ("validation", "landmarks"),
+    ("validation", "outliers"), ("validation", "monitoring"), ("design", "criteria"), ("speed", "steps"),
+]  # fmt: skip
 
 
 @pytest.mark.slow

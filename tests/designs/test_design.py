@@ -250,18 +250,15 @@ def test_the_curve_falls_and_designed_poses_are_better_than_random_ones():
     assert plan.random == middle[-1]
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"n": 3, "target": 1e-3}, "target"),
-        ({"n": 501}, "n"),
-        ({"n_candidates": 1}, "n_candidates"),
-        ({"candidates": "rows"}, "rows of a scenario"),
-        ({"criterion": "G"}, "criterion"),
-        ({"task": np.zeros((0, 4))}, "task"),
-        ({"given": np.zeros((3, 5))}, "given"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"n": 3, "target": 1e-3}, "target"),
+    ({"n": 501}, "n"),
+    ({"n_candidates": 1}, "n_candidates"),
+    ({"candidates": "rows"}, "rows of a scenario"),
+    ({"criterion": "G"}, "criterion"),
+    ({"task": np.zeros((0, 4))}, "task"),
+    ({"given": np.zeros((3, 5))}, "given"),
+])  # fmt: skip
 def test_values_that_make_no_sense_are_refused(options, message):
     of = scenario(INSTRUMENTS["pose"], n=20)
     with pytest.raises(InputError, match=message):

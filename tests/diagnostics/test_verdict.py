@@ -61,21 +61,18 @@ def chi_square(reduced, p_value=0.5, dof=40):
     return ChiSquare(reduced * dof, dof, float(dof), (0.5, 2.0), p_value)
 
 
-@pytest.mark.parametrize(
-    ("chi2", "settings", "severity", "words"),
-    [
-        (chi_square(1.0, dof=0), {}, "error", "no degree of freedom is left"),
-        (chi_square(1.3), {}, None, ""),
-        (chi_square(1.3, 1e-4), {}, "note", "(1.14 times), and sigmas are shown larger by as much"),
-        (chi_square(1.2, 1e-4), {}, None, ""),
-        (chi_square(0.4), {}, "note", "noise specified too large"),
-        (chi_square(2.1), {}, "error", "[0.50, 2.00]: noise specified too small, unmodelled effects, or outliers"),
-        (chi_square(2.1), {"updated": True}, "error", "new rows contradict the earlier calibration"),
-        (chi_square(2.1), {"evaluated": True}, "error", "the arm does not predict these test rows"),
-        (chi_square(2.1), {"gross": GrossErrors(1, ("7",), 1.1)}, "error", "outliers: 1 (7), 1.1 without: look"),
-        (chi_square(2.1), {"effect": "q2"}, "error", "[0.50, 2.00]: residuals are systematic"),
-    ],
-)
+@pytest.mark.parametrize(("chi2", "settings", "severity", "words"), [
+    (chi_square(1.0, dof=0), {}, "error", "no degree of freedom is left"),
+    (chi_square(1.3), {}, None, ""),
+    (chi_square(1.3, 1e-4), {}, "note", "(1.14 times), and sigmas are shown larger by as much"),
+    (chi_square(1.2, 1e-4), {}, None, ""),
+    (chi_square(0.4), {}, "note", "noise specified too large"),
+    (chi_square(2.1), {}, "error", "[0.50, 2.00]: noise specified too small, unmodelled effects, or outliers"),
+    (chi_square(2.1), {"updated": True}, "error", "new rows contradict the earlier calibration"),
+    (chi_square(2.1), {"evaluated": True}, "error", "the arm does not predict these test rows"),
+    (chi_square(2.1), {"gross": GrossErrors(1, ("7",), 1.1)}, "error", "outliers: 1 (7), 1.1 without: look"),
+    (chi_square(2.1), {"effect": "q2"}, "error", "[0.50, 2.00]: residuals are systematic"),
+])  # fmt: skip
 def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severity, words):
     found = [one for one in check_chi_square(chi2, **settings) if one.applies]
     assert [one.severity for one in found] == ([] if severity is None else [severity])
@@ -83,15 +80,12 @@ def test_chi_square_is_judged_by_its_size_and_its_p_value(chi2, settings, severi
     assert all(("by as much" in one.text) == ("by as much" in words) for one in found)
 
 
-@pytest.mark.parametrize(
-    ("more", "alone"),
-    [
-        ({"systematic": Systematic(0.5)}, True),
-        ({"systematic": Systematic(1e-9)}, False),
-        ({"systematic": Systematic(1e-9), "setup": SetupCheck(explanations=("exchanged",))}, True),
-        ({"change": Change("tool", 3, 0.1)}, False),
-    ],
-)
+@pytest.mark.parametrize(("more", "alone"), [
+    ({"systematic": Systematic(0.5)}, True),
+    ({"systematic": Systematic(1e-9)}, False),
+    ({"systematic": Systematic(1e-9), "setup": SetupCheck(explanations=("exchanged",))}, True),
+    ({"change": Change("tool", 3, 0.1)}, False),
+])  # fmt: skip
 def test_gross_errors_are_not_all_that_is_wrong_beside_a_change_or_an_effect(more, alone):
     gross = GrossErrors(1, ("7",), 1.1)
     fit = SimpleNamespace(goodness=SimpleNamespace(gross_alone=True, gross=gross))

@@ -290,13 +290,10 @@ MISTAKES = {
     "ur of seven joints": [seven(), {}, "seven: 7 joints, 0 of which slide, expected six joints that turn"],
     "zeros of no drawing": [UR, {}, "zeros: an arm without its nominal robot, expected a RESULT of calibrate"],
     "zeros of another drawing": [UR, {"nominal": seven()}, "nominal: seven has other joints, expected q1, q2"],
-    "urdf of a name that XML cannot hold": [
-        Robot.from_dh([[0, 0, 0, 0]], names=["a\x1b"]),
-        {},
-        "robot: a name with letters that XML cannot hold",
-    ],
+    "urdf of a name that XML cannot hold": [Robot.from_dh([[0, 0, 0, 0]], names=["a\x1b"]), {},
+                                            "robot: a name with letters that XML cannot hold"],
     "dh with an idle option": [UR, {"tool": "nominal"}, "tool: means nothing for dh, expected the format zeros"],
-}
+}  # fmt: skip
 """Of a format and what is wrong: the arm, the options, and how the message begins."""
 
 

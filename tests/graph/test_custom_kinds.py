@@ -162,46 +162,39 @@ def described(**attributes):
     return type("Mine", (Kind,), {name: value for name, value in own.items() if value is not None})()
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda r: None, "lengths: kind Mine: rows: returned a NoneType, expected Rows(residual, D, N)"),
-        (lambda r: r._replace(residual=r.residual * np.nan), "lengths: kind Mine: residual: row 0: found nan, expected "
-         "a finite number; at the start of the unknowns"),
-        (lambda r: r._replace(wrenches=r.wrenches + np.inf), "lengths: kind Mine: wrenches: row 0: found inf, expected "
-         "a finite number; at the start of the unknowns"),
-        (lambda r: r._replace(residual="far"), "lengths: kind Mine: residual: found 'far', expected numbers of shape "
-         "(12, 1)"),
-        (lambda r: r._replace(residual=[[1.0], [1.0, 2.0]]), "lengths: kind Mine: residual: found [[1.0], [1.0, 2.0]], "
-         "expected numbers of shape (12, 1)"),
-        (lambda r: r._replace(residual=r.residual + 1j), "lengths: kind Mine: residual: found ndarray of shape (12, 1)"
-         ", complex128, expected numbers of shape (12, 1)"),
-        (lambda r: r._replace(nuisances=None), "lengths: kind Mine: nuisances: found None, expected "
-         "numbers of shape (12, 1, 3)"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda r: None, "lengths: kind Mine: rows: returned a NoneType, expected Rows(residual, D, N)"),
+    (lambda r: r._replace(residual=r.residual * np.nan), "lengths: kind Mine: residual: row 0: found nan, expected "
+     "a finite number; at the start of the unknowns"),
+    (lambda r: r._replace(wrenches=r.wrenches + np.inf), "lengths: kind Mine: wrenches: row 0: found inf, expected "
+     "a finite number; at the start of the unknowns"),
+    (lambda r: r._replace(residual="far"), "lengths: kind Mine: residual: found 'far', expected numbers of shape "
+     "(12, 1)"),
+    (lambda r: r._replace(residual=[[1.0], [1.0, 2.0]]), "lengths: kind Mine: residual: found [[1.0], [1.0, 2.0]], "
+     "expected numbers of shape (12, 1)"),
+    (lambda r: r._replace(residual=r.residual + 1j), "lengths: kind Mine: residual: found ndarray of shape (12, 1)"
+     ", complex128, expected numbers of shape (12, 1)"),
+    (lambda r: r._replace(nuisances=None), "lengths: kind Mine: nuisances: found None, expected "
+     "numbers of shape (12, 1, 3)"),
+])  # fmt: skip
 def test_what_rows_raise_or_return_is_one_line_that_names_kind_and_table(change, said):
     with pytest.raises(InputError) as found:
         of_kind(changed(change))
     assert str(found.value) == said
 
 
-@pytest.mark.parametrize(
-    ("attributes", "said"),
-    [
-        ({"ends": None}, "ends: found None, expected a whole number not below 0"),
-        ({"ends": 3}, "ends: found 3, expected at most 2"),
-        ({"residual_dim": "1"}, "residual_dim: found '1', expected a whole number not below 1"),
-        ({"width": 1.0}, "width: found 1.0, expected a whole number not below 0"),
-        ({"n_nuisances": True}, "n_nuisances: found True, expected a whole number not below 0"),
-        ({"names": "anchor"},
-         "names: found 'anchor', expected a tuple of residual_dim = 1 words, such as ('height',)"),
-        ({"units": ("m", "m")}, "units: found ('m', 'm'), expected a tuple of residual_dim = 1 of m, rad and px"),
-        ({"units": None}, "units: found None, expected a tuple of residual_dim = 1 of m, rad and px"),
-        ({"units": ("mm",)}, "units: found ('mm',), expected a tuple of residual_dim = 1 of m, rad and px"),
-        ({"code": 1}, "code: found 1, expected None: compiled code would take the place of its rows"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("attributes", "said"), [
+    ({"ends": None}, "ends: found None, expected a whole number not below 0"),
+    ({"ends": 3}, "ends: found 3, expected at most 2"),
+    ({"residual_dim": "1"}, "residual_dim: found '1', expected a whole number not below 1"),
+    ({"width": 1.0}, "width: found 1.0, expected a whole number not below 0"),
+    ({"n_nuisances": True}, "n_nuisances: found True, expected a whole number not below 0"),
+    ({"names": "anchor"}, "names: found 'anchor', expected a tuple of residual_dim = 1 words, such as ('height',)"),
+    ({"units": ("m", "m")}, "units: found ('m', 'm'), expected a tuple of residual_dim = 1 of m, rad and px"),
+    ({"units": None}, "units: found None, expected a tuple of residual_dim = 1 of m, rad and px"),
+    ({"units": ("mm",)}, "units: found ('mm',), expected a tuple of residual_dim = 1 of m, rad and px"),
+    ({"code": 1}, "code: found 1, expected None: compiled code would take the place of its rows"),
+])  # fmt: skip
 def test_what_a_kind_does_not_say_of_itself_is_named(attributes, said):
     with pytest.raises(InputError) as found:
         CustomMeasurements(described(**attributes), np.ones(3), SIGMA, unknowns=ANCHORS)
@@ -217,32 +210,26 @@ def test_a_kind_of_ours_cannot_be_changed_under_its_compiled_twin():
         CustomMeasurements(Longer(), np.ones(3), SIGMA, ends=np.zeros((3, 2), int))
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"data": "far"}, "data: found 'far', expected finite numbers"),
-        (
-            {"data": ["1.0"] * 60},
-            "data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite numbers",
-        ),
-        ({"data": np.full(60, np.nan)}, "data: row 0: found nan, expected a finite number"),
-        ({"data": np.zeros((60, 2))}, "data: shape (60, 2), expected (n, 1)"),
-        ({"data": np.ma.masked_array(np.ones(60))}, "data: found a masked array, expected finite numbers; nan "),
-        ({"data": (x for x in range(60))}, "data: found a generator, expected finite numbers; list(...) makes a list"),
-        ({"sigma": -1.0}, "sigma: found -1, expected a number above 0"),
-        ({"sigma": "1e-3"}, "sigma: found '1e-3', expected finite numbers"),
-        ({"sigma": 1e-200}, "sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances no "),
-        ({"which": np.full((60, 1), 3)}, "which: row 0: found 3, expected 0 to 2"),
-        ({"ends": np.full((60, 1), -1)}, "ends: row 0: found -1, expected 0 and above"),
-        ({"names": ("A", "A", "B")}, "names: found ('A', 'A', 'B'), expected 3 different words"),
-        ({"names": (1, 2, 3)}, "names: found (1, 2, 3), expected 3 different words"),
-        ({"names": 3}, "names: found 3, expected a list of names"),
-        ({"unknowns": np.zeros((0, 0))}, "unknowns: shape (0, 0), expected a start for each unknown; "),
-        ({"unknowns": np.zeros((3, 1, 3))}, "unknowns: shape (3, 1, 3), expected (n, k)"),
-        ({"test": [True]}, "test: shape (1,), expected (60,), one a row"),
-        ({"kind": AnchorDistance}, "kind: found <class 'custom_kinds.AnchorDistance'>, expected an object of a class"),
-    ],
-)
+@pytest.mark.parametrize(("change", "said"), [
+    ({"data": "far"}, "data: found 'far', expected finite numbers"),
+    ({"data": ["1.0"] * 60}, "data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite numbers"),
+    ({"data": np.full(60, np.nan)}, "data: row 0: found nan, expected a finite number"),
+    ({"data": np.zeros((60, 2))}, "data: shape (60, 2), expected (n, 1)"),
+    ({"data": np.ma.masked_array(np.ones(60))}, "data: found a masked array, expected finite numbers; nan "),
+    ({"data": (x for x in range(60))}, "data: found a generator, expected finite numbers; list(...) makes a list"),
+    ({"sigma": -1.0}, "sigma: found -1, expected a number above 0"),
+    ({"sigma": "1e-3"}, "sigma: found '1e-3', expected finite numbers"),
+    ({"sigma": 1e-200}, "sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances no "),
+    ({"which": np.full((60, 1), 3)}, "which: row 0: found 3, expected 0 to 2"),
+    ({"ends": np.full((60, 1), -1)}, "ends: row 0: found -1, expected 0 and above"),
+    ({"names": ("A", "A", "B")}, "names: found ('A', 'A', 'B'), expected 3 different words"),
+    ({"names": (1, 2, 3)}, "names: found (1, 2, 3), expected 3 different words"),
+    ({"names": 3}, "names: found 3, expected a list of names"),
+    ({"unknowns": np.zeros((0, 0))}, "unknowns: shape (0, 0), expected a start for each unknown; "),
+    ({"unknowns": np.zeros((3, 1, 3))}, "unknowns: shape (3, 1, 3), expected (n, k)"),
+    ({"test": [True]}, "test: shape (1,), expected (60,), one a row"),
+    ({"kind": AnchorDistance}, "kind: found <class 'custom_kinds.AnchorDistance'>, expected an object of a class"),
+])  # fmt: skip
 def test_a_mistake_in_what_was_measured_is_named(change, said):
     with pytest.raises(InputError) as found:
         replace(lengths_to_anchors(5)[2].own[0], **change)

@@ -53,13 +53,10 @@ def test_touches_of_a_point_are_all_pairs_of_its_touches():
     _, true, m = case(sigma=0.0, distances=(), tolerance=None)
     once = touch(true, corners(true, 1, np.random.default_rng(1)), 1, np.random.default_rng(2), 0.0)
     more = replace(
-        m,
-        readings=np.vstack([m.readings, once.readings]),
-        ids=np.append(m.ids, "last"),
-        test=np.append(m.test, False),
+        m, readings=np.vstack([m.readings, once.readings]), ids=np.append(m.ids, "last"), test=np.append(m.test, False),
         sigmas={"point": np.append(m.sigma("point"), SIGMA)},
-        groups=Groups((*m.groups.names, "once"), np.append(m.groups.index, 4), no_pairs("pairs.csv")),
-    )
+        groups=Groups((*m.groups.names, "once"), np.append(m.groups.index, 4), no_pairs("pairs.csv"))
+    )  # fmt: skip
     J = [build_problem(true, x, model="distance").system.left.A for x in (m, all_pairs(m), more)]
     wanted = J[0].T @ J[0]
     assert J[1].T @ J[1] == pytest.approx(wanted, abs=1e-8 * wanted.max())

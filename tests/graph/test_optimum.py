@@ -107,27 +107,18 @@ NOISE = 3e-4
 PAIRS = {"model": "distance-rotation"}
 CASES = {
     "poses": (poses, {}, {"model": "pose"}),
-    "poses, frame, tool, joint noise": (
-        poses,
-        {"joint": NOISE, "estimate": TOOL, "frame": PLACED},
-        {"model": "pose", "frame": "unknown"},
-    ),
-    "positions, frame, tool point": (
-        poses,
-        {"estimate": TOOL_POINT, "frame": PLACED},
-        {"model": "position", "frame": "unknown"},
-    ),
+    "poses, frame, tool, joint noise": (poses, {"joint": NOISE, "estimate": TOOL, "frame": PLACED},
+                                        {"model": "pose", "frame": "unknown"}),
+    "positions, frame, tool point": (poses, {"estimate": TOOL_POINT, "frame": PLACED},
+                                     {"model": "position", "frame": "unknown"}),
     "orientations, joint noise": (poses, {"joint": NOISE}, {"model": "orientation"}),
     "star": (poses, {}, PAIRS),
     "star, joint noise": (poses, {"joint": NOISE}, PAIRS),
     "chain of distances, joint noise": (poses, {"joint": NOISE}, {"model": "distance", "pairing": Pairing("chain")}),
     "angles, random pairs": (poses, {}, {"model": "rotation", "pairing": Pairing("random", 40, 0)}),
     "all pairs, joint noise": (poses, {"joint": NOISE}, PAIRS | {"pairing": Pairing("all")}),
-    "all pairs as if independent": (
-        poses,
-        {"joint": NOISE},
-        PAIRS | {"pairing": Pairing("all"), "pair_errors": "independent"},
-    ),
+    "all pairs as if independent": (poses, {"joint": NOISE},
+                                    PAIRS | {"pairing": Pairing("all"), "pair_errors": "independent"}),
     "direct pairs apart, joint noise": (direct, {"graph": "apart", "joint": NOISE}, PAIRS),
     "direct star, joint noise": (direct, {"graph": "star", "joint": NOISE}, PAIRS),
     "direct tree, joint noise": (direct, {"graph": "tree", "joint": NOISE}, PAIRS),
@@ -138,10 +129,8 @@ CASES = {
     "poses and pairs": (two_tables, {"second": "pairs"}, {}),
     "poses and a chain": (two_tables, {"second": "chain"}, {}),
     "positions and touches": (two_tables, {"second": "touches"}, {}),
-    **{
-        f"{name}, joint noise": (instrument, {"name": name, "joint": NOISE}, {})
-        for name in ("targets known", "targets stations", "anchors offset", "anchors nearly", "planes", "board")
-    },
+    **{f"{name}, joint noise": (instrument, {"name": name, "joint": NOISE}, {}) for name in ("targets known",
+       "targets stations", "anchors offset", "anchors nearly", "planes", "board")},
     "pixels": (instrument, {"name": "pixels"}, {}),
     "room, joint noise": (instrument, {"name": "room", "joint": 2e-4}, {}),
     "a custom kind, joint noise": (custom, {"joint": NOISE}, {}),
@@ -152,16 +141,13 @@ CASES = {
     "joint values of two tables": (two_tables, {"second": "pairs"}, {"encoder": "estimated"}),
     "huber": (gross, {}, {"model": "pose", "loss": "huber"}),
     "cauchy, joint noise": (gross, {"joint": NOISE}, {"model": "position", "loss": "cauchy"}),
-    "geman-mcclure, joint values": (
-        gross,
-        {"joint": NOISE},
-        {"model": "pose", "loss": "geman-mcclure", "encoder": "estimated"},
-    ),
+    "geman-mcclure, joint values": (gross, {"joint": NOISE},
+                                    {"model": "pose", "loss": "geman-mcclure", "encoder": "estimated"}),
     "gnc of a star": (gross, {}, PAIRS | {"loss": "gnc"}),
     "gauge keep": (poses, {}, PAIRS | {"gauge": "keep"}),
     "gauge none": (poses, {"frame": PLACED}, {"model": "pose", "frame": "unknown", "gauge": "none"}),
     "all pairs of small motions": (poses, {"within": 0.1}, PAIRS | {"pairing": Pairing("all")}),
-}
+}  # fmt: skip
 
 
 SLOW = {

@@ -190,18 +190,15 @@ def test_two_tables_that_contradict_each_other_are_refused():
         build_problem(robot, [tables[0], noisy])
 
 
-@pytest.mark.parametrize(
-    ("models", "said"),
-    [
-        (("pose", "pose"), "the same (orientations|positions) as in measurements"),
-        (("pose", "reversed"), "the same (orientations|positions) as in measurements"),
-        (("pose", "a part"), "the same (orientations|positions) as in measurements"),
-        (("pose", "position"), "the same positions as in measurements"),
-        (("distance", "position"), "the same positions as in measurements"),
-        (("rotation", "position"), None),
-        (("orientation", "position"), None),
-    ],
-)
+@pytest.mark.parametrize(("models", "said"), [
+    (("pose", "pose"), "the same (orientations|positions) as in measurements"),
+    (("pose", "reversed"), "the same (orientations|positions) as in measurements"),
+    (("pose", "a part"), "the same (orientations|positions) as in measurements"),
+    (("pose", "position"), "the same positions as in measurements"),
+    (("distance", "position"), "the same positions as in measurements"),
+    (("rotation", "position"), None),
+    (("orientation", "position"), None),
+])  # fmt: skip
 def test_a_table_given_twice_is_refused(models, said):
     rng = np.random.default_rng(9)
     robot = small_arm(tolerance=TOLERANCE)
@@ -267,22 +264,14 @@ def test_pairs_measured_again_are_not_the_same():
         build_problem(robot, [Table(m, "distance"), Table(m, "distance-rotation")])
 
 
-@pytest.mark.parametrize(
-    ("keys", "said"),
-    [
-        ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),
-        ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurement 1: missing key 'model'"),
-        ({"measurements": [{"model": "position"}]}, "job.yaml: measurement 1: missing key 'table'"),
-        (
-            {"pairs": "lengths.csv"},
-            "job.yaml: pairs: next to a list of tables, expected the key in the table's own entry",
-        ),
-        (
-            {"measurements": [{"table": "tracker.csv", "model": "position", "loss": "huber"}]},
-            "job.yaml: measurement 1: unknown key 'loss'",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("keys", "said"), [
+    ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),
+    ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurement 1: missing key 'model'"),
+    ({"measurements": [{"model": "position"}]}, "job.yaml: measurement 1: missing key 'table'"),
+    ({"pairs": "lengths.csv"}, "job.yaml: pairs: next to a list of tables, expected the key in the table's own entry"),
+    ({"measurements": [{"table": "tracker.csv", "model": "position", "loss": "huber"}]},
+     "job.yaml: measurement 1: unknown key 'loss'"),
+])  # fmt: skip
 def test_a_mistake_in_the_list_of_tables_is_named(fg_calib, tmp_path, keys, said):
     robot, _, tables = mixture(13)
     ended = fg_calib("calibrate", write_tables(tmp_path, robot, tables, **keys))

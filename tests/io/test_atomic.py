@@ -65,17 +65,11 @@ def test_a_folder_that_cannot_be_written_is_one_line_and_leaves_no_trace(tmp_pat
             require_writable(tmp_path / folder)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (
-            lambda path: path.write_text("mine"),
-            "is there already, not written by this command, expected another folder",
-        ),
-        (lambda path: path.mkdir(), "is no file, expected a place for a file"),
-        (lambda path: path.symlink_to("nowhere"), "is no file, expected a place for a file"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda path: path.write_text("mine"), "is there already, not written by this command, expected another folder"),
+    (lambda path: path.mkdir(), "is no file, expected a place for a file"),
+    (lambda path: path.symlink_to("nowhere"), "is no file, expected a place for a file"),
+])  # fmt: skip
 def test_what_others_wrote_is_not_replaced(tmp_path, make, message):
     path = tmp_path / "table"
     make(path)
@@ -97,16 +91,13 @@ def test_a_text_is_written_whole_or_not_at_all(tmp_path):
         write_text(tmp_path / "none" / "b", "")
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda folder: folder / "nothing", "nothing: no such file"),
-        (lambda folder: folder, ": is a folder, expected a file"),
-        (lambda folder: folder / ("x" * 5000), "cannot be read: File name too long, expected a file"),
-        (lambda folder: folder / "a\0b", "cannot be read: "),
-        (lambda folder: os.mkfifo(folder / "pipe") or folder / "pipe", "pipe: is a pipe or a device, expected a file"),
-    ],
-)
+@pytest.mark.parametrize(("make", "message"), [
+    (lambda folder: folder / "nothing", "nothing: no such file"),
+    (lambda folder: folder, ": is a folder, expected a file"),
+    (lambda folder: folder / ("x" * 5000), "cannot be read: File name too long, expected a file"),
+    (lambda folder: folder / "a\0b", "cannot be read: "),
+    (lambda folder: os.mkfifo(folder / "pipe") or folder / "pipe", "pipe: is a pipe or a device, expected a file"),
+])  # fmt: skip
 def test_what_is_no_file_is_one_line(tmp_path, make, message):
     with pytest.raises(InputError) as error:
         read_bytes(make(tmp_path))

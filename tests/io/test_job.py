@@ -106,15 +106,12 @@ def test_tables_have_columns_of_their_own_names(folder):
     assert table.measurements.readings.tolist() == data.readings.tolist()
 
 
-@pytest.mark.parametrize(
-    ("robot", "files"),
-    [
-        ("robots/arm.urdf", ["robots/arm.urdf"]),
-        ("robots/wrapped.yaml", ["robots/wrapped.yaml", "robots/arm.urdf"]),
-        ("{urdf: robots/arm.urdf, base_link: a, tip_link: b}", ["robots/arm.urdf"]),
-        ("{convention: dh, joints: [{a: 0, alpha: 0, d: 0, theta: 0, name: j}]}", []),
-    ],
-)
+@pytest.mark.parametrize(("robot", "files"), [
+    ("robots/arm.urdf", ["robots/arm.urdf"]),
+    ("robots/wrapped.yaml", ["robots/wrapped.yaml", "robots/arm.urdf"]),
+    ("{urdf: robots/arm.urdf, base_link: a, tip_link: b}", ["robots/arm.urdf"]),
+    ("{convention: dh, joints: [{a: 0, alpha: 0, d: 0, theta: 0, name: j}]}", []),
+])  # fmt: skip
 def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
     job = read(folder, f"robot: {robot}\nmeasurements: one.csv\nmodel: pose\n")
     assert [joint.name for joint in job.robot.joints] == ["j"]

@@ -97,27 +97,21 @@ def move(parameter):
     parameter["correction"] += 1e-3
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda f: (f / "result.json").write_text("{"), "result.json: not JSON: .*; was it cut off?"),
-        (lambda f: (f / "result.json").write_text('{"n": NaN}'), "result.json: not JSON: NaN is no number"),
-        (lambda f: (f / "result.json").write_text("[]"), "result.json: schema nothing, expected"),
-        (lambda f: (f / "result.json").unlink(), "result: no result.json, expected what"),
-        (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
-        (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
-        (
-            lambda f: changed(f, lambda d: d.update(trustworthy="yes")),
-            "trustworthy: found 'yes', expected true or false",
-        ),
-        (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
-        (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
-        (lambda f: changed(f, lambda d: move(d["parameters"][8])), "robot_calibrated.yaml: other values than in"),
-        (lambda f: (f / "robot_calibrated.yaml").unlink(), "neither robot_calibrated.yaml nor robot_calibrated.urdf"),
-        (lambda f: changed(f, lambda d: d["posterior"]["variables"].popitem()), "json: posterior: covariance: shape"),
-        (lambda f: (f / "residuals.csv").write_text("kind\n"), "residuals.csv: changed, or of another calibration"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "message"), [
+    (lambda f: (f / "result.json").write_text("{"), "result.json: not JSON: .*; was it cut off?"),
+    (lambda f: (f / "result.json").write_text('{"n": NaN}'), "result.json: not JSON: NaN is no number"),
+    (lambda f: (f / "result.json").write_text("[]"), "result.json: schema nothing, expected"),
+    (lambda f: (f / "result.json").unlink(), "result: no result.json, expected what"),
+    (lambda f: changed(f, lambda d: d["posterior"].update(variables={"K(9)": 22 * ["a"]})), "posterior: other var"),
+    (lambda f: changed(f, lambda d: d.update(n_pairs="many")), "result.json: n_pairs: found 'many'"),
+    (lambda f: changed(f, lambda d: d.update(trustworthy="yes")), "trustworthy: found 'yes', expected true or false"),
+    (lambda f: changed(f, lambda d: d["parameters"][2].pop("sigma")), "json: parameter 3: missing key 'sigma'"),
+    (lambda f: changed(f, lambda d: d["parameters"].pop()), "robot_calibrated.yaml: other parameters than in"),
+    (lambda f: changed(f, lambda d: move(d["parameters"][8])), "robot_calibrated.yaml: other values than in"),
+    (lambda f: (f / "robot_calibrated.yaml").unlink(), "neither robot_calibrated.yaml nor robot_calibrated.urdf"),
+    (lambda f: changed(f, lambda d: d["posterior"]["variables"].popitem()), "json: posterior: covariance: shape"),
+    (lambda f: (f / "residuals.csv").write_text("kind\n"), "residuals.csv: changed, or of another calibration"),
+])  # fmt: skip
 def test_a_damaged_folder_is_refused_in_a_line(folder, damage, message):
     damage(folder)
     with pytest.raises(InputError, match=message) as error:

@@ -118,40 +118,32 @@ def test_sigmas_are_spread_over_the_rows():
         assert np.array_equal(Measurements.from_arrays(Q, position=P, sigma_position=given).sigma_position, spread)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"readings": Q[:, 0]}, r"readings: shape \(7,\), expected \(n, n_joints\)"),
-        ({"readings": [[1, 2], [3]]}, r"readings: found \[\[1, 2\], \[3\]\], expected numbers of shape"),
-        ({"readings": Q[:0]}, r"readings: shape \(0, 2\), expected .* at least one row"),
-        ({"position": P[:5]}, r"position: shape \(5, 3\), expected \(7, 3\)"),
-        ({"position": np.where(P == P[4], np.inf, P)}, "position: row 4: found inf, expected a finite"),
-        ({"quaternion": np.ones((N, 4))}, "measurements: row 0: quaternion of norm 2, expected 1 within"),
-        ({"rotation": np.tile(np.diag([1.0, 1, -1]), (N, 1, 1))}, "rotation: row 0: found .*, expected a rotation"),
-        ({"rotation": ROTATION.as_matrix(), "quaternion": ROTATION.as_quat()}, "rotation and quaternion: both"),
-        ({"sigma_position": 0.0}, "sigma_position: found 0, expected a number above 0"),
-        ({"sigma_position": [1, 2]}, r"sigma_position: shape \(2,\), expected one that broadcasts to \(7, 3\)"),
-        ({"sigma_orientation": [1, -1, 1]}, "sigma_orientation: row 1: found -1, expected a number above 0"),
-        ({"sigma_joint": -1.0}, "noise: joint: found -1.0, expected a finite number not below 0"),
-        ({"sigma_joint": [1.0, 1.0, 1.0]}, "noise: joint: 3 sigmas, expected one value, or 2"),
-        ({"ids": ["a"] * N}, "measurements: row 1: id: found 'a', expected different ids"),
-        ({"test": np.arange(N)}, "test: found .*, expected True or False for each of 7 rows"),
-        ({"pairs": {"a": [0], "distance": [1]}}, "pairs: no b, expected a and b"),
-        ({"pairs": {"a": [0], "b": [1]}}, "pairs: neither distance nor angle"),
-        ({"pairs": {"a": [0], "b": [1], "distanze": [1]}}, "pairs: unknown key 'distanze', .*did you mean distance?"),
-        ({"pairs": {"a": [0], "b": [9], "distance": [1]}}, "pairs: row 0: b: found 9, expected an id"),
-        ({"pairs": {"a": [0], "b": [1, 2], "distance": [1]}}, r"pairs: a: shape \(1,\), expected \(2,\), one a row"),
-        (
-            {"pairs": {"a": [0], "b": [1], "distance": [-1]}},
-            "pairs: row 0: distance: found -1.0, expected a number not",
-        ),
-        (
-            {"group": [0] * N, "pairs": {"a": [0], "b": [1], "distance": [1]}},
-            "pairs: row 0: a: found 0, expected an id or a group; names of both",
-        ),
-        ({"group": SIDES, "pairs": {"a": ["l"], "b": ["1"], "distance": [1]}}, "pairs: row 0: b: found '1', exp"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    ({"readings": Q[:, 0]}, r"readings: shape \(7,\), expected \(n, n_joints\)"),
+    ({"readings": [[1, 2], [3]]}, r"readings: found \[\[1, 2\], \[3\]\], expected numbers of shape"),
+    ({"readings": Q[:0]}, r"readings: shape \(0, 2\), expected .* at least one row"),
+    ({"position": P[:5]}, r"position: shape \(5, 3\), expected \(7, 3\)"),
+    ({"position": np.where(P == P[4], np.inf, P)}, "position: row 4: found inf, expected a finite"),
+    ({"quaternion": np.ones((N, 4))}, "measurements: row 0: quaternion of norm 2, expected 1 within"),
+    ({"rotation": np.tile(np.diag([1.0, 1, -1]), (N, 1, 1))}, "rotation: row 0: found .*, expected a rotation"),
+    ({"rotation": ROTATION.as_matrix(), "quaternion": ROTATION.as_quat()}, "rotation and quaternion: both"),
+    ({"sigma_position": 0.0}, "sigma_position: found 0, expected a number above 0"),
+    ({"sigma_position": [1, 2]}, r"sigma_position: shape \(2,\), expected one that broadcasts to \(7, 3\)"),
+    ({"sigma_orientation": [1, -1, 1]}, "sigma_orientation: row 1: found -1, expected a number above 0"),
+    ({"sigma_joint": -1.0}, "noise: joint: found -1.0, expected a finite number not below 0"),
+    ({"sigma_joint": [1.0, 1.0, 1.0]}, "noise: joint: 3 sigmas, expected one value, or 2"),
+    ({"ids": ["a"] * N}, "measurements: row 1: id: found 'a', expected different ids"),
+    ({"test": np.arange(N)}, "test: found .*, expected True or False for each of 7 rows"),
+    ({"pairs": {"a": [0], "distance": [1]}}, "pairs: no b, expected a and b"),
+    ({"pairs": {"a": [0], "b": [1]}}, "pairs: neither distance nor angle"),
+    ({"pairs": {"a": [0], "b": [1], "distanze": [1]}}, "pairs: unknown key 'distanze', .*did you mean distance?"),
+    ({"pairs": {"a": [0], "b": [9], "distance": [1]}}, "pairs: row 0: b: found 9, expected an id"),
+    ({"pairs": {"a": [0], "b": [1, 2], "distance": [1]}}, r"pairs: a: shape \(1,\), expected \(2,\), one a row"),
+    ({"pairs": {"a": [0], "b": [1], "distance": [-1]}}, "pairs: row 0: distance: found -1.0, expected a number not"),
+    ({"group": [0] * N, "pairs": {"a": [0], "b": [1], "distance": [1]}},
+     "pairs: row 0: a: found 0, expected an id or a group; names of both"),
+    ({"group": SIDES, "pairs": {"a": ["l"], "b": ["1"], "distance": [1]}}, "pairs: row 0: b: found '1', exp"),
+])  # fmt: skip
 def test_mistakes_are_named(given, message):
     with pytest.raises(InputError, match=f"^{message}"):
         Measurements.from_arrays(**{"readings": Q} | given)

@@ -242,14 +242,11 @@ def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_
             calibration.update(rows, date=date)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"changed": "thetta3"}, "did you mean theta3"),
-        ({"growth": {"elbow": 1e-6}}, "growth"),
-        ({"date": "yesterday"}, "a date such as"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"changed": "thetta3"}, "did you mean theta3"),
+    ({"growth": {"elbow": 1e-6}}, "growth"),
+    ({"date": "yesterday"}, "a date such as"),
+])  # fmt: skip
 def test_names_that_are_none_are_refused(options, message):
     calibration, true, rng = calibrated(9)
     with pytest.raises(InputError, match=message):

@@ -109,18 +109,15 @@ def test_targets_in_the_measurement_frame_are_reached_there():
     assert by_base.expected_fitted < 5e-5 < by_base.expected[:, 0].max()  # where the base is, priors alone say
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({}, "position: none are given, expected where the targets are, or joint values alone"),
-        ({"position": [[0.0, 0.1]]}, "position"),
-        ({"position": [0.1, 0.2, 0.3], "rotation": np.ones((3, 3))}, "rotation"),
-        ({"position": [0.1, 0.2, 0.3], "near": np.zeros((2, 6))}, "near: 2 rows, expected one for all, or 1"),
-        ({"near": np.full(6, 9.0)}, "near"),
-        ({"position": [0.1, 0.2, 0.3], "world": True}, "world: the measurement frame was not estimated"),
-        ({"near": np.zeros(6), "world": True}, "world: joint values reach poses in the base frame"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    ({}, "position: none are given, expected where the targets are, or joint values alone"),
+    ({"position": [[0.0, 0.1]]}, "position"),
+    ({"position": [0.1, 0.2, 0.3], "rotation": np.ones((3, 3))}, "rotation"),
+    ({"position": [0.1, 0.2, 0.3], "near": np.zeros((2, 6))}, "near: 2 rows, expected one for all, or 1"),
+    ({"near": np.full(6, 9.0)}, "near"),
+    ({"position": [0.1, 0.2, 0.3], "world": True}, "world: the measurement frame was not estimated"),
+    ({"near": np.zeros(6), "world": True}, "world: joint values reach poses in the base frame"),
+])  # fmt: skip
 def test_what_cannot_be_corrected_is_one_line(calibrated, arguments, message):
     with pytest.raises(InputError) as raised:
         correct(calibrated[2], **arguments)

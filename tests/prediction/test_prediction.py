@@ -165,16 +165,13 @@ def test_unknown_errors_count_as_larger_than_all_known_ones():
     assert summed_up(errors[[0, 1]]) == {"rms": np.sqrt(2.5), "median": 2.0, "p95": 2.0, "largest": 2.0}
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"readings": np.zeros((2, 3))}, "readings: shape"),
-        ({"readings": np.zeros((0, 4))}, "readings"),
-        ({"readings": [[np.nan] * 4]}, "readings"),
-        ({"limit": 0.0}, "limit"),
-        ({"measured": np.zeros((0, 4))}, "measured"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    ({"readings": np.zeros((2, 3))}, "readings: shape"),
+    ({"readings": np.zeros((0, 4))}, "readings"),
+    ({"readings": [[np.nan] * 4]}, "readings"),
+    ({"limit": 0.0}, "limit"),
+    ({"measured": np.zeros((0, 4))}, "measured"),
+])  # fmt: skip
 def test_what_cannot_be_used_is_one_line(calibrated, given, message):
     with pytest.raises(InputError, match=message) as caught:
         predict(calibrated[0], **given)

@@ -17,20 +17,15 @@ from fg_calib.report.html import build_page
 
 WEAKLY = "Weakly determined (sigma above a tenth of the prior sigma, or of 1 mrad at the reach)"
 SECTIONS = [
-    *(
-        "The arm and what was measured",
-        "Notes",
-        "Residuals (RMS)",
-        "Fit statistics",
-        "Goodness of fit (1 sigma of a row)",
-    ),
+    *("The arm and what was measured", "Notes", "Residuals (RMS)", "Fit statistics",
+      "Goodness of fit (1 sigma of a row)"),
     *("Prediction of the test rows", "Expected tool error (RMS at 10 test configurations)"),
     *("Parameters", "Suspicious rows", "Suspicious test rows", "Suspicious configurations"),
     "Measurement frame (world_T_base)",
     *("Not identifiable from these data", WEAKLY, "Studentised residuals", "Error over joint space"),
     *("Correlations", "Expected error over the workspace"),
     "Inputs, options and versions",
-]
+]  # fmt: skip
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
 

@@ -162,17 +162,14 @@ def test_one_pose_or_position_in_one_call():
     assert near.readings[0] == pytest.approx(q, abs=1e-8)  # REACHED, by a Jacobian of size 1
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"position": [1, 2]}, r"position: shape \(1, 2\), expected \(n, 3\)"),
-        ({"position": [1, 2, np.nan]}, "position: row 0: found nan"),
-        ({"rotation": np.eye(4)}, r"rotation: shape \(1, 4, 4\), expected \(1, 3, 3\)"),
-        ({"rotation": 2 * np.eye(3)}, "rotation: row 0: found .*, expected a rotation matrix"),
-        ({"near": [0, 0]}, r"near: shape \(2,\), expected \(4\)"),
-        ({"n_starts": 0}, "n_starts: found 0"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    ({"position": [1, 2]}, r"position: shape \(1, 2\), expected \(n, 3\)"),
+    ({"position": [1, 2, np.nan]}, "position: row 0: found nan"),
+    ({"rotation": np.eye(4)}, r"rotation: shape \(1, 4, 4\), expected \(1, 3, 3\)"),
+    ({"rotation": 2 * np.eye(3)}, "rotation: row 0: found .*, expected a rotation matrix"),
+    ({"near": [0, 0]}, r"near: shape \(2,\), expected \(4\)"),
+    ({"n_starts": 0}, "n_starts: found 0"),
+])  # fmt: skip
 def test_targets_are_checked(given, message):
     with pytest.raises(InputError, match=f"^{message}"):
         solve_inverse(small_arm(), **{"position": [0.1, 0.2, 0.3]} | given)

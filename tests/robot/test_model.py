@@ -51,44 +51,41 @@ def test_a_tool_is_a_matrix_too(rpy):
 FOUR = [row[:4] for row in ROWS]
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"rows": [[0, 1, 2]]}, r"rows: shape \(1, 3\), expected \(n, 4\)"),
-        ({"rows": []}, r"rows: shape \(0,\), expected \(n, 4\)"),
-        ({"rows": np.zeros((0, 4))}, "rows: no joints, expected at least one"),
-        ({"rows": [[0, 1, 2, np.nan]]}, "rows: row 0: found nan, expected a finite number"),
-        ({"rows": [[0, 1, 2, "x"]]}, "rows: found .*, expected numbers of shape"),
-        ({"rows": [[0, 90, 2, 0]]}, "rows: row 0: found 90, expected angles in rad, two turns at most; are they"),
-        ({"rows": ROWS}, r"rows: shape \(3, 5\), expected \(n, 4\): the convention dh has no beta"),
-        ({"convention": "DH"}, "convention: found 'DH', expected one of dh, .* did you mean dh?"),
-        ({"types": "sliding"}, "types: joint 1: found 'sliding', expected one of revolute, prismatic"),
-        ({"types": ["revolute"]}, "types: 1 for 3 joints, expected one a joint"),
-        ({"limits": [[0, 1]]}, "limits: 1 for 3 joints"),
-        ({"limits": [[0, 1], [1, 0], None]}, r"limits: joint 2: found \[1, 0\], expected lower below upper"),
-        ({"names": ["a", "a", "b"]}, "names: joint 2: found 'a', as before, expected different names"),
-        ({"tool": [1, 2]}, r"tool: shape \(2,\), expected \(3\), \(6\) or \(4, 4\)"),
-        ({"base": np.ones((4, 4))}, "base: a matrix that is no pose"),
-        ({"base": np.diag([1, 1, -1, 1])}, "base: a matrix that is no pose"),
-        ({"tolerance": {"a": 0.0}}, "tolerance: a: found 0.0, expected a finite number above 0"),
-        ({"tolerance": {"b": 1.0}}, "robot: tolerance: unknown parameter or kind 'b'"),
-        ({"types": 3}, "types: found 3, expected a type, or one a joint$"),
-        ({"limits": 3}, "limits: found 3, expected lower and upper of each joint$"),
-        ({"limits": [1, 2, 3]}, "limits: joint 1: found 1, expected lower below upper, or None$"),
-        ({"limits": [["-1", "1"]] * 3}, "limits: joint 1: found .*'-1', '1'.*, expected lower and upper$"),
-        ({"limits": [[np.nan, 1]] * 3}, r"limits: joint 1: found \[nan, 1\], expected lower below upper, or None$"),
-        ({"names": [1, 2, 3]}, "names: joint 1: found 1, expected a word$"),
-        ({"tolerance": ["a"]}, r"tolerance: found \['a'\], expected a mapping$"),
-        ({"tolerance": {"a": "1e-3"}}, "tolerance: a: found '1e-3', expected a finite number above 0$"),
-        ({"tool": {"w": 1.0}}, "tool: unknown value 'w', expected one of x, y, z, yaw, pitch, roll$"),
-        ({"tool": {"x": "far"}}, r"tool: x: found 'far', expected numbers of shape \(\)$"),
-        ({"tool": [0, 0, 0.1, 90, 0, 0]}, r"tool: roll: found 90, expected angles in rad, .* most; is it in deg\?$"),
-        ({"tool": {"roll": 90}}, r"tool: roll: found 90, expected angles in rad, .* most; is it in deg\?$"),
-        ({"estimate": 3}, "estimate: found 3, expected a list of names$"),
-        ({"fixed": [None]}, "robot: fixed: unknown parameter None, expected one of base.x"),
-        ({"fixed": ["a9"]}, "robot: fixed: unknown parameter 'a9'"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    ({"rows": [[0, 1, 2]]}, r"rows: shape \(1, 3\), expected \(n, 4\)"),
+    ({"rows": []}, r"rows: shape \(0,\), expected \(n, 4\)"),
+    ({"rows": np.zeros((0, 4))}, "rows: no joints, expected at least one"),
+    ({"rows": [[0, 1, 2, np.nan]]}, "rows: row 0: found nan, expected a finite number"),
+    ({"rows": [[0, 1, 2, "x"]]}, "rows: found .*, expected numbers of shape"),
+    ({"rows": [[0, 90, 2, 0]]}, "rows: row 0: found 90, expected angles in rad, two turns at most; are they"),
+    ({"rows": ROWS}, r"rows: shape \(3, 5\), expected \(n, 4\): the convention dh has no beta"),
+    ({"convention": "DH"}, "convention: found 'DH', expected one of dh, .* did you mean dh?"),
+    ({"types": "sliding"}, "types: joint 1: found 'sliding', expected one of revolute, prismatic"),
+    ({"types": ["revolute"]}, "types: 1 for 3 joints, expected one a joint"),
+    ({"limits": [[0, 1]]}, "limits: 1 for 3 joints"),
+    ({"limits": [[0, 1], [1, 0], None]}, r"limits: joint 2: found \[1, 0\], expected lower below upper"),
+    ({"names": ["a", "a", "b"]}, "names: joint 2: found 'a', as before, expected different names"),
+    ({"tool": [1, 2]}, r"tool: shape \(2,\), expected \(3\), \(6\) or \(4, 4\)"),
+    ({"base": np.ones((4, 4))}, "base: a matrix that is no pose"),
+    ({"base": np.diag([1, 1, -1, 1])}, "base: a matrix that is no pose"),
+    ({"tolerance": {"a": 0.0}}, "tolerance: a: found 0.0, expected a finite number above 0"),
+    ({"tolerance": {"b": 1.0}}, "robot: tolerance: unknown parameter or kind 'b'"),
+    ({"types": 3}, "types: found 3, expected a type, or one a joint$"),
+    ({"limits": 3}, "limits: found 3, expected lower and upper of each joint$"),
+    ({"limits": [1, 2, 3]}, "limits: joint 1: found 1, expected lower below upper, or None$"),
+    ({"limits": [["-1", "1"]] * 3}, "limits: joint 1: found .*'-1', '1'.*, expected lower and upper$"),
+    ({"limits": [[np.nan, 1]] * 3}, r"limits: joint 1: found \[nan, 1\], expected lower below upper, or None$"),
+    ({"names": [1, 2, 3]}, "names: joint 1: found 1, expected a word$"),
+    ({"tolerance": ["a"]}, r"tolerance: found \['a'\], expected a mapping$"),
+    ({"tolerance": {"a": "1e-3"}}, "tolerance: a: found '1e-3', expected a finite number above 0$"),
+    ({"tool": {"w": 1.0}}, "tool: unknown value 'w', expected one of x, y, z, yaw, pitch, roll$"),
+    ({"tool": {"x": "far"}}, r"tool: x: found 'far', expected numbers of shape \(\)$"),
+    ({"tool": [0, 0, 0.1, 90, 0, 0]}, r"tool: roll: found 90, expected angles in rad, .* most; is it in deg\?$"),
+    ({"tool": {"roll": 90}}, r"tool: roll: found 90, expected angles in rad, .* most; is it in deg\?$"),
+    ({"estimate": 3}, "estimate: found 3, expected a list of names$"),
+    ({"fixed": [None]}, "robot: fixed: unknown parameter None, expected one of base.x"),
+    ({"fixed": ["a9"]}, "robot: fixed: unknown parameter 'a9'"),
+])  # fmt: skip
 def test_mistakes_are_named(given, message):
     with pytest.raises(InputError, match=message):
         Robot.from_dh(**{"rows": FOUR} | given)
@@ -120,15 +117,12 @@ def test_the_text_of_a_urdf_is_no_path():
         Robot.from_urdf('<?xml version="1.0"?>\n<robot name="arm"/>')
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (None, r"robot: shape \(\), expected 24, one a parameter$"),
-        ([1.0], "robot: 1 values, expected 24, one a parameter$"),
-        ([[1.0]], r"robot: shape \(1, 1\), expected 24, one a parameter$"),
-        ([0.0, 0.0, 0.0, np.nan, *np.zeros(20)], "robot: row 3: found nan, expected a finite number$"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    (None, r"robot: shape \(\), expected 24, one a parameter$"),
+    ([1.0], "robot: 1 values, expected 24, one a parameter$"),
+    ([[1.0]], r"robot: shape \(1, 1\), expected 24, one a parameter$"),
+    ([0.0, 0.0, 0.0, np.nan, *np.zeros(20)], "robot: row 3: found nan, expected a finite number$"),
+])  # fmt: skip
 def test_values_are_finite_and_one_a_parameter(values, message):
     with pytest.raises(InputError, match=message):
         Robot.from_dh(FOUR).with_values(values)
@@ -158,15 +152,12 @@ def test_limits_of_many_turns_are_told_of(caplog, limit, told):
     assert caplog.messages == expected
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda b: b.build(tolerance=0.003), "tolerance: found 0.003, expected a mapping"),
-        (lambda b: b.add_frame("x", 3, 0, False), "values: found 3, expected a mapping"),
-        (lambda b: b.add_convention_joint(3, {}), "joint: found 3, expected a Joint"),
-        (lambda _: RobotBuilder(3, "dh"), "name: found 3, expected text"),
-    ],
-)
+@pytest.mark.parametrize(("call", "message"), [
+    (lambda b: b.build(tolerance=0.003), "tolerance: found 0.003, expected a mapping"),
+    (lambda b: b.add_frame("x", 3, 0, False), "values: found 3, expected a mapping"),
+    (lambda b: b.add_convention_joint(3, {}), "joint: found 3, expected a Joint"),
+    (lambda _: RobotBuilder(3, "dh"), "name: found 3, expected text"),
+])  # fmt: skip
 def test_a_builder_given_something_else_says_so(call, message):
     with pytest.raises(InputError, match=message):
         call(RobotBuilder("arm", "dh"))

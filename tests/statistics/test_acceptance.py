@@ -66,15 +66,12 @@ def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
     assert words in result.not_accepted[0]
 
 
-@pytest.mark.parametrize(
-    ("accept", "message"),
-    [
-        ({"positon": 1e-3}, "accept: unknown limit 'positon', expected one of position, orientation, distance, angle"),
-        ({"position": 0.0}, "accept: position: found 0.0, expected a finite number above 0"),
-        ({"position": True}, "accept: position: found True, expected a finite number above 0"),
-        ("0.5 mm", "accept: found '0.5 mm', expected a Limits, such as Limits(position=5e-4)"),
-    ],
-)
+@pytest.mark.parametrize(("accept", "message"), [
+    ({"positon": 1e-3}, "accept: unknown limit 'positon', expected one of position, orientation, distance, angle"),
+    ({"position": 0.0}, "accept: position: found 0.0, expected a finite number above 0"),
+    ({"position": True}, "accept: position: found True, expected a finite number above 0"),
+    ("0.5 mm", "accept: found '0.5 mm', expected a Limits, such as Limits(position=5e-4)"),
+])  # fmt: skip
 def test_wrong_limits_are_one_line(accept, message):
     with pytest.raises(InputError) as error:
         Options.of(accept=accept)
@@ -105,18 +102,15 @@ def test_what_is_not_accepted_ends_with_3_and_says_why(tmp_path, fg_calib):
     assert ended.err.startswith("not accepted: NOT EVALUATED: position 0.1")
 
 
-@pytest.mark.parametrize(
-    ("accept", "message"),
-    [
-        ({"position": "0.5 deg"}, "accept: position: found '0.5 deg', expected a number with one of m, cm, mm, um, in"),
-        ({"position": "0.5 Mm"}, "expected a number with one of m, cm, mm, um, in; did you mean mm?"),
-        ({"position": "a lot"}, "accept: position: found 'a lot', expected a number, with its unit or without"),
-        ({"position": -1}, "accept: position: found -1, expected a number above 0"),
-        ({"orientation": "5 mm"}, "accept: orientation: found '5 mm', expected a number with one of rad, deg, mrad"),
-        ({"posiion": 1}, "accept: unknown limit 'posiion', expected one of position, orientation, distance, angle"),
-        ([1], "accept: found [1], expected limits by name"),
-    ],
-)
+@pytest.mark.parametrize(("accept", "message"), [
+    ({"position": "0.5 deg"}, "accept: position: found '0.5 deg', expected a number with one of m, cm, mm, um, in"),
+    ({"position": "0.5 Mm"}, "expected a number with one of m, cm, mm, um, in; did you mean mm?"),
+    ({"position": "a lot"}, "accept: position: found 'a lot', expected a number, with its unit or without"),
+    ({"position": -1}, "accept: position: found -1, expected a number above 0"),
+    ({"orientation": "5 mm"}, "accept: orientation: found '5 mm', expected a number with one of rad, deg, mrad"),
+    ({"posiion": 1}, "accept: unknown limit 'posiion', expected one of position, orientation, distance, angle"),
+    ([1], "accept: found [1], expected limits by name"),
+])  # fmt: skip
 def test_limits_of_a_job_that_cannot_be_are_one_line(tmp_path, fg_calib, accept, message):
     ended = of_job(tmp_path, fg_calib, accept)
     assert (ended.code, ended.out) == (1, "")

@@ -39,16 +39,13 @@ def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
     assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("model", "frame", "estimate"),
-    [
-        ("distance-rotation", "known", []),
-        ("pose", "unknown", []),
-        ("pose", "known", TOOL),
-        ("pose", "known", ["tool.x"]),
-        ("position", "known", []),
-    ],
-)
+@pytest.mark.parametrize(("model", "frame", "estimate"), [
+    ("distance-rotation", "known", []),
+    ("pose", "unknown", []),
+    ("pose", "known", TOOL),
+    ("pose", "known", ["tool.x"]),
+    ("position", "known", []),
+])  # fmt: skip
 def test_covariance_equals_gtsams_marginals_where_these_exist(model, frame, estimate):
     rng = np.random.default_rng(0)
     robot = paper_robot(tolerance=TOLERANCE, estimate=estimate)
