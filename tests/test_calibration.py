@@ -21,12 +21,10 @@ CASES = {
     "unknown frame and tool": ({"model": "pose", "frame": "unknown"}, {"tolerance": TOLERANCE, "estimate": TOOL}),
     "priors": ({"model": "distance-rotation"}, {"tolerance": TOLERANCE}),
     "nothing holds what is lost": ({"model": "distance-rotation", "gauge": "none"}, {}),
-    "nothing holds base and tool": (
-        {"model": "pose", "gauge": "none"},
-        {"estimate": [*TOOL, *(name.replace("tool", "base") for name in TOOL)]},
-    ),
+    "nothing holds base and tool": ({"model": "pose", "gauge": "none"},
+                                    {"estimate": [*TOOL, *(name.replace("tool", "base") for name in TOOL)]}),
     "some are kept": ({"model": "position", "gauge": "keep"}, {"tolerance": TOLERANCE}),
-}
+}  # fmt: skip
 
 
 def given(name, n=25):

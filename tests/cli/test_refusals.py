@@ -54,21 +54,16 @@ def nothing(_folder):
     pass
 
 
-INPUT = {  # edit of the example's folder, command, what the one line holds
+# Edit of the example's folder, command, what the one line holds.
+INPUT = {
     "no job": (without(JOB), CALIBRATE, "calibration.yaml: no such file"),
     "no table": (without(POSES), CALIBRATE, "poses.csv: no such file"),
     "no column": (replaced(POSES, ",y,", ",other,"), CALIBRATE, "poses.csv: no column y, expected x y z together"),
-    "text in a number": (
-        replaced(POSES, r"^(p2,[^,]*,)[^,]*", r"\1abc"),
-        CALIBRATE,
-        "poses.csv:4: q2: found 'abc', expected a finite number",
-    ),
+    "text in a number": (replaced(POSES, r"^(p2,[^,]*,)[^,]*", r"\1abc"), CALIBRATE,
+                         "poses.csv:4: q2: found 'abc', expected a finite number"),
     "an unknown key": (replaced(JOB, "^pairing", "pairng"), CALIBRATE, "unknown key 'pairng', expected one of pairs,"),
-    "degrees read as radians": (
-        replaced(JOB, "angle: deg", "angle: rad"),
-        CALIBRATE,
-        "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is it in deg?",
-    ),
+    "degrees read as radians": (replaced(JOB, "angle: deg", "angle: rad"), CALIBRATE,
+                                "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is it in deg?"),
     "an unknown model": (replaced(JOB, "^model: .*", "model: distances"), CALIBRATE, "did you mean distance?"),
     "no noise": (replaced(JOB, "^noise.*", ""), CALIBRATE, "no sigma for distance, expected noise.position or a"),
     "a table as the job": (nothing, ("calibrate", POSES), "expected a mapping, key: value"),
@@ -76,27 +71,18 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "no robot to observe": (nothing, ("observe", "missing.yaml"), "missing.yaml: no such file"),
     "an unknown parameter": (nothing, ("observe", ROBOT, "--prefer", "d9"), "unknown parameter 'd9'"),
     "a table in degrees": (nothing, OBSERVE[:4], "is it in deg?"),
-    "noise of zero": (
-        nothing,
-        (*OBSERVE, "--position-noise", 0),
-        "noise: position: found 0.0, expected a finite number",
-    ),
+    "noise of zero": (nothing, (*OBSERVE, "--position-noise", 0),
+                      "noise: position: found 0.0, expected a finite number"),
     "orientations alone": (written("qx,qy,qz,qw\n0,0,0,1\n"), CORRECT, "orientations without x y z"),
     "a table of no frame": (written("x,y,z\n1,2,3\n"), (*CORRECT, "--table", 0), "table: found 0 without world"),
-    "a frame that is known": (
-        written("x,y,z\n1,2,3\n"),
-        (*CORRECT, "--world"),
-        "world: the measurement frame was not estimated",
-    ),
+    "a frame that is known": (written("x,y,z\n1,2,3\n"), (*CORRECT, "--world"),
+                              "world: the measurement frame was not estimated"),
     "commands over a file": (written("mine"), (*CORRECT, "--out", "table.csv"), "table.csv: is there already"),
     "no joint columns": (written("a\n1\n"), PREDICT, "no joint columns"),
     "no configurations": (written(JOINTS), PREDICT, "table.csv"),
     "a limit that is an angle": (written(JOINTS + CENTRE), (*PREDICT, "--limit", "0.5deg"), "--limit"),
-    "a prediction over a stranger's file": (
-        written("mine", "predict.csv"),
-        ("predict", "result", "--out", "."),
-        "not written by this command",
-    ),
+    "a prediction over a stranger's file": (written("mine", "predict.csv"), ("predict", "result", "--out", "."),
+                                            "not written by this command"),
     "another table to check": (written("x,y\n1,2\n"), ("check", "result", "table.csv"), "table.csv"),
     "a name of no table": (nothing, ("check", "result", POSES, "--like", "x.csv"), "one of poses.csv"),
     "rows that were counted": (nothing, UPDATE, "in the calibration already"),
@@ -105,20 +91,15 @@ INPUT = {  # edit of the example's folder, command, what the one line holds
     "the folder of the result": (nothing, (*UPDATE[:-1], "result"), "the folder of the result"),
     "too many stops": (nothing, (*DESIGN, "--n", 100000), "n: "),
     "a target without unit": (nothing, (*DESIGN, "--target", "0.3"), "--target: 0.3; give a unit, such as 0.3mm"),
-    "a folder without result": (
-        lambda folder: (folder / "empty").mkdir(),
-        ("export", "empty", "--to", "dh"),
-        "error: empty: no result.json, ",
-    ),
+    "a folder without result": (lambda folder: (folder / "empty").mkdir(), ("export", "empty", "--to", "dh"),
+                                "error: empty: no result.json, "),
     "an export over a file": (nothing, (*EXPORT, "--out", ROBOT), f"error: {ROBOT}: is there already, "),
-    "an example over a file": (
-        nothing,
-        ("example", "space-robot", "--out", "."),
-        f"{JOB}: is there already, expected a folder without it",
-    ),
-}
+    "an example over a file": (nothing, ("example", "space-robot", "--out", "."),
+                               f"{JOB}: is there already, expected a folder without it"),
+}  # fmt: skip
 
-USAGE = {  # command, what is said of it
+# Command, what is said of it.
+USAGE = {
     "no command": ((), "Usage: fg-calib"),
     "an unknown command": (("recalibrate", JOB), "recalibrate"),
     "no job": (("calibrate",), "JOB"),

@@ -130,11 +130,9 @@ def test_what_is_left_out_or_put_in_order_is_reported(bag):
     assert found.position[:, 0].tolist() == [3.0, 5.0]
     assert joints.source.notes == ("1 message without the robot's joints left out",)
     assert found.source.notes == (
-        "1 message with nan left out",
-        "2 messages out of order put in order",
-        "1 message with the stamp of another left out",
-        "all orientations are the same: taken as not measured",
-    )
+        "1 message with nan left out", "2 messages out of order put in order",
+        "1 message with the stamp of another left out", "all orientations are the same: taken as not measured"
+    )  # fmt: skip
     assert found.rotation is None
 
 

@@ -147,10 +147,8 @@ def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
 REFUSED = {
     "no robot": (["poses.csv"], "init: no robot among the files, expected one, such as robot.yaml or a URDF"),
     "no table": (["robot.yaml"], "init: no table among the files, expected one, such as poses.csv"),
-    "a picture": (
-        ["robot.yaml", "poses.png"],
-        "poses.png: neither robot, camera nor table, expected robot.yaml (joints",
-    ),
+    "a picture": (["robot.yaml", "poses.png"],
+                  "poses.png: neither robot, camera nor table, expected robot.yaml (joints"),
     "joints alone": (["robot.yaml", "alone.csv"], "alone.csv: joint readings alone, expected what was measured"),
     "pairs alone": (["robot.yaml", "pairs.csv"], "pairs.csv: pairs alone, expected the table of the configurations"),
     "two units": (["robot.yaml", "mixed.csv"], "mixed.csv: lengths in cm, mm, expected one of m, cm, mm, um, in"),
@@ -158,7 +156,7 @@ REFUSED = {
     "a job": (["job.yaml", "poses.csv"], "job.yaml: neither robot, camera nor table, expected robot.yaml"),
     "no camera": (["robot.yaml", "seen.csv"], "seen.csv: images of a camera that is not among the files"),
     "two joints": (["robot.yaml", "few.csv"], "few.csv: neither joint readings nor pairs, expected columns q1 to q6"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)
