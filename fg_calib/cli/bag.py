@@ -64,8 +64,7 @@ def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -
     offsets = {"offset": stops.offset, "applied_offset": stops.applied}
     skipped, topics = [s._asdict() for s in stops.skipped], {"joints": _topic(joints), "pose": _topic(poses)}
     more = {"topics": topics, **offsets, **found, "skipped": skipped, "scatter": stops.scatter}
-    document: dict[str, Any] = plain({"schema": "fg-calib/bag/1", "bag": name, **more})
-    return document
+    return plain({"schema": "fg-calib/bag/1", "bag": name, **more})
 
 
 def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> RenderableType:

@@ -118,5 +118,4 @@ def _root(W: Floats) -> Floats:
     """X with `X X^T = W`, of as many columns as W has directions."""
     w, V = np.linalg.eigh(W)
     kept = w > 1e-15 * w[-1]
-    out: Floats = V[:, kept] * np.sqrt(w[kept])
-    return out
+    return V[:, kept] * np.sqrt(w[kept])

@@ -135,8 +135,7 @@ def _compress(rows: Floats) -> Floats:
         return rows
     _, s, Vt = np.linalg.svd(rows, full_matrices=False)
     kept = s > _LOST_SHARE * s.max(initial=0.0)
-    out: Floats = s[kept, None] * Vt[kept]
-    return out
+    return s[kept, None] * Vt[kept]
 
 
 # --- the system to choose from ---

@@ -160,8 +160,7 @@ def _speed(time: Floats, position: Floats, at: Floats) -> Floats:
     """Speed along a path at some times, shape (n,), [m/s]."""
     ends = [at - SPEED_WIDTH_S / 2.0, at + SPEED_WIDTH_S / 2.0]
     before, after = (np.array([np.interp(end, time, axis) for axis in position.T]) for end in ends)
-    speed: Floats = np.linalg.norm(after - before, axis=0) / SPEED_WIDTH_S
-    return speed
+    return np.linalg.norm(after - before, axis=0) / SPEED_WIDTH_S
 
 
 MIN_SAMPLES = 12

@@ -375,8 +375,7 @@ class Result(Section):
 
     def document(self) -> dict[str, Any]:
         """The content of `result.json`."""
-        document: dict[str, Any] = json.loads(self.model_dump_json(by_alias=True))
-        return document
+        return json.loads(self.model_dump_json(by_alias=True))
 
 
 def key_of(fit: statistics.KindFit, fits: tuple[statistics.KindFit, ...]) -> str:

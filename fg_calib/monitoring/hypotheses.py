@@ -318,8 +318,7 @@ def motion(rows: Linear, found: HypothesisTest) -> Floats:
 
 def rms_motion(motion: Floats) -> Floats:
     """RMS turn and shift of the tool, shape (2,), [rad] and [m]."""
-    out: Floats = np.sqrt(np.mean(np.sum(motion**2, axis=2), axis=0))
-    return out
+    return np.sqrt(np.mean(np.sum(motion**2, axis=2), axis=0))
 
 
 def merge_alike(rows: Linear, likely: Sequence[HypothesisTest], noise: Mapping[str, float]) -> list[HypothesisTest]:

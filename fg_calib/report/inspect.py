@@ -29,8 +29,7 @@ COUNTS = {
 
 def observability_document(found: Identifiability) -> dict[str, Any]:
     """The content of `observability.json`."""
-    document: dict[str, Any] = json.loads(TypeAdapter(Document).dump_json(found))
-    return document
+    return json.loads(TypeAdapter(Document).dump_json(found))
 
 
 def build_identifiability_report(found: Identifiability) -> Group:

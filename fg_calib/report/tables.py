@@ -258,8 +258,7 @@ def document_of(name: str, source: object = None, keys: str = "", **more: Any) -
         more: Other keys and their values.
     """
     head = {"schema": f"fg-calib/{name}/1", "version": __version__}
-    document: dict[str, Any] = plain(head | {key: getattr(source, key) for key in keys.split()} | more)
-    return document
+    return plain(head | {key: getattr(source, key) for key in keys.split()} | more)
 
 
 def write_document(folder: Path | str, name: str, document: dict[str, Any]) -> None:

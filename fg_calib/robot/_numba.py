@@ -49,10 +49,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         kernel: Any = numba.njit(cache=True, **_OPTIONS)(function)
     except RuntimeError:  # neither the package's folder nor the user's cache can be written
         _CompileNotice.cached = False
-        return numba.njit(**_OPTIONS)(function)  # type: ignore[no-any-return]
+        return numba.njit(**_OPTIONS)(function)
     if hasattr(kernel._cache, "_load_overload"):
         kernel._cache.load_overload = partial(_load_overload, kernel._cache)
-    return kernel  # type: ignore[no-any-return]
+    return kernel
 
 
 def _load_overload(cache: Any, signature: object, target_context: Any) -> Any:
@@ -68,7 +68,7 @@ def _load_overload(cache: Any, signature: object, target_context: Any) -> Any:
 def part(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile a part that kernels call, and Python does not: it is kept in their caches, without a Python wrapper."""
     options = _OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True} | options
-    return numba.njit(**options)(function)  # type: ignore[no-any-return]
+    return numba.njit(**options)(function)
 
 
 inlined = partial(part, forceinline=True)

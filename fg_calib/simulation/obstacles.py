@@ -56,8 +56,7 @@ def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
     moves = np.abs(points[0] - points[1]).max(axis=1) > MAX_CONTACT_M
     lines = moves[:-1] | moves[1:]
     start, end = points[2:, :-1][:, lines], points[2:, 1:][:, lines]  # (n, n_lines, 3)
-    hit: Booleans = np.any([_cross(start, end, box).any(axis=1) for box in boxes], axis=0)
-    return hit
+    return np.any([_cross(start, end, box).any(axis=1) for box in boxes], axis=0)
 
 
 def _cross(start: Floats, end: Floats, box: Box) -> Booleans:
@@ -73,5 +72,4 @@ def _cross(start: Floats, end: Floats, box: Box) -> Booleans:
     between = (start > lower) & (start < upper)
     enter = np.where(still, np.where(between, -np.inf, np.inf), np.minimum(first, last)).max(axis=-1)
     leave = np.where(still, np.where(between, np.inf, -np.inf), np.maximum(first, last)).min(axis=-1)
-    crosses: Booleans = np.maximum(enter, 0.0) <= np.minimum(leave, 1.0)
-    return crosses
+    return np.maximum(enter, 0.0) <= np.minimum(leave, 1.0)

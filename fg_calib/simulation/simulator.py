@@ -201,8 +201,7 @@ class Measuring:
     def directions(self, n: int) -> Floats:
         """Unit vectors in any direction, shape (n, 3)."""
         v = self.places.normal(size=(n, 3))
-        unit: Floats = v / np.linalg.norm(v, axis=1, keepdims=True)
-        return unit
+        return v / np.linalg.norm(v, axis=1, keepdims=True)
 
     def named(self, what: str, places: Sequence[Any]) -> dict[str, Any]:
         """Landmarks that are drawn, by names that no other instrument has."""

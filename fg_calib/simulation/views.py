@@ -237,8 +237,7 @@ def sees_board(views: BoardViews, rotation: Floats, position: Floats) -> Boolean
     across = 0.5 * np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) * [*views.board_size, 0.0]
     corners = across @ views.board.rotation.T + views.board.position  # (4, 3)
     seen = (corners - position[:, None]) @ rotation  # in the tool frame, (n, 4, 3)
-    inside: Booleans = (seen[:, :, 2] >= np.cos(views.field_of_view) * np.linalg.norm(seen, axis=2)).all(axis=1)
-    return inside
+    return (seen[:, :, 2] >= np.cos(views.field_of_view) * np.linalg.norm(seen, axis=2)).all(axis=1)
 
 
 def _half_sphere(n: int) -> Floats:

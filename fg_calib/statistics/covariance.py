@@ -262,5 +262,4 @@ def _orthonormal(directions: Floats, scales: Floats) -> Floats:
     scaled = directions / scales
     scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-300)
     _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
-    basis: Floats = Vt[s > graph.RANK_TOLERANCE * s.max(initial=0.0)]
-    return basis
+    return Vt[s > graph.RANK_TOLERANCE * s.max(initial=0.0)]

@@ -120,8 +120,7 @@ class JointErrors(FrozenArrays):
     @property
     def mean(self) -> Floats:
         """Mean error of each joint, in sigma of a reading, shape (k,)."""
-        out: Floats = (self.error / self.sigma).mean(axis=0)
-        return out
+        return (self.error / self.sigma).mean(axis=0)
 
     @property
     def scatter(self) -> Floats:

@@ -249,8 +249,7 @@ class Goodness(FrozenArrays):
 
     def unknown(self, table: ResidualTable) -> Booleans:
         """Predicted rows that depend on what neither data nor priors determine, shape (n,)."""
-        found: Booleans = table.test & (table.reason_code == 0) & ~np.isfinite(self.leverage)
-        return found
+        return table.test & (table.reason_code == 0) & ~np.isfinite(self.leverage)
 
     @property
     def gross_alone(self) -> bool:

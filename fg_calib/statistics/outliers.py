@@ -73,8 +73,7 @@ def _far(table: ResidualTable, fit: Goodness) -> Booleans:
     far = table.used & np.isin(table.measurement_number, table.measurement_number[far])
     n_far, n_used = (table.sum_by_end(rows) for rows in (far, table.used))
     wrong = np.append(2.0 * n_far > n_used, False)  # the last for rows without an end
-    found: Booleans = far | table.used & (wrong[table.a] | wrong[table.b])
-    return found
+    return far | table.used & (wrong[table.a] | wrong[table.b])
 
 
 def _fit_without_outliers(

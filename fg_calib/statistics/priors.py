@@ -388,8 +388,7 @@ def _beyond(names: tuple[str, ...], z: Floats, A: Floats, n_parameters: int) -> 
 def _inverse(C: Floats, rows: Integers) -> Floats:
     """The inverse of a part of a covariance, whose variances are `MIN_SIGMA` squared at least."""
     values, V = np.linalg.eigh(C[np.ix_(rows, rows)])
-    out: Floats = (V / np.maximum(values, MIN_SIGMA**2)) @ V.T
-    return out
+    return (V / np.maximum(values, MIN_SIGMA**2)) @ V.T
 
 
 def _prior_parameters(variables: graph.Variables) -> list[Parameter]:

@@ -46,8 +46,7 @@ class ResidualCovariance:
     @property
     def diagonal(self) -> Floats:
         """Variances, shape (n,)."""
-        out: Floats = self.d + row_squares(self.L) + np.einsum("ij,ij->i", self.P @ self.M, self.P)
-        return out
+        return self.d + row_squares(self.L) + np.einsum("ij,ij->i", self.P @ self.M, self.P)
 
     def at(self, rows: Integers) -> ResidualCovariance:
         """The part at some rows."""
@@ -156,8 +155,7 @@ class RowModel:
 
     def of_all(self, covariance: Floats) -> Floats:
         """The covariance of core and landmarks, of that of the core: shape (n_all, n_all)."""
-        out: Floats = self._follow @ covariance @ self._follow.T + self._alone @ self._alone.T
-        return out
+        return self._follow @ covariance @ self._follow.T + self._alone @ self._alone.T
 
     def errors(self, number: int, rows: Integers) -> ResidualCovariance:
         """Covariance of the rows of some measurements of a block; M is still open."""

@@ -161,8 +161,7 @@ def _root(problem: graph.Problem, name: graph.NoiseName) -> Sparse:
 def _square_roots(covariance: Floats) -> Floats:
     """Symmetric square roots of small covariances, shape (n, h, h)."""
     values, vectors = np.linalg.eigh(covariance)
-    root: Floats = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
-    return root
+    return (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
 
 
 @checked
