@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import statistics
+from fg_calib import monitoring, parallel, statistics
 from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
 from fg_calib.diagnostics.multistart import multistart
 from fg_calib.graph import Problem, Solution, problem_of, solve
 from fg_calib.inputs import Floats, FrozenArrays, InputError, SolverError, as_figures, checked, escaped
 from fg_calib.job import Job
-from fg_calib.monitoring import at_nominal
 from fg_calib.observability import Identifiability, Observability, identifiability_of
-from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot
 from fg_calib.statistics.residual_table import residual_table
@@ -95,7 +93,7 @@ class Assessment(FrozenArrays):
         return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
 
     @checked
-    @single_threaded
+    @parallel.single_threaded
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
 
@@ -183,7 +181,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
 
 
 @checked
-@single_threaded
+@parallel.single_threaded
 def assess(solution: Solution) -> Assessment:
     """Covariance, goodness of fit, residuals, identifiability and verdict of a solution.
 
@@ -200,7 +198,7 @@ def assess(solution: Solution) -> Assessment:
     """
     problem = solution.problem
     spread = statistics.spread_of(solution)
-    identifiability = identifiability_of(*at_nominal(problem.whole or problem, solution.before), "practical")
+    identifiability = identifiability_of(*monitoring.at_nominal(problem.whole or problem, solution.before), "practical")
     table = residual_table(solution)
     goodness = statistics.judge_without_outliers(solution, table, statistics.judge_fit(solution, spread, table))
     table = table.without(goodness.unknown(table))

@@ -33,17 +33,16 @@ def bag(
     as_json: Json = False,
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""
-    from fg_calib.importers import average_stops, read_bag, write_stops
-    from fg_calib.io import read_robot, require_absent
+    from fg_calib import importers, io
 
     if out is not None:
-        require_absent(out.parent, [out.name])
-    arm = read_robot(robot, base_link=base_link, tip_link=tip_link)
+        io.require_absent(out.parent, [out.name])
+    arm = io.read_robot(robot, base_link=base_link, tip_link=tip_link)
     topics = {"joints": joints, "pose": pose, "parent": parent, "child": child}
-    of_joints, of_pose = read_bag(recording, arm, **topics, names=names_in(names))
-    stops = average_stops(of_joints, of_pose, arm, still=still, offset=offset, most_offset=most_offset)
+    of_joints, of_pose = importers.read_bag(recording, arm, **topics, names=names_in(names))
+    stops = importers.average_stops(of_joints, of_pose, arm, still=still, offset=offset, most_offset=most_offset)
     if out is not None:
-        write_stops(out, stops, arm)
+        importers.write_stops(out, stops, arm)
     found = (recording.name, of_joints, of_pose, stops)
     show_result(as_json, lambda: _document(*found), lambda: _report(*found))
     nothing = "nothing is written: --out poses.csv writes the table"

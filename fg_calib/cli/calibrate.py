@@ -36,8 +36,7 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
-    from fg_calib.batch import Order, job_names
-    from fg_calib.io import require_writable
+    from fg_calib import batch, io
     from fg_calib.parallel import dask_executor, local_processes
 
     if out is None and (report or figures):
@@ -45,14 +44,14 @@ def calibrate(
     if workers is not None and scheduler is not None:
         raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
     several = len(jobs) > 1
-    names = job_names(jobs) if several else [""]
+    names = batch.job_names(jobs) if several else [""]
     if out is not None and several:
-        require_writable(out)
+        io.require_writable(out)
     if scheduler is not None:  # its workers run on other machines
         jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     saved = {"report": report, "figures": figures, "residuals": residuals}
     folders = [None if out is None else out / name for name in names]
-    orders = [Order(*one, folds, saved) for one in zip(names, jobs, folders, strict=True)]
+    orders = [batch.Order(*one, folds, saved) for one in zip(names, jobs, folders, strict=True)]
     run_on = dask_executor(scheduler) if scheduler else local_processes(workers) if workers else nullcontext()
     with run_on as executor:
         if several:

@@ -15,18 +15,17 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare the factor graph with plain least squares on the same job, or a new result with an old one."""
-    from fg_calib.baseline import comparison
-    from fg_calib.io import read_job, read_result
+    from fg_calib import baseline, io
     from fg_calib.report import compare as report
     from fg_calib.report import write_document
 
     if new is not None:
-        both, files = (read_result(job), read_result(new)), (job, new)
+        both, files = (io.read_result(job), io.read_result(new)), (job, new)
         show_result(
             as_json, lambda: report.changes_document(*both, files), lambda: report.build_changes_report(*both, files)
         )
         return
-    found = comparison.compare(read_job(job))
+    found = baseline.comparison.compare(io.read_job(job))
     if out is not None:
         write_document(out, "comparison.json", report.comparison_document(found))
     show_result(as_json, lambda: report.comparison_document(found), lambda: report.build_comparison_report(found))

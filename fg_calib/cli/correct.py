@@ -19,22 +19,20 @@ def correct(
     as_json: Json = False,
 ) -> None:
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
-    from fg_calib.calibration import Calibration
+    from fg_calib import calibration, io, report
     from fg_calib.calibration import correct as correct_targets
-    from fg_calib.io import Units, read_targets, require_absent
-    from fg_calib.report import build_correction_report, correction_document, write_commands
 
     if out is not None:
-        require_absent(out.parent, [out.name])
-    found, units = Calibration.load(result), Units(length, angle)
-    wanted = read_targets(targets, found.robot, units)
+        io.require_absent(out.parent, [out.name])
+    found, units = calibration.Calibration.load(result), io.Units(length, angle)
+    wanted = io.read_targets(targets, found.robot, units)
     commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)
     if out is not None:
-        write_commands(out, wanted.ids, commands, found.robot, units)
+        report.write_commands(out, wanted.ids, commands, found.robot, units)
     show_result(
         as_json,
-        lambda: correction_document(found.robot.name, wanted.ids, commands),
-        lambda: build_correction_report(wanted.ids, commands, found.robot),
+        lambda: report.correction_document(found.robot.name, wanted.ids, commands),
+        lambda: report.build_correction_report(wanted.ids, commands, found.robot),
     )
     say(f"wrote {len(wanted.ids)} commands to {out}" if out else "nothing is written: --out commands.csv writes them")
     left = int((~commands.reached).sum())

@@ -34,16 +34,15 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
+    from fg_calib import io, report
     from fg_calib.designs.design import design as designed
-    from fg_calib.io import read_joint_table, require_absent, require_writable
-    from fg_calib.report import build_design_report, design_document, write_design
 
     if n is not None and target is not None:
         raise typer.BadParameter("one of the two", param_hint="--n and --target")
     subject, units, robot = _read(of)
     if out is not None:
-        require_writable(out)
-        require_absent(out, ["design.json"])  # before the search, which takes its time
+        io.require_writable(out)
+        io.require_absent(out, ["design.json"])  # before the search, which takes its time
     choices: dict[str, Any] = {
         "n": n,
         "target": target,
@@ -51,29 +50,28 @@ def design(
         "fitted": None if error is None else error == "fitted",
         "criterion": criterion,
         "seed": seed,
-        "given": None if given is None else read_joint_table(given, robot, units)[1],
-        "task": None if task is None else read_joint_table(task, robot, units)[1],
+        "given": None if given is None else io.read_joint_table(given, robot, units)[1],
+        "task": None if task is None else io.read_joint_table(task, robot, units)[1],
         **_candidates(candidates, robot, units),
     }
     found = designed(subject, **choices)
-    names = write_design(out, found, units) if out is not None else ()
-    show_result(as_json, lambda: design_document(found), lambda: build_design_report(found))
+    names = report.write_design(out, found, units) if out is not None else ()
+    show_result(as_json, lambda: report.design_document(found), lambda: report.build_design_report(found))
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
     end([] if found.reached else ["the target is not reached"], "doubtful")
 
 
 def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
     """Read the scenario or job, the units of its tables, and the arm."""
-    from fg_calib.inputs import InputError
+    from fg_calib import inputs, simulation
     from fg_calib.io import Units, is_job, read_job, units_of
-    from fg_calib.simulation import read_scenario
 
     if is_job(of):
         job = read_job(of)
         return job, units_of(job), job.robot
     if Path(of).name == "result.json" or (Path(of) / "result.json").exists():
-        raise InputError(of, "a result", "a scenario, or the job that the result came from")
-    scenario = read_scenario(of)
+        raise inputs.InputError(of, "a result", "a scenario, or the job that the result came from")
+    scenario = simulation.read_scenario(of)
     return scenario, Units(scenario.length_unit, scenario.angle_unit), scenario.robot
 
 

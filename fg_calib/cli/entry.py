@@ -15,9 +15,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from fg_calib import __version__
+from fg_calib import __version__, inputs
 from fg_calib.cli.output import progress, say
-from fg_calib.inputs import CalibrationError, printable
 
 COMMANDS = (
     *("init", "inspect", "calibrate", "report", "export", "correct", "predict", "compare", "check", "update"),
@@ -44,7 +43,7 @@ class _Line(logging.Formatter):
     """A logged message as one line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
+        return inputs.printable(super().format(record))
 
 
 def run() -> None:
@@ -58,7 +57,7 @@ def run() -> None:
     try:
         with progress():
             build_app(asked or COMMANDS)(prog_name="fg-calib")
-    except CalibrationError as error:
+    except inputs.CalibrationError as error:
         _fail(str(error))
     except MemoryError:
         _fail("there is not enough memory for this")

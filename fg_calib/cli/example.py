@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from fg_calib.cli import EXAMPLES
+from fg_calib import cli, inputs
 from fg_calib.cli.output import argument, option, say_next
-from fg_calib.inputs import InputError
 
 
 def example(
@@ -17,10 +16,10 @@ def example(
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
     from fg_calib.io import fill_folder, require_absent
 
-    known = sorted(folder.name for folder in EXAMPLES.iterdir() if folder.is_dir())
+    known = sorted(folder.name for folder in cli.EXAMPLES.iterdir() if folder.is_dir())
     if name not in known:
-        raise InputError("example", f"found {name!r}", f"one of {', '.join(known)}")
-    files = sorted(file for file in (EXAMPLES / name).iterdir() if file.is_file())
+        raise inputs.InputError("example", f"found {name!r}", f"one of {', '.join(known)}")
+    files = sorted(file for file in (cli.EXAMPLES / name).iterdir() if file.is_file())
     require_absent(out, [file.name for file in files])
 
     def write(folder: Path) -> None:

@@ -14,12 +14,11 @@ def init(
     out: Annotated[Path, option("--out", "JOB", "The job to write.")] = Path("calibration.yaml"),
 ) -> None:
     """Write a commented job for a robot and its tables, recognised by their headers; nothing is overwritten."""
-    from fg_calib.importers import draft_job
-    from fg_calib.io import require_absent, write_text
+    from fg_calib import importers, io
 
-    require_absent(out.parent, [out.name])
-    text = draft_job(files, out)
-    write_text(out, text)
+    io.require_absent(out.parent, [out.name])
+    text = importers.draft_job(files, out)
+    io.write_text(out, text)
     decisions = sum("DECIDE" in line for line in text.splitlines()[2:])
     say(f"wrote {out}: {decisions} lines with DECIDE are yours to look at")
     say(f"now: fg-calib inspect {shlex.quote(str(out))}")

@@ -10,11 +10,10 @@ from fg_calib.cli.output import Json, argument, end, show_result
 
 def inspect(job: Annotated[Path, argument("JOB", "The job, such as calibration.yaml.")], as_json: Json = False) -> None:
     """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
-    from fg_calib.diagnostics import inspect_job
-    from fg_calib.io import read_job
+    from fg_calib import diagnostics, io
     from fg_calib.report import build_inspection_report, inspection_document
 
-    given = read_job(job)
-    found = inspect_job(given)
+    given = io.read_job(job)
+    found = diagnostics.inspect_job(given)
     show_result(as_json, lambda: inspection_document(found, given), lambda: build_inspection_report(found, given))
     end(found.findings, "look at this first")

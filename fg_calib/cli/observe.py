@@ -31,9 +31,8 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
-    from fg_calib.inputs import Pairing
+    from fg_calib import inputs, measurements
     from fg_calib.io import Units, read_measurements, read_robot
-    from fg_calib.measurements import Noise
     from fg_calib.observability import observe_configurations, observe_structure
     from fg_calib.report import build_identifiability_report, observability_document, write_document
 
@@ -42,13 +41,13 @@ def observe(
         found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
     else:
         units = Units(length, angle)
-        noise = Noise(
+        noise = measurements.Noise(
             position=None if position_noise is None else position_noise * units.factor("m"),
             orientation=None if orientation_noise is None else orientation_noise * units.factor("rad"),
             joint=tuple(joint_noise * units.factor(joint.unit) for joint in arm.joints),
         )
         table = read_measurements(configurations, arm, units=units, noise=noise)
-        found = observe_configurations(arm, table, model, frame=frame, pairing=Pairing(pairing), prefer=names)
+        found = observe_configurations(arm, table, model, frame=frame, pairing=inputs.Pairing(pairing), prefer=names)
     if out is not None:
         write_document(out, "observability.json", observability_document(found))
     show_result(as_json, lambda: observability_document(found), lambda: build_identifiability_report(found))

@@ -18,23 +18,21 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
-    from fg_calib.calibration import Calibration
+    from fg_calib import calibration, io, report
     from fg_calib.calibration import predict as predict_tool
-    from fg_calib.io import Units, read_joint_table, require_writable
-    from fg_calib.report import build_prediction_report, prediction_document, write_prediction
 
-    units = Units(length, angle)
+    units = io.Units(length, angle)
     if out is not None:
-        require_writable(out)
-    arm = Calibration.load(result)
-    ids, readings = ((), None) if at is None else read_joint_table(at, arm.robot, units)
+        io.require_writable(out)
+    arm = calibration.Calibration.load(result)
+    ids, readings = ((), None) if at is None else io.read_joint_table(at, arm.robot, units)
     found = predict_tool(arm, readings, limit=limit)
     if out is not None:
-        write_prediction(out, found, arm.result, arm.robot, ids, units)
+        report.write_prediction(out, found, arm.result, arm.robot, ids, units)
     show_result(
         as_json,
-        lambda: prediction_document(found, arm.result, ids),
-        lambda: build_prediction_report(found, arm.result, arm.robot, ids),
+        lambda: report.prediction_document(found, arm.result, ids),
+        lambda: report.build_prediction_report(found, arm.result, arm.robot, ids),
     )
     if out is not None:
         say(f"wrote the prediction to {out}")

@@ -29,15 +29,13 @@ def update(
     as_json: Json = False,
 ) -> None:
     """Add new rows to the information of a calibration: its own rows are not read again."""
-    from fg_calib.calibration import Calibration
-    from fg_calib.inputs import InputError
-    from fg_calib.io import require_no_input, require_writable
+    from fg_calib import calibration, inputs, io
 
     if out.resolve() == (result.parent if result.is_file() else result).resolve():
-        raise InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
-    require_writable(out)
-    require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
-    before = Calibration.load(result)
+        raise inputs.InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
+    io.require_writable(out)
+    io.require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
+    before = calibration.Calibration.load(result)
     found = before.update(
         table,
         date=date,

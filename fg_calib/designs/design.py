@@ -17,18 +17,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib import inputs
+from fg_calib import inputs, job, prediction
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
 from fg_calib.designs.information import N_TASK, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.inputs import Floats, FrozenArrays, InputError, Integers, ProblemError, check_number, checked
-from fg_calib.job import Job
 from fg_calib.measurements import Table
 from fg_calib.observability import Observability, ObservedQuantities
 from fg_calib.parallel import single_threaded, tell
-from fg_calib.prediction import PoseRms
 from fg_calib.robot import Robot, random_readings
 from fg_calib.simulation import MOST_DRAWN, Box, Configurations, Scenario
 
@@ -79,9 +77,9 @@ class Design(FrozenArrays):
     readings: Floats
     ids: NDArray[np.str_]
     group: NDArray[np.str_]
-    expected: PoseRms
-    after_fit: PoseRms | None
-    before: PoseRms | None
+    expected: prediction.PoseRms
+    after_fit: prediction.PoseRms | None
+    before: prediction.PoseRms | None
     random: float
     curve: tuple[CurvePoint, ...]
     asked: int | None
@@ -106,7 +104,7 @@ class Design(FrozenArrays):
 @checked
 @single_threaded
 def design(
-    of: Scenario | Job,
+    of: Scenario | job.Job,
     *,
     n: int | None = None,
     target: float | None = None,
@@ -169,14 +167,14 @@ def _kept_out(scenario: Scenario, corners: Sequence[Floats]) -> Scenario:
 
 
 def _build_pool(
-    of: Scenario | Job,
+    of: Scenario | job.Job,
     candidates: Configurations | Literal["rows"] | None,
     given: Floats | None,
     n: int,
     generator: np.random.Generator,
 ) -> Pool:
     """The pool of a scenario, or of a job that is solved first."""
-    if isinstance(of, Job):
+    if isinstance(of, job.Job):
         if given is not None:
             raise InputError("given", "with a job", "a scenario: what a job measured counts already")
         source, problem = "job" if of.path is None else of.path.name, solve_for_design(of)

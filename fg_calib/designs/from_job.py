@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib import simulation
-from fg_calib.assessment import solve_job
+from fg_calib import assessment, simulation
 from fg_calib.designs.candidates import Pool, pool_of
 from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
@@ -42,7 +41,7 @@ def solve_for_design(job: Job) -> Problem:
             raise InputError(table.measurements.source, "pairs that are measured directly", expected)
     gauge = "prior" if job.options.gauge == "keep" else job.options.gauge
     options = replace(job.options, gauge=gauge, folds=None, encoder="propagated")
-    solution = solve_job(replace(job, options=options))
+    solution = assessment.solve_job(replace(job, options=options))
     if solution.problem.evaluated:
         raise InputError(str(job.path or "job"), "test rows alone", "train rows: what was measured is what counts")
     return relinearized_at(solution.problem, solution.parameters)

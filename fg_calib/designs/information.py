@@ -20,12 +20,10 @@ from functools import cached_property
 
 import numpy as np
 
+from fg_calib import prediction, robot, statistics
 from fg_calib.graph import SIGNAL_FLOOR, Problem, eliminate, prior_rows, unknown_prior_rows
 from fg_calib.inputs import Brief, Floats, FrozenArrays, Integers
 from fg_calib.observability import Observability, observability_of_rows
-from fg_calib.prediction import PoseRms, errors_at
-from fg_calib.robot import forward, without_rigid_motion
-from fg_calib.statistics import TangentCovariance, covariance_of_rows
 
 N_TASK = 500
 """Number of random configurations within the joint limits that are the default task."""
@@ -229,12 +227,12 @@ class Task(FrozenArrays):
     def quadratic_form(self, problem: Problem) -> Floats:
         """W, in the columns of a problem's core, shape (n_columns, n_columns), [m^2]."""
         v = problem.variables
-        at = forward(v.chains[0].at(problem.start), problem.robot.trig(self.readings))
+        at = robot.forward(v.chains[0].at(problem.start), problem.robot.trig(self.readings))
         rotation, position = at.jacobian[:, :3].copy(), at.jacobian[:, 3:].copy()
         for derivative in (rotation, position):
             derivative[:, :, v.n_robot_columns :] = 0.0
         if self.fitted:
-            position, rigid = without_rigid_motion(at.position, position)
+            position, rigid = robot.without_rigid_motion(at.position, position)
             rotation = rotation - rigid
         n = position.shape[2]
         flat = np.vstack([position.reshape(-1, n), self.lever * rotation.reshape(-1, n)])
@@ -256,15 +254,15 @@ class Posterior(Brief):
     n_measurements: int = 0
 
     @cached_property
-    def covariance(self) -> TangentCovariance:
+    def covariance(self) -> statistics.TangentCovariance:
         """Covariance of the core."""
         v = self.problem.variables
         left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_columns)
-        return covariance_of_rows(v, self.problem.start, left.A)
+        return statistics.covariance_of_rows(v, self.problem.start, left.A)
 
-    def error(self, task: Task) -> PoseRms:
+    def error(self, task: Task) -> prediction.PoseRms:
         """Expected errors of the tool over a task."""
-        base, fitted = errors_at(self.covariance, task.readings)
+        base, fitted = prediction.errors_at(self.covariance, task.readings)
         return fitted if task.fitted else base
 
     @cached_property

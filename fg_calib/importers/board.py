@@ -34,11 +34,9 @@ from pydantic import Field, StrictBool
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from fg_calib import __version__, io
+from fg_calib import __version__, io, measurements, parallel
 from fg_calib.initialization import Camera
 from fg_calib.inputs import Floats, InputError, Integers, check
-from fg_calib.measurements import COVARIANCE, Frames, RoomPixel
-from fg_calib.parallel import tell
 
 Image = NDArray[np.uint8]
 
@@ -517,8 +515,8 @@ def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:
 def _rows(camera: Camera, points: Floats, uv: Floats, R: Floats, t: Floats) -> _Fit:
     """Residuals at a pose, and their derivatives."""
     n = len(points)
-    at = Frames(np.broadcast_to(R, (n, 1, 3, 3)), np.broadcast_to(t, (n, 1, 3)))
-    rows = RoomPixel(camera).rows(at, np.column_stack([uv, points]), np.empty((n, 0)))
+    at = measurements.Frames(np.broadcast_to(R, (n, 1, 3, 3)), np.broadcast_to(t, (n, 1, 3)))
+    rows = measurements.RoomPixel(camera).rows(at, np.column_stack([uv, points]), np.empty((n, 0)))
     return _Fit((R, t), float(np.sum(rows.residual**2)), rows.wrenches.reshape(2 * n, 6))
 
 
@@ -597,7 +595,7 @@ def read_corners(
     """
     found, without, size = list[Corners](), dict[str, str](), (0, 0)
     for k, file in enumerate(files):
-        tell("looking for corners", k, len(files))
+        parallel.tell("looking for corners", k, len(files))
         image = decode(io.read_bytes(file), file.name)
         height, width = image.shape
         if k and size != (width, height):
@@ -780,4 +778,4 @@ def _pose_columns(tables: BoardTables) -> dict[str, Any]:
     upper = (np.array([view.covariance for view in views]) / np.outer(size, size))[:, *np.triu_indices(6)]
     columns = _row_columns(tables, views, [1] * len(views))
     columns |= dict(zip((*"xyz", "rx", "ry", "rz"), poses.T, strict=True))
-    return columns | dict(zip(COVARIANCE, upper.T, strict=True))
+    return columns | dict(zip(measurements.COVARIANCE, upper.T, strict=True))

@@ -29,20 +29,14 @@ import numpy as np
 import scipy
 from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
 
-from fg_calib import __version__, statistics
-from fg_calib.assessment import Assessment
-from fg_calib.diagnostics import SetupCheck
+from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
-from fg_calib.measurements import Table
-from fg_calib.monitoring import fingerprints, knowledge_of
 from fg_calib.observability import Identifiability
-from fg_calib.prediction import ExpectedError
 from fg_calib.robot import SPAN, Robot, model, pose
-from fg_calib.statistics import FLAGS, JointErrors
 
 if TYPE_CHECKING:
     import polars as pl
@@ -244,7 +238,7 @@ class Result(Section):
     cautions: tuple[str, ...] = of("assessed.verdict.cautions", ())
     reservations: tuple[str, ...] = of("assessed.verdict.warnings", ())
     notes: tuple[str, ...] = ()
-    setup: SetupCheck | None = of("assessed.verdict.setup", None)
+    setup: diagnostics.SetupCheck | None = of("assessed.verdict.setup", None)
     probability_of_noise: float | None = of("assessed.verdict.noise_like", None)
     chi2: Figure = of("assessed.fit.chi_square.value")
     dof: int = of("assessed.fit.chi_square.dof")
@@ -260,7 +254,7 @@ class Result(Section):
     acceptance: statistics.Acceptance | None = of("assessed.acceptance", None)
     folds: statistics.CrossValidation | None = of("assessed.cross_validation", None)
     priors: statistics.PriorFit | None = of("assessed.fit.priors", None)
-    expected_error: ExpectedError | None = of("assessed.expected_error", None)
+    expected_error: prediction.ExpectedError | None = of("assessed.expected_error", None)
     sigma_joint: Floats = of("problem.sigma_joint", np.zeros(0))
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
@@ -288,7 +282,7 @@ class Result(Section):
     def of(
         cls,
         solution: Solution,
-        assessed: Assessment,
+        assessed: assessment.Assessment,
         *,
         inputs: Mapping[str, str] | None = None,
         job: Mapping[str, Any] | None = None,
@@ -384,7 +378,7 @@ def key_of(fit: statistics.KindFit, fits: tuple[statistics.KindFit, ...]) -> str
     return f"{fit.kind}, table {fit.table + 1}" if several else fit.kind
 
 
-def in_words(table: Table) -> str:
+def in_words(table: measurements.Table) -> str:
     """The content of a table."""
     kinds = [type(own.kind).__name__ for own in table.own]
     if table.model is None:
@@ -447,13 +441,13 @@ def _statistics(lengths: Floats) -> Statistics:
 
 
 def _carried(solution: Solution, job: Mapping[str, Any]) -> Carried:
-    problem, known = solution.problem, knowledge_of(solution)
+    problem, known = solution.problem, monitoring.knowledge_of(solution)
     noise: dict[str, dict[str, float]] = {}
     for (table, kind), factor in problem.state.factors.items():
         source = "" if table < 0 else problem.data.tables[table].measurements.source
         noise.setdefault(source.partition(", station ")[0], {})[kind] = factor
     knowledge = None if known is None else Knowledge.model_validate(known)
-    return Carried(job=dict(job), rows=fingerprints(problem.data.tables), noise=noise, knowledge=knowledge)
+    return Carried(job=dict(job), rows=monitoring.fingerprints(problem.data.tables), noise=noise, knowledge=knowledge)
 
 
 @cache
@@ -560,7 +554,7 @@ RESOLUTION = 1e-8
 """How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]: ten nanometres."""
 
 
-def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
+def residual_frame(solution: Solution, assessed: assessment.Assessment) -> pl.DataFrame:
     """Every scalar residual, as `residuals.csv` has it."""
     import polars as pl
 
@@ -584,7 +578,7 @@ def residual_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
         "leverage": fit.leverage,
         "studentised": fit.studentised,
         "weight": fit.weight,
-        "flag": _coded(FLAGS, fit.flag),
+        "flag": _coded(statistics.FLAGS, fit.flag),
         "noise_adds": table.excess,
         "suspect": fit.suspect,
     }
@@ -604,7 +598,7 @@ def _coded(words: Sequence[str], codes: Any) -> pl.Series:
     return pl.Series([word or None for word in words], dtype=kept)[np.asarray(codes, dtype=np.uint32)]
 
 
-def configuration_frame(solution: Solution, assessed: Assessment) -> pl.DataFrame:
+def configuration_frame(solution: Solution, assessed: assessment.Assessment) -> pl.DataFrame:
     """Every measured configuration, as `configurations.csv` has it."""
     import polars as pl
 
@@ -625,7 +619,7 @@ def configuration_frame(solution: Solution, assessed: Assessment) -> pl.DataFram
     return pl.DataFrame(columns)
 
 
-def joint_frame(found: JointErrors, solution: Solution) -> pl.DataFrame:
+def joint_frame(found: statistics.JointErrors, solution: Solution) -> pl.DataFrame:
     """Every estimated joint position, as `joints.csv` has it."""
     import polars as pl
 

@@ -20,13 +20,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fg_calib import inputs, measurements
+from fg_calib import inputs, measurements, parallel
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, checked
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
 from fg_calib.measurements import Column as ColumnSet
-from fg_calib.parallel import require_polars
 from fg_calib.robot import Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
@@ -130,7 +129,7 @@ class Table:
         Raises:
             InputError: The table cannot be read, it has no rows, or `columns` does not fit.
         """
-        require_polars(name)
+        parallel.require_polars(name)
         import polars as pl
 
         is_file = isinstance(table, os.PathLike | str)

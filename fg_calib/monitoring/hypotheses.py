@@ -29,12 +29,11 @@ from itertools import combinations
 import numpy as np
 from scipy import special
 
-from fg_calib.graph import Variables, build_variables
+from fg_calib import graph, statistics
 from fg_calib.inputs import POSE_MODELS, CalibrationError, Floats, FrozenArrays
 from fg_calib.monitoring.new_data import Linear, Rows, ends_of_rows, linearise_new_data, place_new_data
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, forward, names_of, random_readings
-from fg_calib.statistics import FACTOR
 
 WRONG = 0.01
 """Probability with which the true change is at most called distinguished from another."""
@@ -124,7 +123,7 @@ class HypothesisTest:
     @property
     def explains(self) -> bool:
         """Whether it leaves no more than noise does, or at most `FACTOR` times that."""
-        return self.left <= FACTOR * self.dof or float(special.chdtrc(self.dof, self.left)) > CERTAIN
+        return self.left <= statistics.FACTOR * self.dof or float(special.chdtrc(self.dof, self.left)) > CERTAIN
 
     @property
     def scale(self) -> float:
@@ -177,7 +176,7 @@ def single_changes(rows: Linear) -> list[ChangeHypothesis]:
     return [ChangeHypothesis((name,), kind, units, rows.of_arm @ D, D) for name, kind, units, D in known]
 
 
-def named_changes(v: Variables) -> dict[str, Floats]:
+def named_changes(v: graph.Variables) -> dict[str, Floats]:
     """Changes of a robot by name, each as directions in its columns, shape (n_columns, k).
 
     Parameters, the zeros of joints that the joint's own parameters can express, any turn and shift of `tool` and
@@ -294,9 +293,9 @@ def _refined(found: HypothesisTest, calibrated: Calibrated, rows: Rows) -> Hypot
     return replace(found, change=total + step.change, sigma=step.sigma, drop=drop, left=step.left)
 
 
-def all_variables(robot: Robot) -> Variables:
+def all_variables(robot: Robot) -> graph.Variables:
     """The variables of all parameters of a robot."""
-    return build_variables(robot.with_estimated(names_of(robot.parameters)), [False], False)
+    return graph.build_variables(robot.with_estimated(names_of(robot.parameters)), [False], False)
 
 
 def random_configurations(robot: Robot) -> Floats:

@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib import graph
-from fg_calib.diagnostics import basis_of
+from fg_calib import diagnostics, graph, statistics
 from fg_calib.inputs import Booleans, Floats, Integers, Options, ProblemError
 from fg_calib.measurements import INSTRUMENTS, Dataset, KnownPoint, Table, build_dataset
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, names_of
-from fg_calib.statistics import HeldOut
 from fg_calib.statistics.residual_table import residual_table
 
 
@@ -91,7 +89,7 @@ class Placed:
     problem: graph.Problem
     pinned: tuple[tuple[str, str], ...]
 
-    def errors(self) -> tuple[HeldOut, ...]:
+    def errors(self) -> tuple[statistics.HeldOut, ...]:
         """How well the arm predicts the rows, frames and what does not stay with it fitted, by table and kind."""
         table = residual_table(self.solution)
         tested = replace(table, test=table.used, n_fitted=0, seen=np.zeros_like(table.seen))
@@ -206,7 +204,7 @@ def linearise_new_data(at: Placed) -> Linear:
     free = np.concatenate([*frames, np.setdiff1d(np.arange(v.n_columns, wide), pinned)])
     directions = np.hstack([known, unit[:, free.astype(np.int64)]])
     of_known = np.hstack([information, np.zeros((len(information), len(free)))])
-    fitted = basis_of(np.vstack([J @ directions, of_known, J_priors @ directions]))
+    fitted = diagnostics.basis_of(np.vstack([J @ directions, of_known, J_priors @ directions]))
     r = np.concatenate([r, np.zeros(len(information)), r_priors])
     n_given = len(information) + len(r_priors)
     return Linear(

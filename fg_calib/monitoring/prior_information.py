@@ -16,11 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib import graph
+from fg_calib import graph, observability, parallel
 from fg_calib.inputs import Floats, Options
 from fg_calib.measurements import LANDMARKS, Measurements, Table
-from fg_calib.observability import ObservedQuantities
-from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot
 
 Words = NDArray[np.uint64]
@@ -93,7 +91,7 @@ class Calibrated:
         return graph.NoiseState(factors=factors)
 
 
-@single_threaded
+@parallel.single_threaded
 def knowledge_of(solution: graph.Solution) -> graph.Knowledge | None:
     """Information of a solution's rows about the arm, targets and anchors, with earlier information.
 
@@ -111,7 +109,7 @@ def knowledge_of(solution: graph.Solution) -> graph.Knowledge | None:
         problem = replace(problem, variables=problem.whole.variables)
     as_drawn, x = at_nominal(problem, solution.before)
     nominal = _known_at(as_drawn, x, with_loss=False)
-    views = ObservedQuantities.of(problem).views
+    views = observability.ObservedQuantities.of(problem).views
     nominal = replace(nominal, right=np.zeros(nominal.n), views=views)
     return replace(_known_at(problem, solution.parameters, with_loss=True), views=views, nominal=nominal)
 

@@ -15,14 +15,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from fg_calib import measurements, statistics
 from fg_calib.graph import Knowledge, Problem, Solution, kept_of, solve
 from fg_calib.inputs import NEAR, Floats, InputError, ProblemError, did_you_mean, known_names
-from fg_calib.measurements import TARGET, build_dataset
 from fg_calib.monitoring.hypotheses import named_changes
 from fg_calib.monitoring.new_data import Rows, place_new_data, started
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, tolerance_kind
-from fg_calib.statistics import HeldOut
 
 
 def updated(
@@ -47,7 +46,7 @@ def updated(
     if known is None:
         found = "a calibration that does not hold what its rows say"
         raise InputError("update", found, "one that this version of fg-calib wrote, with an arm that was estimated")
-    known = known.about([name for name in known.unknowns if name[0] == TARGET.letter or anchors_stay])
+    known = known.about([name for name in known.unknowns if name[0] == measurements.TARGET.letter or anchors_stay])
     robot = calibrated.robot
     if growth or changed:
         information = replace(calibrated, knowledge=known).information
@@ -58,7 +57,7 @@ def updated(
     return solve(_problem(calibrated, robot, known, rows, fit))
 
 
-def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[HeldOut, ...]:
+def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[statistics.HeldOut, ...]:
     """How well the arm as it was calibrated before predicts new rows, by table and kind: it has not seen them.
 
     Args:
@@ -71,7 +70,7 @@ def predicted_before(calibrated: Calibrated, rows: Rows) -> tuple[HeldOut, ...]:
 
 def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows, fit: Solution) -> Problem:
     """The problem of the rows with what is known, started at the arm as it was calibrated."""
-    options, data = calibrated.fixed_options, build_dataset(robot, rows.free_of(known))
+    options, data = calibrated.fixed_options, measurements.build_dataset(robot, rows.free_of(known))
 
     def problem(arm: Robot, whole: Problem | None) -> Problem:
         return started(arm, data, options, calibrated.values, fit, whole=whole, knowledge=known)

@@ -11,18 +11,14 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table as Shown
 
+from fg_calib import inputs, measurements, observability, prediction, simulation
 from fg_calib.designs import Design
-from fg_calib.inputs import Floats
 from fg_calib.io import Units, fill_folder, require_absent, write_csv, write_robot, write_text, write_urdf
-from fg_calib.measurements import Table
-from fg_calib.observability import missing_motions
-from fg_calib.prediction import PoseRms
 from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
 from fg_calib.robot import Robot, pose
-from fg_calib.simulation import job_text, table_columns, to_fill_in
 
 MAX_POSES_LISTED = 40
 """Poses that the report lists; the table has all."""
@@ -105,7 +101,7 @@ def _notes(design: Design) -> Iterator[str]:
         yield f"candidates{f' of {name}' if name else ''}: {one.reasons()}"
     for name in sorted(set(design.pool.found).difference(design.group.tolist(), [""])):
         yield f"{name}: none of its own poses was chosen, and it gets no table"
-    yield from map(str, missing_motions(design.pool.robot))
+    yield from map(str, observability.missing_motions(design.pool.robot))
     travel = math.degrees(design.travel), math.degrees(design.travel_before)
     yield f"joint travel along the poses {travel[0]:.0f} deg, {travel[1]:.0f} unordered"
     if lost := len(design.observability.lost):
@@ -119,7 +115,7 @@ def _notes(design: Design) -> Iterator[str]:
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
 
 
-def _pose(error: PoseRms) -> str:
+def _pose(error: prediction.PoseRms) -> str:
     return f"{_mm(error.position)}, {in_words(error.orientation, 'rad', '.4f')}"
 
 
@@ -175,9 +171,9 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     measured = design.tables if scenario is not None else ()
     files: dict[str, Any] = {CONFIGURATIONS: _configurations(design, robot, units)}
     for t in measured:
-        for name, columns in table_columns(t, robot, units).items():
+        for name, columns in simulation.table_columns(t, robot, units).items():
             rounded = _rounded(t.measurements.readings, robot, units) if "q1" in columns else {}
-            files[name] = to_fill_in({**columns, **rounded}, touched=_is_touched(t))
+            files[name] = simulation.to_fill_in({**columns, **rounded}, touched=_is_touched(t))
     urdf = "robot.urdf" if robot.urdf is not None and measured else None
     job = ("robot.yaml", "calibration.yaml") if measured else ()
     names = (DESIGN, "design.svg", *files, *job, *([urdf] if urdf else []))
@@ -194,13 +190,13 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
             write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
             then = _CALIBRATE if design.pool.before is None else _UPDATE
             keys = {"robot": "robot.yaml"} | {k: v for k, v in scenario.job.items() if k not in ("model", "pairing")}
-            write_text(into / "calibration.yaml", job_text(_JOB_BEGINS + then, keys, measured, robot, units))
+            write_text(into / "calibration.yaml", simulation.job_text(_JOB_BEGINS + then, keys, measured, robot, units))
 
     fill_folder(folder, write)
     return names
 
 
-def _is_touched(table: Table) -> bool:
+def _is_touched(table: measurements.Table) -> bool:
     """Whether something is touched, so that it is the joint readings that are measured."""
     m = table.measurements
     contact = table.model in ("anchor", "plane") and not np.any(m.columns.get("distance", 0.0))
@@ -215,7 +211,7 @@ def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any
     return {"id": design.ids, **_rounded(design.readings, robot, units), **group, **tool}
 
 
-def _rounded(readings: Floats, robot: Robot, units: Units) -> dict[str, Floats]:
+def _rounded(readings: inputs.Floats, robot: Robot, units: Units) -> dict[str, inputs.Floats]:
     """The columns of joint readings, rounded, within the limits."""
     factors = np.array([units.factor(joint.unit) for joint in robot.joints])
     shown = np.clip(np.round(readings / factors, DECIMALS), *(robot.limits / factors[:, None]).T)

@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fg_calib import robot, simulation
 from fg_calib.inputs import Booleans, Floats, InputError
 from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.tables import shown_in
 from fg_calib.report.text import ReportData
-from fg_calib.robot import SCALES
-from fg_calib.simulation import link_points
 
 if TYPE_CHECKING:
     import polars as pl
@@ -98,7 +97,7 @@ def _colours(test: Booleans) -> str:
 def parameter_whiskers(data: ReportData) -> list[Chart]:
     """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
     found = []
-    for unit in SCALES:
+    for unit in robot.SCALES:
         what = {"m": "Lengths", "rad": "Angles"}.get(unit, "Effects of joints")
         shown = [p for p in data.result.estimated if p.unit == unit]
         if not shown:
@@ -250,6 +249,6 @@ def arm_scene(data: ReportData) -> Mapping[str, Any] | None:
             "value": float(f"{rms[k]:.4g}") if np.isfinite(rms[k]) else None,
             "links": np.round(points, 4).tolist(),
         }
-        for k, points in zip(chosen.tolist(), link_points(data.robot, data.readings[chosen]), strict=True)
+        for k, points in zip(chosen.tolist(), simulation.link_points(data.robot, data.readings[chosen]), strict=True)
     ]
     return {"unit": shown_in(data.result.unit_of(kind)).unit, "family": kind, "low": low, "high": high, "items": items}

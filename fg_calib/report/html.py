@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING
 
-from fg_calib.inputs import escaped
-from fg_calib.io import Result
+from fg_calib import inputs, io
 from fg_calib.report import text
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import arm_scene, figures_of
@@ -46,7 +45,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=lambda value: escaped(value) if type(value) is str else value,
+        finalize=lambda value: inputs.escaped(value) if type(value) is str else value,
     )
     environment.filters |= {"figure": lambda chart: Markup(chart.svg), "resource": lambda name: Markup(resource(name))}
     return environment
@@ -77,7 +76,7 @@ def build_page(data: text.ReportData) -> str:
     )
 
 
-def notebook_html(result: Result) -> str:
+def notebook_html(result: io.Result) -> str:
     """The summary and the parameters as HTML, for a notebook."""
     (table,) = section(text.PARAMETERS, text.parameter_table(result))
     return _environment().get_template("notebook.html").render(lines=text.summary(result), section=table)
@@ -108,13 +107,13 @@ def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:
     yield f"{known} of {len(result.estimated)}", "parameters estimated with a known uncertainty"
 
 
-def _command(result: Result) -> str:
+def _command(result: io.Result) -> str:
     """The command that repeats the calibration in the folder of its job; empty without a job."""
     job, folds = [*result.inputs][:1], [] if result.folds is None else ["--folds", f"{result.folds.n}"]
     return shlex.join(["fg-calib", "calibrate", *job, "--out", "result", *folds]) if job else ""
 
 
-def _options(result: Result) -> Iterator[tuple[str, str]]:
+def _options(result: io.Result) -> Iterator[tuple[str, str]]:
     for key, value in vars(result.options).items():
         if value not in (None, (), "") and key != "accept":
             yield key, shortened(list(value), 20) if isinstance(value, tuple) else str(value)

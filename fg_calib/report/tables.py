@@ -17,9 +17,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from fg_calib import __version__
-from fg_calib.diagnostics import probability
-from fg_calib.inputs import check_number, escaped
+from fg_calib import __version__, diagnostics, inputs
 from fg_calib.io import fill_folder, write_text
 from fg_calib.observability import LostDirection, Observability
 from fg_calib.robot import SCALES, Robot, Scale, unit_of
@@ -45,7 +43,7 @@ def in_order(kinds: Iterable[str]) -> list[str]:
 
 def plain_text(report: RenderableType, width: int = WIDTH) -> str:
     """A report as plain text, without blanks at the ends of lines."""
-    check_number("width", width, least=1, whole=True)
+    inputs.check_number("width", width, least=1, whole=True)
     text = io.StringIO()
     console = Console(file=text, width=width_for(report, width), color_system=None, highlight=False)
     console.print(report)
@@ -71,7 +69,7 @@ def _least_width(part: Any) -> int:
 
 def line(text: str, style: str = "") -> Text:
     """A line of a report: all text passes here, so that names from files neither steer nor style the terminal."""
-    return Text(escaped(text), style=style)
+    return Text(inputs.escaped(text), style=style)
 
 
 Content = Table | Text | str
@@ -170,7 +168,7 @@ def _cell(value: Any, form: str, unknown: str, unit: str) -> Text:
         return line(figure(value, unit if kind == "q" else kind, digits, unknown or "unknown"))
     if value is None or not np.isfinite(value):
         return line(unknown or "-")
-    return line(probability(value) if form == "p" else f"{value:{form}}")
+    return line(diagnostics.probability(value) if form == "p" else f"{value:{form}}")
 
 
 def shown_in(unit: str) -> Scale:

@@ -14,13 +14,10 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
-from fg_calib.assessment import Assessment
+from fg_calib import assessment, graph, measurements, prediction
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
-from fg_calib.graph import Solution
 from fg_calib.inputs import LIMITED, Booleans, Floats
 from fg_calib.io import Result, key_of
-from fg_calib.measurements import LANDMARKS
-from fg_calib.prediction import ExpectedError, PredictedErrors, predict_errors
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
 from fg_calib.robot import Robot
@@ -69,11 +66,11 @@ class ReportData:
         return (self.configurations["split"] == "test").to_numpy()
 
     @cached_property
-    def workspace(self) -> PredictedErrors | None:
+    def workspace(self) -> prediction.PredictedErrors | None:
         """Expected errors over the workspace; None where nothing says what was measured."""
         if self.configurations is None or not len(self.configurations):
             return None
-        return predict_errors(self.robot, self.posterior, self.readings, fitted=self.result.free_of_frame)
+        return prediction.predict_errors(self.robot, self.posterior, self.readings, fitted=self.result.free_of_frame)
 
     @cached_property
     def rms(self) -> tuple[str, Floats] | None:
@@ -257,7 +254,7 @@ def _cross_validation(result: Result) -> list[Section]:
     return section(title, table_of(columns, rows), *lines)
 
 
-def expected_tool_error(expected: ExpectedError | None) -> list[Section]:
+def expected_tool_error(expected: prediction.ExpectedError | None) -> list[Section]:
     """The section on the expected error of the tool, by the covariance; none for an evaluation."""
     if expected is None:
         return []
@@ -366,7 +363,7 @@ def _joint_values(found: ReportData) -> list[Section]:
 def _landmarks(result: Result) -> list[Section]:
     """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
     sections: list[Section] = []
-    for kind, title in ((kind.name, kind.heading) for kind in LANDMARKS.values() if kind.heading):
+    for kind, title in ((kind.name, kind.heading) for kind in measurements.LANDMARKS.values() if kind.heading):
         rows = []
         for p in (p for p in result.groups if p.kind == kind):
             units = ["" if kind == "unknown" else unit for unit in p.units]
@@ -410,7 +407,7 @@ def summary(result: Result) -> list[str]:
     return [str(line(text if len(text) <= tables.WIDTH else f"{text[: tables.WIDTH - 4]} ...")) for text in lines]
 
 
-def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
+def notes_of(solution: graph.Solution, assessed: assessment.Assessment) -> Iterator[str]:
     """Notes for a reader of the report, a sentence each."""
     problem, weights, blocks = solution.problem, solution.problem.state.weights, solution.problem.data.blocks
     for reason, count in problem.n_excluded.items():
@@ -439,7 +436,7 @@ def notes_of(solution: Solution, assessed: Assessment) -> Iterator[str]:
         yield "suspicious rows may be weighted down by a robust loss: loss in the job"
 
 
-def _noise_notes(solution: Solution, assessed: Assessment) -> Iterator[str]:
+def _noise_notes(solution: graph.Solution, assessed: assessment.Assessment) -> Iterator[str]:
     """Explain the ratio of observed to specified noise, and how to estimate the noise."""
     estimated, verdicts = solution.estimated_noise, {fit.verdict for fit in assessed.fit.goodness.kinds}
     if estimated and solution.converged:
@@ -450,7 +447,7 @@ def _noise_notes(solution: Solution, assessed: Assessment) -> Iterator[str]:
         yield "to use the observed noise instead of the specified one: estimate: true in noise of the job"
 
 
-def _undetermined(solution: Solution, assessed: Assessment) -> Iterator[str]:
+def _undetermined(solution: graph.Solution, assessed: assessment.Assessment) -> Iterator[str]:
     """Explain what fixes the parameters that the data do not determine."""
     estimated, fixed = set(assessed.names), dict[str, list[str]]()
     for p in assessed.estimates.parameters:

@@ -91,8 +91,7 @@ import pydantic
 from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAdapter, ValidationError, ValidationInfo
 from scipy.spatial.transform import Rotation
 
-from fg_calib import inputs, io
-from fg_calib.initialization import Camera
+from fg_calib import initialization, inputs, io
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, AngleUnit, Brief, Floats, InputError, Pairing
 from fg_calib.measurements import Noise
 from fg_calib.robot import Robot, tolerance_kind, unit_of
@@ -581,7 +580,7 @@ class Instrument:
     planes: Planes | None = None
     contact: pydantic.StrictBool = False
     boards: Boards | None = None
-    camera: Camera | None = None
+    camera: initialization.Camera | None = None
     fixed: pydantic.StrictBool = False
     corners: Annotated[Floats | None, _in_file(_corners)] = None
     from_behind: tuple[str, ...] = ()

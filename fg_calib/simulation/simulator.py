@@ -29,12 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib import inputs, measurements
-from fg_calib.initialization import Camera
+from fg_calib import initialization, inputs, io, measurements, parallel
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Brief, Floats, FrameKnowledge, InputError, Integers
-from fg_calib.io import NOISE_UNITS
 from fg_calib.measurements import INSTRUMENTS, Groups, KnownPoint, Labels, Measurements, Noise, Pairs, Table
-from fg_calib.parallel import single_threaded
 from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
 from fg_calib.simulation.scenario import BoardViews, Configurations, Instrument, Placement, Plane, Scenario, Spot
 from fg_calib.simulation.views import find_readings
@@ -63,7 +60,7 @@ def choose_frame(frame: Placement | str, generator: np.random.Generator) -> Plac
 
 def override_noise(noise: Noise, more: Noise | None) -> Noise:
     """A noise with the values of another where it has some; the joints' stay."""
-    values = {} if more is None else {kind: more.get(kind) for kind in NOISE_UNITS}
+    values = {} if more is None else {kind: more.get(kind) for kind in io.NOISE_UNITS}
     return noise.updated(**{kind: value for kind, value in values.items() if value is not None})
 
 
@@ -446,7 +443,7 @@ class Measuring:
         return Placement(base_R_camera.T, -base_R_camera.T @ (middle - 2.5 * radius * ahead))
 
 
-def project(camera: Camera, points: Floats) -> tuple[Floats, Booleans]:
+def project(camera: initialization.Camera, points: Floats) -> tuple[Floats, Booleans]:
     """Images of points in the camera's frame, shape (..., 3), and whether they are in front of it and in its image.
 
     The distortion's polynomial turns back far from the axis, and would bring into the image what is far outside.
@@ -534,7 +531,7 @@ class Simulation(Brief):
 
 
 @inputs.checked
-@single_threaded
+@parallel.single_threaded
 def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simulation:
     """Run a scenario.
 

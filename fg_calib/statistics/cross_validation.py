@@ -33,13 +33,10 @@ import numpy as np
 from pydantic import computed_field
 from scipy import special
 
-from fg_calib import inputs
-from fg_calib.graph import Solution, problem_of
+from fg_calib import graph, inputs, parallel, robot
 from fg_calib.inputs import Figure, Floats, FrozenArrays, InputError, Integers, Limits, ProblemError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Labels, Table
-from fg_calib.parallel import Failure, map_jobs
-from fg_calib.robot import SCALES
 from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
 
 Verdict = Literal["pass", "fail", "not evaluated"]
@@ -102,7 +99,7 @@ def wide(ratio: Mapping[str, float], n: int) -> list[str]:
 
 @checked
 def cross_validate(
-    job: Job, solve: Callable[[Job], Solution], n: int = 5, *, executor: Executor | None = None
+    job: Job, solve: Callable[[Job], graph.Solution], n: int = 5, *, executor: Executor | None = None
 ) -> CrossValidation:
     """Hold every configuration out once, and calibrate without it.
 
@@ -125,7 +122,7 @@ def cross_validate(
     if not tables:
         raise InputError("folds", "test rows alone", "rows to calibrate with, and to hold out")
     whole = replace(job, measurements=tables)
-    data = problem_of(whole).data  # whose tables are those of one station each
+    data = graph.problem_of(whole).data  # whose tables are those of one station each
     fold = _divided(data, n, np.random.default_rng(0))
     if len(np.unique(fold[fold >= 0])) < n:
         raise InputError("folds", f"found {n}", f"at most {np.sum(fold >= 0)}: so many configurations can be held out")
@@ -134,8 +131,8 @@ def cross_validate(
     names = [f"without fold {k + 1} of {n}" for k in range(n)]
     jobs = [replace(whole, measurements=tables) for tables in without]
     found = []
-    for one in map_jobs(partial(_calibrated, solve=solve), jobs, executor, names=names):
-        if isinstance(one, Failure):
+    for one in parallel.map_jobs(partial(_calibrated, solve=solve), jobs, executor, names=names):
+        if isinstance(one, parallel.Failure):
             raise RuntimeError(one.trace) if one.trace else ProblemError("folds", f"{one.job}: {one.reason}")
         found.append(one)
     estimates, held, converged = zip(*found, strict=True)
@@ -155,7 +152,7 @@ def cross_validate(
     )
 
 
-def _calibrated(job: Job, solve: Callable[[Job], Solution]) -> tuple[Floats, tuple[HeldOut, ...], bool]:
+def _calibrated(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Floats, tuple[HeldOut, ...], bool]:
     """The robot's parameters without a fold, the held-out residuals, and whether the solver converged."""
     solution = solve(job)
     problem = solution.problem
@@ -310,7 +307,7 @@ def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str
     if held is None:
         return Judgement(kind, limit, None, None, 0, "not evaluated", f"no measurement of any {kind} was held out")
 
-    exceeds, scale = held.after > limit, SCALES["m" if kind == "position" else "rad"]
+    exceeds, scale = held.after > limit, robot.SCALES["m" if kind == "position" else "rad"]
     expected = f"{scale.factor * (tool or 0.0):.3g} {scale.unit}"
     doubts = {
         f"fewer than {LEAST} were held out": held.n < LEAST,

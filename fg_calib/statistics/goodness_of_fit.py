@@ -34,10 +34,9 @@ from numpy.typing import NDArray
 from pydantic import computed_field
 from scipy import special
 
+from fg_calib import measurements, robot
 from fg_calib.graph import NoiseState, Solution, effect, mahalanobis_distances, noises_at
 from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
-from fg_calib.measurements import squares_along
-from fg_calib.robot import SPAN
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel
@@ -66,7 +65,7 @@ CONFIDENCE = 0.999
 FACTOR = 2.0
 """A reduced chi-square between 1 / FACTOR and FACTOR is good whatever its distribution: noise is never known better."""
 
-_CHUNK, _CHUNK_WITH_STATES = 4 * SPAN, SPAN // 4
+_CHUNK, _CHUNK_WITH_STATES = 4 * robot.SPAN, robot.SPAN // 4
 """Measurements whose rows are linearised at once: those with private noise alone, and others."""
 
 _MEDIAN = 0.6744897501960817
@@ -414,7 +413,7 @@ class RowStatistics:
                 first, last = last, last + int(np.sum(measured[chunk]))
                 rows = slice(first, last)
                 if model.is_plain(number) and not asked[rows].any():
-                    squares = squares_along(noise.rows_at(chunk), model.chain(number), self.spread.root)
+                    squares = measurements.squares_along(noise.rows_at(chunk), model.chain(number), self.spread.root)
                     of_rows = (squares + noise.variance[chunk])[measured[chunk]]
                     self.leverage[rows] = of_rows / table.sigma[rows] ** 2 - 1.0
                     continue

@@ -53,9 +53,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from fg_calib import graph
+from fg_calib import graph, parallel
 from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, SharedScale, checked
-from fg_calib.parallel import single_threaded
 from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.variance_components import settle
@@ -83,7 +82,7 @@ QUANTILE = 1.959963984540054
 
 
 @checked
-@single_threaded
+@parallel.single_threaded
 def estimate_tolerances(
     problem: graph.Problem, solve_with: Callable[[graph.Problem], graph.Solution] = graph.solve
 ) -> graph.Solution:

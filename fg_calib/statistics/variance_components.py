@@ -38,9 +38,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse
 
-from fg_calib import graph
+from fg_calib import graph, parallel
 from fg_calib.inputs import Booleans, Floats, Integers, checked
-from fg_calib.parallel import single_threaded
 
 Sparse = scipy.sparse.csr_array
 
@@ -165,7 +164,7 @@ def _square_roots(covariance: Floats) -> Floats:
 
 
 @checked
-@single_threaded
+@parallel.single_threaded
 def estimate_noise(problem: graph.Problem, options: graph.SolverOptions | None = None) -> graph.Solution:
     """Estimate the parameters and, with them, a factor on the specified noise of each kind.
 
