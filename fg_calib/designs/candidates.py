@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from fg_calib import simulation
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
-from fg_calib.graph import Problem, Variables, coordinates_of, places_of, square_root, true_problem, unknown_prior_rows
+from fg_calib.graph import Problem, Variables, coordinates_of, square_root, unknown_prior_rows
 from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
 from fg_calib.measurements import INSTRUMENTS, Landmarks, Table
+from fg_calib.observability import places_of, true_problem
 from fg_calib.robot import Robot
 from fg_calib.simulation import BoardViews, Candidates, Errors, GivenReadings, Instrument, Scenario
 

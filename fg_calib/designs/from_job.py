@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import assessment, simulation
 from fg_calib.designs.candidates import Pool, pool_of
-from fg_calib.graph import Problem, places_of, pose_of, relinearized_at
+from fg_calib.graph import Problem, pose_of, relinearized_at
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
 from fg_calib.measurements import INSTRUMENTS, Measurements, Noise
+from fg_calib.observability import places_of
 from fg_calib.robot import pose
 from fg_calib.simulation import Configurations, Errors, Instrument, Placement, Plane, RandomReadings, Scenario, Spot
 

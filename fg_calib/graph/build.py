@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from fg_calib import inputs
 from fg_calib.graph.normal_system import identifiable_subset
 from fg_calib.graph.problem import Problem, named_rows, problem_at, start_of, tables_of, variables_of
 from fg_calib.graph.variables import Variables
-from fg_calib.inputs import Floats, Integers, Options, Pairing, ProblemError, check_names, checked
+from fg_calib.inputs import Floats, Options, ProblemError, check_names, checked
 from fg_calib.job import Job
-from fg_calib.measurements import INSTRUMENTS, Frames, Measurements, Table, build, check_rows, is_ours, missing_values
+from fg_calib.measurements import Frames, Measurements, Table, build, check_rows, is_ours, missing_values
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import Robot, forward, names_of, random_readings
+from fg_calib.robot import Robot, forward, names_of
 
 _log = logging.getLogger(__name__)
-
-Places = Mapping[tuple[str, str], Floats]
-"""Coordinates of landmarks, and unknown frames as X, by letter and name."""
 
 QUARTER_TURN = 1e-3
 """Cosine of a pitch at which yaw and roll of a frame are no longer distinct."""
 
 FIRST_TOLERANCE = 1e-3
 """Prior sigma that a joint's parameter starts from where scales are estimated and none is specified, [m] and [rad]."""
-
-STRUCTURAL_FLOOR = 1e-6
-"""Signal-to-noise ratio that counts as nothing on random configurations with an assumed noise: rounding alone."""
 
 
 @checked
@@ -158,88 +151,6 @@ def problem_of(job: Job, **changes: Any) -> Problem:
         ProblemError: The measurements lack what the model needs, or do not suffice.
     """
     return build_problem(job.robot, job.measurements, replace(job.options, **changes))
-
-
-@single_threaded
-def predicted_problem(
-    robot: Robot,
-    measurements: Measurements,
-    model: inputs.Model,
-    *,
-    frame: inputs.FrameKnowledge = "known",
-    pairing: Pairing | None = None,
-    pair_errors: inputs.PairErrors = "shared",
-) -> Problem:
-    """The problem that a robot's own predictions at some configurations make: what could be measured there.
-
-    Args:
-        robot: The robot.
-        measurements: The configurations (train rows) and their noise, 1 mm and 1 mrad where unknown; measured
-            values are not looked at.
-        model: Which measurements take part.
-        frame: Whether the measurement frame is estimated too.
-        pairing: How pairs are formed; a star if None.
-        pair_errors: Whether pairs of one configuration share its errors or count as independent.
-    """
-    options = Options(model, pairing or Pairing(), frame, gauge="none", pair_errors=pair_errors)
-    options = replace(options, model=INSTRUMENTS[options.model].random_model(Table(measurements)))
-    m = build.predict_measurements(robot, measurements, options.model)
-    return true_problem(robot, Table(m, options.model, options.pairing, options.frame), options)
-
-
-@single_threaded
-def true_problem(
-    robot: Robot, tables: Table | Sequence[Table], options: Options, places: Places | None = None
-) -> Problem:
-    """The problem of tables at a robot that is the true one: what else is unknown is where the tables put it.
-
-    Args:
-        robot: The robot.
-        tables: Tables that it would measure, without noise.
-        options: Whether pairs share errors; the tables' own choices count for the rest.
-        places: Where frames and unknowns are, of which a few rows may not tell (see `places_of`).
-    """
-    data, places = build.build_dataset(robot, tables_of(tables, options)), places or {}
-    starts = {i: places[key] for i, key in enumerate(data.landmarks.keys) if key in places}
-    data = replace(data, landmarks=data.landmarks.with_starts(starts))
-    variables = variables_of(robot, data, options)
-    start = start_of(robot.with_estimated([]), data, variables)  # the arm as it is, what it measures where it is
-    for name, where in _coordinates(data, variables).items():
-        if name in places and np.all(where >= 0):
-            start[where] = places[name]
-    return problem_at(robot, data, options, variables, start)
-
-
-def places_of(problem: Problem, parameters: Floats) -> dict[tuple[str, str], Floats]:
-    """Coordinates of landmarks by letter and name, and unknown measurement frames by X and their table's label."""
-    unknowns, coordinates = problem.data.landmarks, problem.variables.at(parameters).coordinates
-    places = zip(unknowns.keys, np.split(coordinates, np.cumsum(unknowns.sizes)[:-1]), strict=False)
-    return dict(places) | {("X", problem.data.labels[v.number]): parameters[v.places] for v in problem.variables.frames}
-
-
-def _coordinates(data: build.Dataset, variables: Variables) -> dict[tuple[str, str], Integers]:
-    """Index of landmarks and unknown frames (see `places_of`) in a parameter vector; -1 where not estimated."""
-    parts = np.split(variables.coordinates, np.cumsum(data.landmarks.sizes)[:-1])
-    frames = {("X", data.labels[v.number]): v.places for v in variables.frames}
-    return dict(zip(data.landmarks.keys, parts, strict=False)) | frames
-
-
-@single_threaded
-def random_problem(
-    robot: Robot, model: inputs.Model, frame: inputs.FrameKnowledge, *, n_configurations: int, seed: int
-) -> Problem:
-    """`predicted_problem` at random configurations: what a model can determine at all.
-
-    Args:
-        robot: The robot; its joints move as `random_readings` says.
-        model: Which measurements take part; pairs are chained. Noise is assumed as `Robot.scale_of` says.
-        frame: Whether the measurement frame is estimated too.
-        n_configurations: How many; 0 for ten for every parameter, 300 at least.
-        seed: Of the random configurations.
-    """
-    n = n_configurations or max(300, 10 * len(robot.parameters))
-    somewhere = Measurements.at(robot, random_readings(robot, n, np.random.default_rng(seed)))
-    return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")
 
 
 def _check_own_kinds(robot: Robot, data: build.Dataset, variables: Variables, start: Floats) -> None:

@@ -122,11 +122,8 @@ class Knowledge(FrozenArrays):
             return self
         n, k = directions.shape
         own = np.hstack([np.zeros((k, n)), np.eye(k)])[~free]
-        left = eliminate(
-            np.vstack([np.hstack([self.rows, -self.rows @ directions]), own]),
-            np.append(self.right, np.zeros(len(own))),
-            n,
-        )
+        wide = np.vstack([np.hstack([self.rows, -self.rows @ directions]), own])
+        left = eliminate(wide, np.append(self.right, np.zeros(len(own))), n)
         return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, left.A, left.b), self.nominal)
 
     def with_rows(self, A: Floats, b: Floats) -> Knowledge:
@@ -202,6 +199,5 @@ class Knowledge(FrozenArrays):
 
 def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:
     """Index of an unknown's coordinates in a parameter vector; None for one that is not there, or not estimated."""
-    parts = np.split(variables.coordinates, np.cumsum(unknowns.sizes)[:-1])
-    place = dict(zip(unknowns.keys, parts, strict=False)).get(name)
+    place = unknowns.by_key(variables.coordinates).get(name)
     return place if place is not None and np.all(place >= 0) else None

@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 
 from fg_calib.graph.noise_models import NoiseState, RowNoise
 from fg_calib.graph.normal_system import NormalSystem
-from fg_calib.graph.problem import Problem, frames_only, noises_at, relinearized_at, subsampled, with_user_factors
+from fg_calib.graph.problem import (
+    Problem,
+    frames_only,
+    mahalanobis_distances,
+    noises_at,
+    relinearized_at,
+    subsampled,
+    with_user_factors,
+)
 from fg_calib.graph.robust import Weighting, constants, cost
 from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, SolverError, check_number, checked
 from fg_calib.parallel import one_blas_thread
@@ -229,7 +237,12 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
         if before is not problem.start:
             problem = relinearized_at(problem, before)
         run = _fit(_started_by_few(problem, options), options)
-        return _solution(run, before, problem, clock)
+        state, variables, cost = run.problem.state, run.problem.variables, run.cost
+        parameters = variables.parameters(variables.values(run.parameters))  # angles in usual range
+        if state.weights is not None:
+            cost = relinearized_at(run.problem, parameters, replace(state, weights=None)).system.cost
+        found = replace(run, parameters=parameters, before=before, initial_cost=problem.system.cost, cost=cost)
+        return replace(found, seconds=time.perf_counter() - clock)
 
 
 def unsolved(problem: Problem) -> Solution:
@@ -247,7 +260,7 @@ def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
         run = _fit(_started_by_few(few, options), options)
     except SolverError:
         return problem
-    return relinearized_at(problem, run.here.parameters) if run.converged else problem
+    return relinearized_at(problem, run.parameters) if run.converged else problem
 
 
 def _fit_frames(problem: Problem, options: SolverOptions) -> Floats:
@@ -256,7 +269,7 @@ def _fit_frames(problem: Problem, options: SolverOptions) -> Floats:
     if frames is None:
         return problem.start
     options = replace(options, decrement=max(options.decrement, COARSE))
-    found = _fit(_started_by_few(frames, options), options).here.parameters
+    found = _fit(_started_by_few(frames, options), options).parameters
     return np.concatenate([found, problem.start[len(found) :]])
 
 
@@ -356,17 +369,7 @@ class _Point:
         return self.after(self.system.full_root @ (self.system.weights * y))
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """Result of a descent: its point, its steps, whether it has converged, and why it stopped."""
-
-    here: _Point
-    history: tuple[Iteration, ...]
-    converged: bool
-    message: str
-
-
-def _fit(problem: Problem, options: SolverOptions) -> _Fit:
+def _fit(problem: Problem, options: SolverOptions) -> Solution:
     """Least squares from the problem's start to the fixed point of whitening.
 
     Rows stay as they are whitened until their optimum is near; then each step is one to rows whitened where it leads.
@@ -411,7 +414,9 @@ def _fit(problem: Problem, options: SolverOptions) -> _Fit:
     if converged and here.rounding > NEAR_ENOUGH:
         hidden = f"rounding hides the optimum, by {here.rounding:.0e} sigma"
         converged, message = False, f"not converged: {hidden}: noise, tolerances or lengths are out of all proportion"
-    return _Fit(here, tuple(history), converged, message if here.problem.variables.keys else "nothing to fit")
+    message, cost = message if here.problem.variables.keys else "nothing to fit", here.system.cost
+    run = Solution(here.problem, here.parameters, start, converged, message, tuple(history))
+    return replace(run, cost=cost, weighted_cost=cost)
 
 
 def _iteration(before: _Point, after: _Point, damping: float) -> Iteration:
@@ -440,30 +445,10 @@ def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[
     """Estimate the noise from the residuals, and whether the loss has its final form."""
     state, final = problem.state, True
     if problem.options.loss != "none":
-        found = [noise.lengths() for noise in noises_at(problem, parameters)]
+        found = mahalanobis_distances(problem, parameters)
         test = np.concatenate([s.test for s in problem.data.blocks])
         e, residual_dim = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
         weights, final = weighting.update(e, residual_dim)
         ends = np.cumsum([s.n for s in problem.data.blocks])[:-1]
         state = replace(state, weights=tuple(np.split(weights, ends)))
     return state, final
-
-
-def _solution(run: _Fit, before: Floats, started: Problem, clock: float) -> Solution:
-    problem, weighted_cost = run.here.problem, run.here.system.cost
-    parameters = problem.variables.parameters(problem.variables.values(run.here.parameters))  # angles in usual range
-    weighted, cost = problem.state.weights is not None, weighted_cost
-    if weighted:
-        cost = relinearized_at(problem, parameters, replace(problem.state, weights=None)).system.cost
-    return Solution(
-        problem=problem,
-        parameters=parameters,
-        before=before,
-        converged=run.converged,
-        message=run.message,
-        history=run.history,
-        initial_cost=started.system.cost,
-        cost=cost,
-        weighted_cost=weighted_cost,
-        seconds=time.perf_counter() - clock,
-    )

@@ -22,7 +22,7 @@ pitch and yaw: at a pitch of 90 degrees the angles themselves are no coordinates
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -247,9 +247,8 @@ class Variables(Brief):
                 coordinates += [-1] * size
                 continue
             letter, parameters = item.kind.letter, tuple(range(place, place + size))
-            number = (
-                len(unknowns.items) if f"{letter}({index})" in taken else index
-            )  # the base has the letter of boards
+            # The base has the letter of boards.
+            number = len(unknowns.items) if f"{letter}({index})" in taken else index
             prior = None if item.tolerance is None else (tuple(item.start.tolist()), size * (item.tolerance,))
             key, columns = gtsam.symbol(letter, number), slice(column, column + size)
             scales = tuple(map(self.robot.scale_of, item.units))
@@ -303,21 +302,21 @@ class Variables(Brief):
         Note:
             At a pitch of a quarter turn roll and yaw have no derivative; their rows are then nan.
         """
-        return self._by_pose(_frame_derivative, parameters)
+        D = np.linalg.pinv(self.tangent_derivative(parameters)).astype(np.float64)
+        for v in self.items:
+            if v.is_pose and abs(np.cos(parameters[v.parameters[4]])) <= QUARTER_TURN:
+                D[v.columns, v.columns][[3, 5]] = np.nan
+        return D
 
     def tangent_derivative(self, parameters: Floats) -> Floats:
         """Derivative of the columns in the named scalars: the inverse of `named_derivative`, finite everywhere.
 
         At a pitch of a quarter turn it is singular: there roll and yaw turn a frame about the same axis.
         """
-        return self._by_pose(_tangent_derivative, parameters)
-
-    def _by_pose(self, derivative: Callable[[Floats], Floats], parameters: Floats) -> Floats:
-        """The identity, but for the blocks of poses, shape (n_columns, n_columns)."""
         D = np.eye(self.n_columns)
         for v in self.items:
             if v.is_pose:
-                D[v.columns, v.columns] = derivative(parameters[v.places])
+                D[v.columns, v.columns] = _tangent_derivative(parameters[v.places])
         return D
 
 
@@ -353,13 +352,9 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
     poses, chains = {v.symbol: v for v in items if v.is_pose}, list[Chain]()
     tangents = {symbol: v.columns.start for symbol, v in poses.items()}
     for frame in (f"X({table})" for table in range(len(frames))):
+        tool, base, at = map(tangents.get, ("T(0)", "B(0)", frame))
         chain = build_chain(
-            robot,
-            columns,
-            tool_tangent=tangents.get("T(0)"),
-            base_tangent=tangents.get("B(0)"),
-            frame_tangent=tangents.get(frame),
-            frame=frame in poses,
+            robot, columns, tool_tangent=tool, base_tangent=base, frame_tangent=at, frame=frame in poses
         )
         later = poses[frame].parameters[0] - n if frame in poses else -n
         source = np.where(chain.source >= n, chain.source + later, chain.source)
@@ -415,14 +410,6 @@ def corrections_of(robot: Robot, values: Floats) -> Floats:
 
 _ALONG_TANGENT = (5, 4, 3, 0, 1, 2)
 """Which of `FRAME_KINDS` goes with each direction of a pose's tangent: roll, pitch, yaw with turns about x, y, z."""
-
-
-def _frame_derivative(frame: Floats) -> Floats:
-    """Derivative of x, y, z, yaw, pitch, roll in Pose3's tangent (rotation first, in itself), shape (6, 6)."""
-    D = np.linalg.pinv(_tangent_derivative(frame)).astype(np.float64)
-    if abs(np.cos(frame[4])) <= QUARTER_TURN:
-        D[[3, 5]] = np.nan
-    return D
 
 
 def _tangent_derivative(frame: Floats) -> Floats:

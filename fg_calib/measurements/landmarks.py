@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, Integers, ProblemError
@@ -156,6 +158,10 @@ class Landmarks:
     def owners(self) -> Integers:
         """Which landmark each coordinate is of, shape (n_coordinates,)."""
         return np.repeat(np.arange(len(self.items)), self.sizes)
+
+    def by_key(self, values: NDArray[Any]) -> dict[tuple[str, str], NDArray[Any]]:
+        """Values of all coordinates, shape (n_coordinates,), apart by letter and name of their landmark."""
+        return dict(zip(self.keys, np.split(values, self._first[1:-1]), strict=False))
 
     def span(self, index: int) -> slice:
         """Coordinates of a landmark."""

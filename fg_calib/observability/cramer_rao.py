@@ -31,9 +31,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fg_calib import inputs
-from fg_calib.graph import correlation, named_triangle, predicted_problem, true_problem
+from fg_calib.graph import correlation, named_triangle
 from fg_calib.inputs import Booleans, Brief, Floats, InputError, Model, Options, PairErrors, Pairing, checked
 from fg_calib.measurements import Measurements, Table
+from fg_calib.observability.predicted import predicted_problem, true_problem
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, build_chain, forward, without_rigid_motion
 

@@ -14,11 +14,12 @@ from typing import Literal
 import numpy as np
 
 from fg_calib import inputs
-from fg_calib.graph import SIGNAL_FLOOR, STRUCTURAL_FLOOR, Problem, named_triangle, predicted_problem, random_problem
+from fg_calib.graph import SIGNAL_FLOOR, Problem, named_triangle
 from fg_calib.inputs import Brief, Floats, FrameKnowledge, Model, ProblemError, check_names, check_number, checked
 from fg_calib.measurements import Measurements
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
+from fg_calib.observability.predicted import STRUCTURAL_FLOOR, predicted_problem, random_problem
 from fg_calib.observability.reasons import LostDirection, explain
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, names_of

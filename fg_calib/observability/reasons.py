@@ -18,10 +18,11 @@ from functools import cache
 
 import numpy as np
 
-from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, random_problem, square_root
+from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, square_root
 from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model
 from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Instrument
 from fg_calib.observability.indices import Observability
+from fg_calib.observability.predicted import random_problem
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import build_chain, forward, random_readings
 

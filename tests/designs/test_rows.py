@@ -10,7 +10,8 @@ from tolerances import rounding
 
 from fg_calib import Pairing
 from fg_calib.designs.candidates import build_pool, draw_groups, rows_in_columns_of
-from fg_calib.graph import build_problem, prior_rows, square_root, true_problem
+from fg_calib.graph import build_problem, prior_rows, square_root
+from fg_calib.observability import true_problem
 from fg_calib.simulation.scenario import Instrument, Placement, RandomReadings
 
 N = 20
