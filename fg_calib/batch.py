@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 
 from fg_calib.calibration import Calibration, calibrate_job
 from fg_calib.inputs import InputError, checked, escaped, shown
-from fg_calib.io import fill_folder, read_job, require_no_input, require_writable, write_text
+from fg_calib.io import fill_folder, read_job, require_no_input, require_writable
 from fg_calib.job import Job
 from fg_calib.parallel import Failure, map_jobs
 
@@ -211,12 +211,8 @@ def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None
     columns = {head: [getattr(job, head) for job in jobs] for head in heads}
     columns |= {f"rms {kind} [{unit}]": [job.rms.get(kind) for job in jobs] for kind, unit in kinds.items()}
     columns |= {"rows": [job.rows for job in jobs], "reason": ["; ".join(job.reasons) for job in jobs]}
-
-    def write(into: Path) -> None:
-        write_text(into / "jobs.json", json.dumps(jobs_document(jobs, seconds), indent=1, allow_nan=False) + "\n")
-        pl.DataFrame(columns).write_csv(into / "jobs.csv")
-
-    fill_folder(folder, write, JOBS_FILES)
+    document = json.dumps(jobs_document(jobs, seconds), indent=1, allow_nan=False) + "\n"
+    fill_folder(folder, {"jobs.json": document, "jobs.csv": pl.DataFrame(columns).write_csv}, JOBS_FILES)
 
 
 def job_names(jobs: Sequence[Path]) -> list[str]:

@@ -646,12 +646,7 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
     """
     found = Calibration.load(path)
     texts = pages_of(found.report_data, report=True, figures=figures)
-
-    def write(into: Path) -> None:
-        for name, text in texts.items():
-            io.write_text(into / name, text)
-
-    io.fill_folder(Path(folder or found.folder or ""), write, {name: io.RESULT_FILES[name] for name in texts})
+    io.fill_folder(Path(folder or found.folder or ""), texts, {name: io.RESULT_FILES[name] for name in texts})
 
 
 def _with_priors(robot: Robot, result: io.Result) -> Robot:

@@ -19,12 +19,7 @@ def example(
     known = sorted(folder.name for folder in cli.EXAMPLES.iterdir() if folder.is_dir())
     if name not in known:
         raise inputs.InputError("example", f"found {name!r}", f"one of {', '.join(known)}")
-    files = sorted(file for file in (cli.EXAMPLES / name).iterdir() if file.is_file())
-    require_absent(out, [file.name for file in files])
-
-    def write(folder: Path) -> None:
-        for file in files:
-            (folder / file.name).write_bytes(file.read_bytes())
-
-    fill_folder(out, write)
-    say_next([file.name for file in files], out)
+    files = {file.name: file.read_bytes() for file in sorted((cli.EXAMPLES / name).iterdir()) if file.is_file()}
+    require_absent(out, files)
+    fill_folder(out, files)
+    say_next([*files], out)

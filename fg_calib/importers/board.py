@@ -23,7 +23,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -736,23 +736,15 @@ def write_board_tables(folder: Path, tables: BoardTables) -> tuple[str, ...]:
     Raises:
         InputError: The folder cannot be written, or holds files of these names that are not of a board.
     """
-    names: list[str] = []
-
-    def write(into: Path) -> None:
-        io.write_text(into / "board.json", json.dumps(tables.document(), indent=1, allow_nan=False) + "\n")
-        io.write_csv(into / "pixels.csv", _pixel_columns(tables))
-        if tables.posed:
-            io.write_csv(into / "board.csv", _pose_columns(tables))
-        if tables.camera_file is not None:
-            (into / "camera.yaml").write_bytes(tables.camera_file)
-        else:
-            fit, words = tables.fit, "# fg-calib board: estimated from the images, in px; 1 sigma\n"
-            values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
-            io.write_text(into / "camera.yaml", words + yaml.safe_dump(values, sort_keys=False))
-        names.extend(sorted(file.name for file in into.iterdir()))
-
-    io.fill_folder(folder, write, BOARD_FILES)
-    return tuple(names)
+    fit, words = tables.fit, "# fg-calib board: estimated from the images, in px; 1 sigma\n"
+    values = asdict(fit.camera) | {"width": fit.size[0], "height": fit.size[1], "sigma": fit.camera_sigma}
+    files: dict[str, Any] = {"board.json": json.dumps(tables.document(), indent=1, allow_nan=False) + "\n"}
+    files["pixels.csv"] = partial(io.write_csv, columns=_pixel_columns(tables))
+    if tables.posed:
+        files["board.csv"] = partial(io.write_csv, columns=_pose_columns(tables))
+    files["camera.yaml"] = tables.camera_file or words + yaml.safe_dump(values, sort_keys=False)
+    io.fill_folder(folder, files, BOARD_FILES)
+    return tuple(sorted(files))
 
 
 def _row_columns(tables: BoardTables, views: Sequence[View], each: Sequence[int]) -> dict[str, Any]:

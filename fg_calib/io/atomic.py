@@ -97,7 +97,11 @@ def write_text(path: Path, text: str) -> None:
         raise InputError(str(path), f"cannot be written: {error.strerror or error}") from None
 
 
-def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, bytes] | None = None) -> None:
+File = str | bytes | Callable[[Path], object]
+"""What a file holds, or a function that writes it to the path that it is given, after those before it."""
+
+
+def fill_folder(folder: Path, files: Mapping[str, File], own: Mapping[str, bytes] | None = None) -> None:
     """Write several files to a folder, after all of them were written to another folder.
 
     An interruption while they are moved may leave old files with new ones. The first of `own` is moved last: where it
@@ -105,7 +109,7 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
 
     Args:
         folder: Where the files appear; it is made if it does not exist.
-        write: Writes them to the folder that it is given.
+        files: The files by name.
         own: Files that may be written, replaced, and removed if they are not written now: see `require_own`.
 
     Raises:
@@ -118,7 +122,11 @@ def fill_folder(folder: Path, write: Callable[[Path], None], own: Mapping[str, b
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".fg-calib-", dir=folder, ignore_cleanup_errors=True) as made:
             try:
-                write(Path(made))
+                for name, content in files.items():
+                    if callable(content):
+                        content(Path(made, name))
+                    else:
+                        Path(made, name).write_bytes(content.encode() if isinstance(content, str) else content)
             except InputError as error:
                 place = error.place.replace(made, str(folder))
                 raise InputError(place, error.found, error.expected, error.hint) from error
@@ -143,7 +151,7 @@ def require_writable(folder: Path) -> None:
     Raises:
         InputError: A file cannot be written.
     """
-    fill_folder(folder, lambda _: None)
+    fill_folder(folder, {})
 
 
 def require_absent(folder: Path, names: Iterable[str]) -> None:

@@ -18,7 +18,7 @@ import math
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, partial
 from hashlib import file_digest, sha256
 from importlib import metadata
 from pathlib import Path
@@ -641,7 +641,7 @@ def joint_frame(found: statistics.JointErrors, solution: Solution) -> pl.DataFra
 
 
 def write_calibration(
-    folder: Path, result: Result, robot: Robot, tables: Mapping[str, pl.DataFrame], pages: Mapping[str, str]
+    folder: Path, result: Result, robot: Robot, tables: Mapping[str, pl.DataFrame], pages: dict[str, str]
 ) -> None:
     """Write the files of a calibration into a folder, all or none.
 
@@ -656,18 +656,15 @@ def write_calibration(
     Raises:
         InputError: The folder cannot be written.
     """
+    files: dict[str, Any] = {"robot_calibrated.yaml": partial(_write_robot, robot=robot)}
+    files |= {name: t.write_parquet if name.endswith(".parquet") else t.write_csv for name, t in tables.items()}
 
-    def write(into: Path) -> None:
-        _write_robot(into, robot)
-        for name, table in tables.items():
-            table.write_parquet(into / name) if name.endswith(".parquet") else table.write_csv(into / name)
-        digests = {name: _digest(into / name) for name in tables}
+    def write_result(path: Path) -> None:
+        digests = {name: _digest(path.with_name(name)) for name in tables}
         document = result.model_copy(update={"files": digests}).document()
-        texts = {**pages, "result.json": json.dumps(document, indent=1, allow_nan=False) + "\n"}
-        for name, text in texts.items():
-            write_text(into / name, text)
+        write_text(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
-    fill_folder(folder, write, RESULT_FILES)
+    fill_folder(folder, files | pages | {"result.json": write_result}, RESULT_FILES)
 
 
 def _digest(path: Path) -> str:
@@ -675,10 +672,11 @@ def _digest(path: Path) -> str:
         return file_digest(file, "sha256").hexdigest()
 
 
-def _write_robot(folder: Path, robot: Robot) -> None:
+def _write_robot(path: Path, robot: Robot) -> None:
+    """The YAML of a robot; next to it its URDF, alone where that says all."""
     units = Units(*robot.units)
     if robot.urdf is not None:
-        file, own = folder / "robot_calibrated.urdf", has_own_zeros(robot)
+        file, own = path.with_suffix(".urdf"), has_own_zeros(robot)
         write_urdf(file, robot)
         links = {"base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
         require_same_chain(robot, read_robot(file, **links, estimate=[model.ZEROS] * own), str(file))
@@ -690,7 +688,7 @@ def _write_robot(folder: Path, robot: Robot) -> None:
         for p, factor in ((p, units.factor(p.unit)) for p in robot.parameters)
     ]
     name = None if robot.urdf is None else "robot_calibrated.urdf"
-    write_robot(folder / "robot_calibrated.yaml", robot.with_values(rounded), units=units, urdf_name=name)
+    write_robot(path, robot.with_values(rounded), units=units, urdf_name=name)
 
 
 def read_calibrated_robot(folder: Path, result: Result) -> Robot:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from rich.table import Table as Shown
 
 from fg_calib import inputs, measurements, observability, prediction, simulation
 from fg_calib.designs import Design
-from fg_calib.io import Units, fill_folder, require_absent, write_csv, write_robot, write_text, write_urdf
+from fg_calib.io import Units, fill_folder, require_absent, write_csv, write_robot, write_urdf
 from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.predict import FRAMES
@@ -169,31 +170,24 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     scenario = design.pool.scenario
     measured = design.tables if scenario is not None else ()
-    files: dict[str, Any] = {CONFIGURATIONS: _configurations(design, robot, units)}
+    files: dict[str, Any] = {DESIGN: tables.json_text(design_document(design))}
+    files |= {"design.svg": standalone([draw_design(design)])}
+    files[CONFIGURATIONS] = partial(write_csv, columns=_configurations(design, robot, units))
     for t in measured:
         for name, columns in simulation.table_columns(t, robot, units).items():
             rounded = _rounded(t.measurements.readings, robot, units) if "q1" in columns else {}
-            files[name] = simulation.to_fill_in({**columns, **rounded}, touched=_is_touched(t))
-    urdf = "robot.urdf" if robot.urdf is not None and measured else None
-    job = ("robot.yaml", "calibration.yaml") if measured else ()
-    names = (DESIGN, "design.svg", *files, *job, *([urdf] if urdf else []))
-    require_absent(folder, names)
-
-    def write(into: Path) -> None:
-        write_text(into / DESIGN, tables.json_text(design_document(design)))
-        write_text(into / "design.svg", standalone([draw_design(design)]))
-        for name, columns in files.items():
-            write_csv(into / name, columns)
-        if urdf is not None:
-            write_urdf(into / urdf, robot)
-        if scenario is not None:
-            write_robot(into / "robot.yaml", robot, units=units, urdf_name=urdf)
-            then = _CALIBRATE if design.pool.before is None else _UPDATE
-            keys = {"robot": "robot.yaml"} | {k: v for k, v in scenario.job.items() if k not in ("model", "pairing")}
-            write_text(into / "calibration.yaml", simulation.job_text(_JOB_BEGINS + then, keys, measured, robot, units))
-
-    fill_folder(folder, write)
-    return names
+            left = simulation.to_fill_in({**columns, **rounded}, touched=_is_touched(t))
+            files[name] = partial(write_csv, columns=left)
+    if scenario is not None:
+        urdf = None if robot.urdf is None else "robot.urdf"
+        files["robot.yaml"] = partial(write_robot, robot=robot, units=units, urdf_name=urdf)
+        words = _JOB_BEGINS + (_CALIBRATE if design.pool.before is None else _UPDATE)
+        keys = {"robot": "robot.yaml"} | {k: v for k, v in scenario.job.items() if k not in ("model", "pairing")}
+        files["calibration.yaml"] = simulation.job_text(words, keys, measured, robot, units)
+        files |= {} if urdf is None else {urdf: partial(write_urdf, robot=robot)}
+    require_absent(folder, files)
+    fill_folder(folder, files)
+    return tuple(files)
 
 
 def _is_touched(table: measurements.Table) -> bool:

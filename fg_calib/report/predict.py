@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats
-from fg_calib.io import Result, Units, fill_folder, joint_columns, require_absent, write_csv, write_text
+from fg_calib.io import Result, Units, fill_folder, joint_columns, require_absent, write_csv
 from fg_calib.prediction import Correction, PredictedErrors, ToolErrors, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import standalone
@@ -122,15 +123,11 @@ def write_prediction(
         for column, (kind, unit) in zip(() if of is None else of.T, POSE_KINDS.items(), strict=False):
             columns[f"{name}_{kind}_{tables.shown_in(unit).unit}"] = column * tables.shown_in(unit).factor
     columns["measured_near"] = np.where(found.far, "no", "yes")
-
-    def write(into: Path) -> None:
-        write_text(into / "predict.json", tables.json_text(prediction_document(found, result, ids)))
-        write_csv(into / "predict.csv", columns)
-        if not found.given and found.unknown < 1.0:
-            slices = error_slices(errors.position, found.expected[:, 0], found.measured)
-            write_text(into / "predict.svg", standalone(slices))
-
-    fill_folder(folder, write, FILES)
+    document = tables.json_text(prediction_document(found, result, ids))
+    files: dict[str, Any] = {"predict.json": document, "predict.csv": partial(write_csv, columns=columns)}
+    if not found.given and found.unknown < 1.0:
+        files["predict.svg"] = standalone(error_slices(errors.position, found.expected[:, 0], found.measured))
+    fill_folder(folder, files, FILES)
 
 
 def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot, ids: Sequence[str] = ()) -> Group:

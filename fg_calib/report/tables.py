@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from fg_calib import __version__, diagnostics, inputs
-from fg_calib.io import fill_folder, write_text
+from fg_calib.io import fill_folder
 from fg_calib.observability import LostDirection, Observability
 from fg_calib.robot import SCALES, Robot, Scale, unit_of
 
@@ -266,7 +266,7 @@ def write_document(folder: Path | str, name: str, document: dict[str, Any]) -> N
         InputError: The folder cannot be written, or holds another file of that name.
     """
     begins = json_text({"schema": document["schema"]}).rpartition("/")[0].encode()
-    fill_folder(Path(folder), lambda into: write_text(into / name, json_text(document)), {name: begins})
+    fill_folder(Path(folder), {name: json_text(document)}, {name: begins})
 
 
 def json_text(document: Any) -> str:

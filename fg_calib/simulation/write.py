@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -51,33 +52,30 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     """
     folder, robots = Path(folder), {"robot_nominal": simulation.robot, "robot_true": simulation.true_robot}
     units = Units(length=simulation.scenario.length_unit, angle=simulation.scenario.angle_unit)
-    tables = {name: c for t in simulation.tables for name, c in table_columns(t, simulation.robot, units).items()}
-    texts = {"calibration.yaml": _job_text(simulation, units)}
+    files: dict[str, Any] = {}
+    for name, robot in robots.items():
+        urdf = None if robot.urdf is None else f"{name}.urdf"
+        files |= {} if urdf is None else {urdf: partial(io.write_urdf, robot=robot)}
+        files[f"{name}.yaml"] = partial(io.write_robot, robot=robot, units=units, urdf_name=urdf)
+    for table in simulation.tables:
+        for name, columns in table_columns(table, simulation.robot, units).items():
+            files[name] = partial(io.write_csv, columns=columns)
     if simulation.scenario.instruments:
         truth = {kind: {n: _place(one, units) for n, one in found.items()} for kind, found in simulation.truth.items()}
-        texts["truth.yaml"] = _yaml({"units": asdict(units)} | truth)
+        files["truth.yaml"] = _yaml({"units": asdict(units)} | truth)
 
-    def write(into: Path) -> None:
-        for name, robot in robots.items():
-            urdf = None if robot.urdf is None else f"{name}.urdf"
-            if urdf is not None:
-                io.write_urdf(into / urdf, robot)
-            io.write_robot(into / f"{name}.yaml", robot, units=units, urdf_name=urdf)
-        for name, columns in tables.items():
-            io.write_csv(into / name, columns)
-        words, _, rest = texts["calibration.yaml"].partition("\n")
-        for name, text in {**texts, "calibration.yaml": f"{words}; {_digest(into, rest)}\n{rest}"}.items():
-            io.write_text(into / name, text)
+    def write_job(path: Path) -> None:
+        words, _, rest = _job_text(simulation, units).partition("\n")
+        io.write_text(path, f"{words}; {_digest(path.parent, rest)}\n{rest}")
 
+    files["calibration.yaml"] = write_job
     job = folder / "calibration.yaml"
     words, _, rest = io.read_text(job).partition("\n") if io.exists(job) else ("", "", "")
     if words.startswith(_FIRST_WORDS) and not words.endswith(_digest(folder, rest)):
         raise InputError(str(folder), "files that were changed since they were simulated", "another folder")
-    urdfs = [f"{name}.urdf" for name, robot in robots.items() if robot.urdf is not None]
-    names = sorted((*tables, *texts, *urdfs, *(f"{name}.yaml" for name in robots)))
     own = {"calibration.yaml": _FIRST_WORDS.encode()}
-    io.fill_folder(folder, write, own | dict.fromkeys(names, b"") | own)
-    return tuple(names)
+    io.fill_folder(folder, files, own | dict.fromkeys(files, b"") | own)
+    return tuple(sorted(files))
 
 
 def _digest(folder: Path, job: str) -> str:
