@@ -55,6 +55,7 @@ def touches(rng):
 PAIRS = {"model": "distance-rotation"}
 CASES = {
     "poses, joint values": (poses, {"joint": 2e-3}, {"model": "pose", "encoder": "estimated"}),
+    "poses": (poses, {}, {"model": "pose"}),
     "star": (poses, {}, PAIRS),
     "all pairs": (poses, {}, PAIRS | {"pairing": Pairing("all")}),
     "all pairs of small motions": (small_motions, {}, PAIRS | {"pairing": Pairing("all")}),
