@@ -84,6 +84,11 @@ def tool_pose(robot: Robot, q: Floats, values: Floats | None = None) -> Floats:
     return T
 
 
+def tool_poses(robot: Robot, q: Floats) -> Floats:
+    """base_T_tool of each row, shape (n, 4, 4)."""
+    return np.stack([tool_pose(robot, row) for row in q])
+
+
 def central_differences(function: Callable[[Floats], Floats], x: Floats, step: float = 1e-6) -> Floats:
     """Derivative of function at x: the values' shape, then x's."""
     columns = []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from exported import UR10
 from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, slipped
+from oracle import central_differences
 from scipy import stats
 from simulated import true_robot
 
@@ -51,13 +52,10 @@ def test_chi_square_is_that_of_the_covariance_written_out(known):
     found = calibration.check(Table(alone, "position"))
     predicted = calibration.predict(rows.readings)
     r = (predicted.position - rows.position).ravel()
-    names, values = list(calibration.result.covariance.names), calibration.robot.nominal
-    J = []
-    for name in names:
-        at = [calibration.robot.with_values(values + h * np.eye(len(values))[calibration.robot.index(name)])
-              for h in (1e-5, -1e-5)]  # fmt: skip
-        J.append((pose(at[0], rows.readings).position - pose(at[1], rows.readings).position).ravel() / 2e-5)
-    C = SIGMA[0] ** 2 * np.eye(9) + np.array(J).T @ calibration.covariance(names) @ np.array(J)
+    names, robot = list(calibration.result.covariance.names), calibration.robot
+    J = central_differences(lambda x: pose(robot.with_values(x), rows.readings).position.ravel(), robot.nominal, 1e-5)
+    J = J[:, [robot.index(name) for name in names]]
+    C = SIGMA[0] ** 2 * np.eye(9) + J @ calibration.covariance(names) @ J.T
     assert found.chi2 == pytest.approx(r @ np.linalg.solve(C, r), rel=1e-5)  # differences
     assert found.p_value == pytest.approx(stats.chi2.sf(found.chi2, 9))
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from oracle import central_differences
 from simulated import TOOL, measure, planar_robot, small_arm
 from tolerances import rounding
 
@@ -69,22 +70,15 @@ def dense_bound(robot, readings, sigma_joint, pairs, pair_errors, step=1e-6):
         p = pose(robot.with_values(values), q).position
         return np.linalg.norm(p[b] - p[a], axis=1)
 
-    J = np.empty((len(pairs), len(i)))
-    for column, k in enumerate(i):
-        h = step * np.eye(len(nominal))[k]
-        J[:, column] = (distances(nominal + h, readings) - distances(nominal - h, readings)) / (2 * step)
+    J = central_differences(lambda values: distances(values, readings), nominal, step)[:, i]
     p = pose(robot, readings).position
     u = (p[b] - p[a]) / np.linalg.norm(p[b] - p[a], axis=1)[:, None]
     L = np.zeros((len(pairs), readings.size + p.size))
     for row, (first, second) in enumerate(pairs):
         L[row, 3 * second : 3 * second + 3] = SIGMA * u[row]
         L[row, 3 * first : 3 * first + 3] = -SIGMA * u[row]
-    for k in range(readings.size):
-        h = np.zeros(readings.size)
-        h[k] = step
-        h = h.reshape(readings.shape)
-        L[:, p.size + k] = sigma_joint * (distances(nominal, readings + h) - distances(nominal, readings - h))
-    L[:, p.size :] /= 2 * step
+    of_readings = central_differences(lambda q: distances(nominal, q.reshape(readings.shape)), readings.ravel(), step)
+    L[:, p.size :] = sigma_joint * of_readings
     P = np.diag([1.0 / robot.parameters[k].tolerance ** 2 for k in i])
     C = L @ L.T
     weighted = np.linalg.inv(C if pair_errors == "shared" else np.diag(np.diag(C))) @ J

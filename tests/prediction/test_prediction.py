@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from oracle import central_differences
 from simulated import measure, small_arm, true_robot
 from tolerances import rounding
 
@@ -28,6 +29,12 @@ def in_unknown_frame():
     rng = np.random.default_rng(2)
     robot = small_arm()
     return calibrate(robot, measure(robot, 40, rng), model="pose", frame="unknown", gauge="none")
+
+
+def derivatives(robot, names, q):
+    """Of the tool's position at a configuration in some parameters, shape (3, n)."""
+    every = central_differences(lambda values: pose(robot.with_values(values), [q]).position[0], robot.nominal)
+    return every[:, [robot.index(name) for name in names]]
 
 
 def small(monkeypatch):
@@ -132,18 +139,6 @@ def test_errors_over_two_configurations_are_roots_of_mean_squares_and_half_the_l
     base, fitted = errors_at(result.posterior, q)
     assert base.position == pytest.approx(np.sqrt(np.mean([np.trace(one @ C @ one.T) for one in v])), rel=1e-5)
     assert fitted.position == pytest.approx(0.5 * np.sqrt(length @ C @ length), rel=1e-5)
-
-
-def derivatives(robot, names, q, step=1e-6):
-    columns = []
-    for name in names:
-        at = []
-        for sign in (1, -1):
-            values = robot.nominal
-            values[robot.index(name)] += sign * step
-            at.append(pose(robot.with_values(values), [q]).position[0])
-        columns.append((at[0] - at[1]) / (2 * step))
-    return np.array(columns).T
 
 
 def test_what_nothing_determines_is_unknown_and_named(monkeypatch):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from oracle import random_robot, tool_pose
+from oracle import random_robot, tool_pose, tool_poses
 from simulated import paper_robot, planar_robot, small_arm
 from tolerances import rounding
 
@@ -11,15 +11,10 @@ from fg_calib.robot import CONVENTIONS, REACHED, pose, random_readings, solve_in
 from fg_calib.robot.inverse import _Search
 
 
-def poses_of(robot, q):
-    """base_T_tool of each row, shape (n, 4, 4), by the oracle."""
-    return np.stack([tool_pose(robot, row) for row in q])
-
-
 def require_reached(robot, found, T):
     """The solutions bring the tool to T within 1e-9 m and rad, and stand within the limits."""
     assert found.reached.all()
-    there = poses_of(robot, found.readings)
+    there = tool_poses(robot, found.readings)
     assert np.abs(there[:, :3, 3] - T[:, :3, 3]).max() < REACHED
     assert np.abs(there[:, :3, :3] - T[:, :3, :3]).max() < REACHED
     lower, upper = robot.limits.T
@@ -45,13 +40,13 @@ ARMS = [
 def test_poses_that_can_be_reached_are_reached_within_the_limits(robot):
     """Any convention, revolute and prismatic, with base and tool, fewer than six joints and more."""
     rng = np.random.default_rng(1)
-    T = poses_of(robot, random_readings(robot, 15, rng))
+    T = tool_poses(robot, random_readings(robot, 15, rng))
     require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
 
 def test_limits_that_are_no_whole_turn_about_zero_are_kept():
     robot, rng = planar_robot(limits=[np.deg2rad([200, 500])] * 2), np.random.default_rng(2)
-    T = poses_of(robot, random_readings(robot, 50, rng))
+    T = tool_poses(robot, random_readings(robot, 50, rng))
     require_reached(robot, solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng), T)
 
 
@@ -66,7 +61,7 @@ def test_random_starts_give_random_self_motion():
 def test_a_solution_stays_near_where_it_started():
     robot, rng = paper_robot(), np.random.default_rng(4)
     near = np.array([0.3, -0.5, 0.4, 1.0, -0.7, 0.9, 0.2])
-    T = poses_of(robot, near + 0.05 * rng.normal(size=(20, 7)))
+    T = tool_poses(robot, near + 0.05 * rng.normal(size=(20, 7)))
     found = solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng, near=near)
     require_reached(robot, found, T)
     assert np.abs(found.readings - near).max() < 0.6
@@ -94,7 +89,7 @@ def test_steps_are_of_minimum_norm():
 @pytest.mark.slow
 def test_what_cannot_be_reached_is_told_with_its_miss():
     robot, rng = elbow_arm(180), np.random.default_rng(5)
-    T = poses_of(robot, random_readings(robot, 3, rng))
+    T = tool_poses(robot, random_readings(robot, 3, rng))
     T[1, :3, 3] = 4.0, 0.0, 0.0  # the arm is 1.8 m long
     found = solve_inverse(robot, T[:, :3, 3], T[:, :3, :3], generator=rng)
     assert found.reached.tolist() == [True, False, True]
@@ -118,7 +113,7 @@ def test_what_a_joint_at_its_limit_cannot_do_the_others_do():
 
 def test_a_pose_is_solved_alike_alone_and_among_others():
     robot = paper_robot()
-    T = poses_of(robot, random_readings(robot, 10, np.random.default_rng(7)))
+    T = tool_poses(robot, random_readings(robot, 10, np.random.default_rng(7)))
     R, p = T[:, :3, :3], T[:, :3, 3]
     ten = solve_inverse(robot, p, R, generator=np.random.default_rng(8)).readings
     three = solve_inverse(robot, p[:3], R[:3], generator=np.random.default_rng(8)).readings

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from oracle import tool_pose
+from oracle import tool_poses
 from simulated import paper_robot, planar_robot, small_arm
 
 from fg_calib.robot import REACHED, Robot, random_readings
@@ -35,10 +35,6 @@ def draw(robot, of, n=None, **conditions):
     lower, upper = robot.limits.T
     assert isinstance(of, GivenReadings) or ((found.readings >= lower) & (found.readings <= upper)).all()
     return found
-
-
-def poses_of(robot, readings):
-    return np.stack([tool_pose(robot, q) for q in readings])
 
 
 def angle(a, b):
@@ -110,7 +106,7 @@ def test_all_are_apart_and_none_was_rejected_for_nothing(robot):
 
 def test_a_camera_looks_at_the_board_from_within_the_range_and_the_cone():
     found = draw(ARM, VIEWS)
-    T = poses_of(ARM, found.readings)
+    T = tool_poses(ARM, found.readings)
     assert (len(T), set(found.rejected)) == (100, {"out of reach"})
     away = T[:, :3, 3] - BOARD.position
     length = np.linalg.norm(away, axis=1)
@@ -125,7 +121,9 @@ def test_the_centre_is_anywhere_in_the_field_of_view_evenly():
     """1 - cosine of the angle to the axis, and the azimuth, are even: of 200 numbers the mean is 0.5 +- 0.0204."""
     board = Placement(np.eye(3), np.array([6.0, 0.0, 3.0]))
     robot = paper_robot()  # reaches nearly any of these, so that reach does not favour some
-    T = poses_of(robot, draw(robot, BoardViews(board, 199, distance=(0.3, 0.6), cone=0.7, field_of_view=0.4)).readings)
+    T = tool_poses(
+        robot, draw(robot, BoardViews(board, 199, distance=(0.3, 0.6), cone=0.7, field_of_view=0.4)).readings
+    )
     seen = np.einsum("nji,nj->ni", T[:, :3, :3], board.position - T[:, :3, 3])
     even = (1.0 - np.cos(angle(seen, np.array([0.0, 0.0, 1.0])))) / (1.0 - np.cos(0.4))
     around = np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5
@@ -136,7 +134,7 @@ def test_the_centre_is_anywhere_in_the_field_of_view_evenly():
 def test_the_whole_board_is_in_the_field_of_view():
     views = replace(VIEWS, field_of_view=0.4, board_size=(0.2, 0.1))
     found = draw(ARM, views, n=60)
-    T = poses_of(ARM, found.readings)
+    T = tool_poses(ARM, found.readings)
     corners = [BOARD.position + BOARD.rotation @ (x, y, 0.0) for x in (-0.1, 0.1) for y in (-0.05, 0.05)]
     off = np.array([angle(corner - T[:, :3, 3], T[:, :3, 2]) for corner in corners])
     assert off.max() <= 0.4 + 1e-8
@@ -152,7 +150,7 @@ def test_the_tracker_sees_the_reflector(robot, far):
     """Within its range and the reflector's acceptance; an arm of four joints is not turned, but drawn until it is."""
     region = Box([-2.0, -0.6, -0.9], [1.0, 1.0, 1.0])
     views = replace(TARGET, distance=(2.0, far), region=region)
-    T = poses_of(robot, draw(robot, views).readings)
+    T = tool_poses(robot, draw(robot, views).readings)
     target = np.einsum("nij,j->ni", T[:, :3, :3], views.target) + T[:, :3, 3]
     away, off = np.linalg.norm(views.station - target, axis=1), angle(views.station - target, T[:, :3, :3] @ views.axis)
     assert len(T) == 100

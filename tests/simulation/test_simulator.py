@@ -10,7 +10,7 @@ from math import sqrt
 import numpy as np
 import pytest
 from exported import TREE
-from oracle import tool_pose
+from oracle import tool_poses
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 from simulated import planar_robot
@@ -37,17 +37,12 @@ def simulation(shipped):
     return simulate(shipped, 0)
 
 
-def poses_of(robot, q):
-    """base_T_tool of each row, shape (n, 4, 4), by the oracle."""
-    return np.stack([tool_pose(robot, row) for row in q])
-
-
 def measured(simulation):
     """The true poses in the measurement frame by 4x4 products, and how the measured ones differ: position, rotation
     vector about the tool's axes."""
     world_T_base = np.eye(4)
     world_T_base[:3, :3], world_T_base[:3, 3] = simulation.frame.rotation, simulation.frame.position
-    T = world_T_base @ poses_of(simulation.true_robot, simulation.true_readings)
+    T = world_T_base @ tool_poses(simulation.true_robot, simulation.true_readings)
     m = simulation.measurements
     turned = np.swapaxes(T[:, :3, :3], 1, 2) @ m.rotation
     return T, m.position - T[:, :3, 3], Rotation.from_matrix(turned).as_rotvec()
@@ -93,7 +88,7 @@ def test_drawn_errors_have_their_size_and_spare_fixed_parameters(shipped, law, v
 def test_the_camera_looks_at_the_centre_from_a_and_from_the_half_sphere(simulation):
     """At the nominal robot, by 4x4 products, to 1e-9; and within the limits."""
     q, test = np.split(simulation.measurements.readings, [52])
-    T = poses_of(simulation.robot, q)
+    T = tool_poses(simulation.robot, q)
     p, z, A = T[:, :3, 3], T[:, :3, 2], np.array([0.0, 6.5, 3.05])
     assert p[0] == pytest.approx(A, abs=rounding(1, 10))
     assert np.linalg.norm(p[1:] - A, axis=1) == pytest.approx(0.5, abs=rounding(1, 1e3))

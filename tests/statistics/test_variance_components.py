@@ -42,15 +42,8 @@ def tracker_and_bar(true, rng, n=30):
     b = np.concatenate([np.roll(np.arange(n), 1), np.roll(np.arange(n), 3)])
     length = np.linalg.norm(p[b] - p[a], axis=1) + 5e-4 * rng.normal(size=len(a))
     sigma, none = np.full(len(a), 5e-4), np.full(len(a), np.nan)
-    same = {
-        "readings": q,
-        "ids": np.arange(n).astype(str),
-        "test": np.zeros(n, dtype=bool),
-        "rotation": None,
-        "sigma_orientation": None,
-        "sigma_joint": np.full(true.n_joints, SIGMA_JOINT),
-        "named": True,
-    }
+    same = {"readings": q, "ids": np.arange(n).astype(str), "test": np.zeros(n, dtype=bool), "named": True}
+    same |= {"rotation": None, "sigma_orientation": None, "sigma_joint": np.full(true.n_joints, SIGMA_JOINT)}
     p = p + SIGMA[0] * rng.normal(size=p.shape)
     pairs = Pairs(a, b, length, none, sigma, none, np.zeros(len(a), dtype=bool))
     return (
@@ -68,16 +61,12 @@ def touched(true, rng):
     return replace(m, readings=readings, sigma_joint=np.full(true.n_joints, SIGMA_JOINT))
 
 
-CHOICES = {
-    "pose": {"model": "pose"},
+CHOICES = {name: {"model": "pose"} for name in ("pose", "no joint noise", "joints drowned")}
+CHOICES |= {name: {"model": "distance"} for name in ("star of distances", "touches")} | {"tables": {}}
+CHOICES |= {
     "frame unknown": {"model": "pose", "frame": "unknown"},
     "encoder estimated": {"model": "pose", "encoder": "estimated"},
-    "no joint noise": {"model": "pose"},
-    "joints drowned": {"model": "pose"},
-    "star of distances": {"model": "distance"},
     "all distances": {"model": "distance", "pairing": Pairing("all")},
-    "touches": {"model": "distance"},
-    "tables": {},
 }
 
 
