@@ -189,7 +189,7 @@ def named_changes(v: graph.Variables) -> dict[str, Floats]:
     found: dict[str, Floats] = dict(zip(v.names, E.T[:, :, None], strict=True))
     for j, name in enumerate(robot.zero_names):
         own = [v.names.index(p.name) for p in robot.parameters if p.owner == j + 1 and p.name in v.names]
-        A, b = (J @ E[:, own]).reshape(-1, len(own)), joints[:, :, j].ravel()
+        A, b = np.concatenate(J @ E[:, own]), joints[:, :, j].ravel()
         amounts = np.linalg.lstsq(A, b, rcond=None)[0] if own else np.zeros(0)
         if np.linalg.norm(A @ amounts - b) <= 1e-6 * np.linalg.norm(b):
             found.setdefault(name, E[:, own] @ amounts[:, None])

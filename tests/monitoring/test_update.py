@@ -7,7 +7,7 @@ import pytest
 from month import arm, calibrated, measured, placed, slipped
 from simulated import true_robot
 
-from fg_calib import InputError, Measurements, Table, calibrate
+from fg_calib import InputError, Measurements, Table, calibrate, export
 from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 
@@ -134,6 +134,17 @@ def test_an_update_at_odds_with_what_was_known_points_to_the_check():
     updated = calibration.update(measured(slipped(true, theta3=1e-3), 8, rng))
     assert "See `fg-calib check`" in updated.findings[0]
     assert not any("parallel" in text for text in updated.findings)
+
+
+def test_a_joint_of_fixed_parameters_has_no_zero_to_change():
+    """Other joints change, and zeros fitted to the arm are exported, its own too."""
+    calibration, true, rng = calibrated(1, robot=arm(fixed=["a1", "alpha1", "d1", "theta1"]))
+    rows = measured(slipped(true, theta3=2e-3), 10, rng, ids="new")
+    changed = calibration.update(rows, changed="theta3").parameters["theta3"]
+    assert abs(changed.estimate - true.nominal[true.index("theta3")] - 2e-3) < 4.0 * changed.sigma
+    with pytest.raises(InputError, match="changed"):
+        calibration.update(rows, changed="q1.zero")
+    assert all(zero["determined"] for zero in export(calibration, "zeros").details["zeros"].values())
 
 
 def test_growth_is_added_to_what_was_known():
