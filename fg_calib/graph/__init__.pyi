@@ -4,7 +4,7 @@ from .build import (
     problem_of,
     problem_of_tables,
 )
-from .error_states import PRIVATE_SHARE, State, WhitenedBlock, WhitenedRows, block_diagonal, whitener_of
+from .error_states import PRIVATE_SHARE, State, WhitenedBlock, WhitenedRows, all_errors, block_diagonal, whitener_of
 from .factors import DistanceFactor, RotationAngleFactor
 from .knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
 from .noise_models import JOINT_NOISE, NoiseName, NoiseState, RowNoise, reach, whitening_of
@@ -21,8 +21,8 @@ from .problem import (
     Problem,
     correlation,
     directions,
-    estimate_sensitivity,
     joint_errors,
+    loss_variance,
     mahalanobis_distances,
     named_triangle,
     noises_at,
@@ -80,6 +80,7 @@ __all__ = [
     "Variables",
     "WhitenedBlock",
     "WhitenedRows",
+    "all_errors",
     "block_diagonal",
     "build_problem",
     "build_variables",
@@ -90,11 +91,11 @@ __all__ = [
     "directions",
     "effect",
     "eliminate",
-    "estimate_sensitivity",
     "first_independent",
     "frame_of",
     "joint_errors",
     "kept_of",
+    "loss_variance",
     "mahalanobis_distances",
     "named_triangle",
     "noises_at",

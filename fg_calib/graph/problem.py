@@ -14,7 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fg_calib.graph.error_states import WhitenedRows, all_errors, correlation_of, whitened_rows
+from fg_calib.graph.error_states import WhitenedRows, correlation_of, whitened_rows
 from fg_calib.graph.factors import linearize_factors, measurement_factors, prior_factors, with_added
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, POSE_SLOTS, NoiseState, RowNoise, TableState, same_everywhere
@@ -195,10 +195,8 @@ class Problem(FrozenArrays):
     @property
     def n_pairs(self) -> int:
         """Train pairs that give at least one row."""
-        numbers = {s.table: list[Integers]() for s in self.pair_blocks}
-        for s in self.pair_blocks:
-            numbers[s.table].append(s.number[s.train])
-        return sum(int(np.sum(np.bincount(np.concatenate(each)) > 0)) for each in numbers.values())
+        each = [s.table * 2**32 + s.number[s.train].astype(np.int64) for s in self.pair_blocks]
+        return len(np.unique(np.concatenate([np.zeros(0, np.int64), *each])))
 
     @property
     def n_configurations(self) -> int:
@@ -485,25 +483,6 @@ def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:
 def named_triangle(problem: Problem, parameters: Floats) -> Floats:
     """The system's triangle by named parameters, measurement frames projected out, shape (m, n_robot_columns)."""
     return named_rows(problem.variables, parameters, problem.linearize(parameters).left.A)
-
-
-def estimate_sensitivity(problem: Problem, parameters: Floats, wanted: Integers) -> Floats:
-    """Sensitivity M of the estimate to errors e of configurations: dx = -K M e, K its covariance.
-
-    Args:
-        problem: The problem.
-        parameters: The parameter vector.
-        wanted: Numbers of the errors that are asked for (see `noise_models`).
-
-    Returns:
-        M by core and nuisance variables, these not eliminated, shape (n_columns + n_nuisance, len(wanted)).
-    """
-    v = problem.variables
-    if not len(wanted):
-        return np.zeros((v.n_columns + v.n_nuisance, 0))
-    J = problem.rows.private(v.at(parameters))[:, :-1]
-    L = all_errors(problem.noises, problem.rows)[:, wanted]
-    return (L.T @ problem.rows.states.weigh(J)).T / loss_variance(problem)
 
 
 def loss_variance(problem: Problem) -> float:

@@ -296,11 +296,6 @@ class _Point:
             raise SolverError(" ".join((str(error) or type(error).__name__).split())) from error
 
     @property
-    def decrement(self) -> float:
-        """How far the optimum still is, [sigma]."""
-        return self.system.decrement
-
-    @property
     def rounding(self) -> float:
         """Part of the decrement that is rounding of the residuals, [sigma]."""
         largest, angle = float(self.system.singular_values.max(initial=0.0)), self.problem.robot.scale_of("rad")
@@ -309,7 +304,7 @@ class _Point:
     @property
     def at_rounding(self) -> bool:
         """Whether rounding of the cost is above the decrease that the step promises."""
-        return 0.5 * self.decrement**2 <= 10.0 * self.rounding * float(np.sqrt(2.0 * self.system.cost))
+        return 0.5 * self.system.decrement**2 <= 10.0 * self.rounding * float(np.sqrt(2.0 * self.system.cost))
 
     def after(self, step: Floats) -> _Point:
         """The point after a tangent step."""
@@ -325,8 +320,8 @@ class _Point:
         """
         there = self.after(self.system.step)
         try:
-            falls = self.system.cost - there.system.cost >= FAIR_SHARE * 0.5 * self.decrement**2
-            if falls or (self.at_rounding and there.decrement < self.decrement):
+            falls = self.system.cost - there.system.cost >= FAIR_SHARE * 0.5 * self.system.decrement**2
+            if falls or (self.at_rounding and there.system.decrement < self.system.decrement):
                 return there, 0.0, damping
         except SolverError:
             pass  # so far off that the rows have no derivative there
@@ -383,33 +378,35 @@ def _fit(problem: Problem, options: SolverOptions) -> Solution:
     here, converged, message, share = _Point(problem, start), False, "", 1.0
     del problem  # a million pairs once less in memory
     while not message and len(history) < options.max_iterations:
-        was, near, there = here, here.decrement <= COARSE, here
+        was, near, there = here, here.system.decrement <= COARSE, here
         if not near and (found := here.descend(damping)) is not None:
             here, used, damping = found
             history.append(_iteration(was, here, used))
             continue
-        stepped = near and here.decrement > max(options.decrement, here.rounding)
+        stepped = near and here.system.decrement > max(options.decrement, here.rounding)
         there = here.after(share * here.system.step) if stepped else here
         state, final = _learn(here.problem, there.parameters, weighting)
         here = _Point(relinearized_at(here.problem, there.parameters, state), there.parameters)
-        left = here.decrement
+        left = here.system.decrement
         if stepped:  # each step leaves the same share of what was left, without end
             history.append(_iteration(was, here, 0.0))
-            circling = len(history) > FULL_STEPS and left > SLOWEST * was.decrement
+            circling = len(history) > FULL_STEPS and left > SLOWEST * was.system.decrement
             share = max(MIN_SHARE, 0.5 * share) if circling else share
-            left /= 1.0 - min(left / was.decrement, SLOWEST)
+            left /= 1.0 - min(left / was.system.decrement, SLOWEST)
         tries = 0 if near else tries + 1
         if final and left <= max(options.decrement, here.rounding):
             converged, goal = True, max(options.decrement, here.rounding)
             message = f"converged: less than {goal:.0e} sigma from the optimum"
         elif not near and was.at_rounding:
             converged = True
-            message = f"converged to rounding: no step lowers the cost, {here.decrement:.1e} sigma left"
+            message = f"converged to rounding: no step lowers the cost, {here.system.decrement:.1e} sigma left"
         elif tries == PATIENCE:
-            message = f"not converged: no step lowers the cost although {here.decrement:.1e} sigma are left to go"
+            message = (
+                f"not converged: no step lowers the cost although {here.system.decrement:.1e} sigma are left to go"
+            )
     if not message:
-        converged = here.decrement <= NEAR_ENOUGH
-        spent = f"{options.max_iterations} iterations, {here.decrement:.1e} sigma left to go"
+        converged = here.system.decrement <= NEAR_ENOUGH
+        spent = f"{options.max_iterations} iterations, {here.system.decrement:.1e} sigma left to go"
         message = f"{'converged' if converged else 'not converged'}: {spent}"
     if converged and here.rounding > NEAR_ENOUGH:
         hidden = f"rounding hides the optimum, by {here.rounding:.0e} sigma"
@@ -422,7 +419,7 @@ def _fit(problem: Problem, options: SolverOptions) -> Solution:
 def _iteration(before: _Point, after: _Point, damping: float) -> Iteration:
     variables = before.problem.variables
     taken = variables.step(before.parameters, after.parameters) / variables.all_scales
-    return Iteration(after.system.cost, damping, float(np.linalg.norm(taken)), before.decrement)
+    return Iteration(after.system.cost, damping, float(np.linalg.norm(taken)), before.system.decrement)
 
 
 def take_steps(problem: Problem, most: int) -> Floats:
@@ -434,7 +431,7 @@ def take_steps(problem: Problem, most: int) -> Floats:
     """
     here, damping = _Point(problem, problem.start), FIRST_DAMPING
     for _ in range(most):
-        found = here.descend(damping) if here.decrement**2 > 2e-3 * here.system.cost else None
+        found = here.descend(damping) if here.system.decrement**2 > 2e-3 * here.system.cost else None
         if found is None:
             break
         here, _, damping = found
@@ -443,12 +440,11 @@ def take_steps(problem: Problem, most: int) -> Floats:
 
 def _learn(problem: Problem, parameters: Floats, weighting: Weighting) -> tuple[NoiseState, bool]:
     """Estimate the noise from the residuals, and whether the loss has its final form."""
-    state, final = problem.state, True
-    if problem.options.loss != "none":
-        found = mahalanobis_distances(problem, parameters)
-        test = np.concatenate([s.test for s in problem.data.blocks])
-        e, residual_dim = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
-        weights, final = weighting.update(e, residual_dim)
-        ends = np.cumsum([s.n for s in problem.data.blocks])[:-1]
-        state = replace(state, weights=tuple(np.split(weights, ends)))
-    return state, final
+    if problem.options.loss == "none":
+        return problem.state, True
+    blocks, found = problem.data.blocks, mahalanobis_distances(problem, parameters)
+    test = np.concatenate([s.test for s in blocks])
+    e, residual_dim = (np.where(test, 0, np.concatenate(each)) for each in zip(*found, strict=True))
+    weights, final = weighting.update(e, residual_dim)
+    each = tuple(np.split(weights, np.cumsum([s.n for s in blocks])[:-1]))
+    return replace(problem.state, weights=each), final

@@ -433,18 +433,15 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         only: The variable whose priors are wanted; all if None.
     """
     items = variables.items if only is None else (only,)
-    n = sum(len(variables.prior_weights[v.key][0]) for v in items)
-    nominal, r, J, first = variables.nominal(), np.zeros(n), np.zeros((n, variables.n_columns)), 0
+    nominal, r, J = variables.nominal(), [np.zeros(0)], [np.zeros((0, variables.n_columns))]
     for v in items:
         with_prior, weight = variables.prior_weights[v.key]
-        if not with_prior:
-            continue
-        of_v, rows, columns = v.places, slice(first, first + len(with_prior)), v.columns
-        first = rows.stop
-        x, of = parameters[of_v], nominal[of_v]
+        x, of = parameters[v.places], nominal[v.places]
         off, D = _off_nominal(x, of) if v.is_pose else (x - of, np.eye(len(x)))
-        r[rows], J[rows, columns] = weight * off[with_prior], weight[:, None] * D[with_prior]
-    return r, J
+        r.append(weight * off[with_prior])
+        J.append(np.zeros((len(with_prior), variables.n_columns)))
+        J[-1][:, v.columns] = weight[:, None] * D[with_prior]
+    return np.concatenate(r), np.vstack(J)
 
 
 def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:

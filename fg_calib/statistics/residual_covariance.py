@@ -15,7 +15,7 @@ import scipy.sparse
 from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
-from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, estimate_sensitivity, reach
+from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, all_errors, loss_variance, reach
 from fg_calib.inputs import Booleans, Floats, Integers
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
@@ -34,7 +34,7 @@ class ResidualCovariance:
         d: Diagonal of D, the variance of private noise, shape (n,).
         L: How rows follow from other noise, sparse, shape (n, n_errors): from errors of 1 sigma.
         P: Derivatives in core and landmarks. Where fitted and predicted rows share errors, then also `L F^T`, F the
-            estimate's sensitivity to those errors (see `graph.estimate_sensitivity`). Shape (n, k).
+            estimate's sensitivity to those errors e, which move it by -K F e. Shape (n, k).
         M: Symmetric, shape (k, k).
     """
 
@@ -132,7 +132,10 @@ class RowModel:
         self._follow = np.vstack([np.eye(v.n_columns), left.follow])
         self._alone = np.vstack([np.zeros((v.n_columns, left.rank)), left.inverse])
         self._common = np.flatnonzero((reach(noises) > 0) & (reach(noises, test=True) > 0))
-        self._sensitivity = estimate_sensitivity(problem, parameters, self._common)
+        if len(self._common):  # how the estimate follows from errors e: dx = -K M e, K its covariance
+            L = all_errors(problem.noises, problem.rows)[:, self._common]
+            J = problem.rows.private(self._at)[:, :-1]
+            self._sensitivity = (L.T @ problem.rows.states.weigh(J)).T / loss_variance(problem)
         known = np.repeat(np.array([item.known for item in unknowns.items], dtype=np.bool_), unknowns.sizes)
         self._nowhere: Booleans = (self._at.columns < 0) & ~known
         alone = [np.flatnonzero(self._nowhere[n.block.nuisances].any(axis=1) & n.block.kind.is_contact) for n in noises]
