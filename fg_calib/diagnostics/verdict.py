@@ -51,6 +51,9 @@ MAX_OUTLIER_SHARE = 0.5
 MOST_ESTIMATED = 2.0
 """Estimated over specified noise above which an unmodelled effect is more likely."""
 
+MAX_NOISE_FACTOR = 5.0
+"""Estimated over specified noise above which one asks why."""
+
 MAX_PRIOR_SCALE = 10.0
 """Estimated over specified prior sigma above which one asks why."""
 
@@ -183,8 +186,8 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     case = Case(solution, spread, fit, identifiability, regression, change, systematic)
     found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}
     doubts = any(s.severity == "error" for each in found.values() for s in each)
+    much = any(kind.factor > MOST_ESTIMATED for kind in fit.goodness.kinds)
     if not problem.evaluated:
-        much = any(kind.factor > MOST_ESTIMATED for kind in fit.goodness.kinds)
         case = replace(case, setup=check_problem(problem, solution.before, doubtful=doubts or much))
     fits = not (doubts or solution.estimated_noise is not None)
     found[check_fit] = list(check_fit(case))  # which names an effect only if the set-up is right
@@ -192,7 +195,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     offsets = list(check_offsets(case))
     explained = bool(offsets) or any(s.severity == "error" for s in lacking)  # why residuals are systematic
     statements = [*check_setup(case, fits=fits), *check_optima(case)]
-    statements += () if explained else check_systematic(case, doubts=doubts)
+    statements += () if explained else check_systematic(case, doubts=doubts or much)
     statements += [s for each in found.values() for s in each]
     statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
     statements += [*check_excitation(identifiability), *offsets, *lacking]
@@ -398,10 +401,14 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:
-    """Check whether estimated noise is small compared with how the tool would move if each joint moved by itself."""
-    estimated = case.solution.estimated_noise
+    """Check whether few rows make estimated noise large, and whether it is small compared with motions of joints."""
+    estimated, gross = case.solution.estimated_noise, case.fit.goodness.gross
     if not estimated:
         return
+    if gross is not None:
+        text = f"outliers: {gross.n} ({listed(gross.names)}) make the estimated noise {gross.ratio**-0.5:.3g} times as"
+        text += " large: look at them, or let a robust loss do so (loss: gnc)"
+        yield Statement("error" if case.effect else "warning", text)
     readings = case.problem.data.readings[:MOST_READINGS]
     at = pose(case.problem.robot, readings).jacobian[:, :, -readings.shape[1] :] * readings.std(axis=0)
     turn, shift = (float(np.sqrt(np.mean(np.sum(part**2, axis=2)))) for part in (at[:, :3], at[:, 3:]))
@@ -410,6 +417,9 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
         text = f"the noise estimated of {fit.kind} is {ratio:.2g} times as large as what the joints move"
         text += ": the arm explains next to nothing; check the table and the job"
         yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)
+        text = f"the noise estimated of {fit.kind} is {fit.factor:.3g} times that specified (1 mm, 1 mrad where nothing"
+        text += " was): is that known, or are effects not modelled?"
+        yield Statement("warning", text, gross is None and fit.factor > MAX_NOISE_FACTOR)
 
 
 CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (

@@ -178,7 +178,7 @@ class GrossErrors:
     Attributes:
         n: How many there are.
         names: Of their configurations and groups, or of the pairs' two, the worst first.
-        ratio: Reduced chi-square without them.
+        ratio: Reduced chi-square without them; of estimated noise its variance without them over that with them.
     """
 
     n: int

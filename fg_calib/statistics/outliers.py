@@ -4,7 +4,8 @@ One gross error in a table with many unknowns makes most residuals too large, fo
 far from the others of their kind are left out, and everything is fitted and judged anew, those left out by how they are
 predicted, until the same ones are far. Far is a studentised residual, over the typical size of its kind, beyond what
 any of a clean table has (Sidak). A fit that outliers led far from the truth is not linear there, so the search begins
-again at the nominal arm where the fit without them is not as expected.
+again at the nominal arm where the fit without them is not as expected. Noise that is estimated is estimated anew
+without them: they are gross errors if its variance falls below half.
 
 References:
     Hadi, Simonoff (1993), Procedures for the identification of multiple outliers in linear models. JASA 88(424).
@@ -20,8 +21,9 @@ import numpy as np
 from fg_calib.graph import Problem, Solution, solve, with_factors
 from fg_calib.inputs import Booleans, SolverError
 from fg_calib.statistics.covariance import Spread, spread_of
-from fg_calib.statistics.goodness_of_fit import Goodness, GrossErrors, chi_square, judge_fit
+from fg_calib.statistics.goodness_of_fit import FACTOR, Goodness, GrossErrors, chi_square, judge_fit
 from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table, suspect_level
+from fg_calib.statistics.variance_components import estimate_noise
 
 MAX_ROWS = 20_000
 """Rows up to which outliers are looked for: among more, a few do little harm."""
@@ -43,8 +45,8 @@ def judge_without_outliers(solution: Solution, table: ResidualTable, fit: Goodne
         table: Its residuals.
         fit: Its goodness of fit.
     """
-    robust = solution.problem.state.weights is not None or solution.estimated_noise is not None
-    if robust or _is_fine(fit) or solution.problem.evaluated or solution.problem.has_more:
+    problem, fine = solution.problem, _is_fine(fit) and solution.estimated_noise is None
+    if problem.state.weights is not None or fine or problem.evaluated or problem.has_more:
         return fit
     if np.sum(table.used) > MAX_ROWS:
         return replace(fit, searched=False)
@@ -61,12 +63,17 @@ def _is_fine(fit: Goodness) -> bool:
     return all(kind.verdict in FINE for kind in fit.kinds)
 
 
-def _far(table: ResidualTable, fit: Goodness) -> Booleans:
+def _far(table: ResidualTable, fit: Goodness, least: float) -> Booleans:
     """Fitted rows of measurements that are far from the others of their kind, shape (n,).
 
     Where most of a configuration's measurements are, all of them are: its reading or its pose is wrong.
+
+    Args:
+        table: The residuals.
+        fit: Their goodness of fit.
+        least: Typical size of a kind's studentised residuals that is at least assumed.
     """
-    typical = {(kind.table, kind.kind): max(kind.typical, 1.0) for kind in fit.kinds}
+    typical = {(kind.table, kind.kind): max(kind.typical, least) for kind in fit.kinds}
     scale = np.array([typical.get(group, np.nan) for group in table.groups] or [np.nan])[table.group]
     with np.errstate(invalid="ignore"):
         far = table.used & (np.abs(fit.studentised) > scale * suspect_level(int(np.sum(table.used)), CHANCE))
@@ -87,15 +94,16 @@ def _fit_without_outliers(
         fit: The goodness of fit to begin with.
     """
     out, found = np.zeros(table.n, dtype=np.bool_), None
+    least, solve_with = (1.0, solve) if solution.estimated_noise is None else (0.0, estimate_noise)
     for _ in range(MAX_ROUNDS):
-        far = _far(table, fit)
+        far = _far(table, fit, least)
         if np.array_equal(far, out) or np.sum(far) > MAX_OUTLIER_SHARE * np.sum(table.used):
             break
         out = far
         if not out.any():
             return None
         try:
-            again = solve(_without(solution, table, out))
+            again = solve_with(_without(solution, table, out))
         except SolverError:
             break
         now = (again, spread_of(again), residual_table(again))
@@ -125,7 +133,13 @@ def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, r
     rows, names = rows[np.argsort(-size[rows], kind="stable")], ("", *table.names)
     ends = dict.fromkeys((names[table.a[i] + 1], names[table.b[i] + 1]) for i in rows)
     n, chi2 = len(np.unique(table.measurement_number[rows])), chi_square(now[0], now[1])
-    return replace(fit, kinds=kinds, gross=GrossErrors(n, _names(list(ends)), chi2.value / max(chi2.dof, 1)))
+    ratio = chi2.value / max(chi2.dof, 1)
+    if now[0].estimated_noise is not None:
+        factors = {(kind.table, kind.kind): kind.factor for kind in rest.kinds}
+        ratio = min((factors.get((kind.table, kind.kind), np.inf) / kind.factor) ** 2 for kind in fit.kinds)
+        if ratio > 1.0 / FACTOR:
+            return fit
+    return replace(fit, kinds=kinds, gross=GrossErrors(n, _names(list(ends)), ratio))
 
 
 def _names(ends: list[tuple[str, str]]) -> tuple[str, ...]:

@@ -71,6 +71,14 @@ def test_what_residuals_follow_is_said_first_and_a_loss_that_takes_it_for_outlie
     assert any(text.startswith("least squares predicts the test rows better") for text in errors) == (loss == "gnc")
 
 
+@pytest.mark.parametrize(("size", "error"), [(10.0, True), (2.0, False)])
+def test_an_effect_that_noise_estimated_far_above_the_specified_would_hide_is_an_error(size, error):
+    robot, m = measured("6R", np.random.default_rng(1), effect=of_joint(1, lambda *at: size * gravity(*at)), n=60)
+    found = calibrate(robot, m, model="position", frame="unknown", estimate_noise=True).assessment.verdict
+    assert [bool(found.errors), bool(found.warnings)] == [error, not error]
+    assert (found.errors or found.warnings)[0].startswith("systematic residuals: q2 yields to gravity (p = ")
+
+
 def test_an_effect_is_seen_among_outliers_that_a_loss_rejects():
     sag = of_joint(1, lambda *at: 10.0 * gravity(*at))
     robot, m = measured("6R", np.random.default_rng(1), effect=sag)

@@ -132,3 +132,21 @@ def test_noise_estimated_as_large_as_the_motions_is_no_noise():
     m = replace(m, rotation=np.tile(np.eye(3), (40, 1, 1)))
     found = assess(estimate_noise(build_problem(robot, m, model="pose")))
     assert any(text.startswith("the noise estimated of orientation is") for text in found.verdict.errors)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ([], None),
+        ([3, 4, 5], r"outliers: 3 \([345], [345], [345]\) make the estimated noise \S+ times as large: look at them"),
+        (range(20), "the noise estimated of position is .* times that specified"),
+    ],
+)
+def test_estimated_noise_far_above_the_specified_is_a_warning_that_names_gross_rows(wrong, words):
+    rng = np.random.default_rng(0)
+    robot = small_arm(tolerance=TOLERANCE)
+    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4))
+    m = replace(m, position=plus(m.position, list(wrong), rng.choice([-5e-3, 5e-3], (len(wrong), 3))))
+    found = assess(estimate_noise(build_problem(robot, m, model="pose")))
+    assert found.trustworthy
+    assert [bool(re.match(words or "", text)) for text in found.verdict.warnings] == [True] * bool(words)
