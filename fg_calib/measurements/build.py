@@ -365,17 +365,10 @@ def predict_measurements(robot: Robot, m: Measurements, model: str) -> Measureme
         names = tuple(f"{column} {i + 1}" for i in range(instrument.n_landmarks))
         found = m.labels.get(column)
         labels[column] = Labels(names, np.arange(n) % len(names)) if found is None else found.of(train)
-    exact = replace(
-        m.select(train),
-        covariance=None,
-        position=poses.position,
-        rotation=poses.rotation,
-        sigma_position=specified("position", 3),
-        sigma_orientation=specified("orientation", 3),
-        source="predictions",
-        labels=labels,
-        sigmas={name: specified(name) for name in instrument.generic_columns},
-    )
+    sigmas = {name: specified(name) for name in instrument.generic_columns}
+    exact = replace(m.select(train), position=poses.position, rotation=poses.rotation, labels=labels, sigmas=sigmas)
+    exact = replace(exact, sigma_position=specified("position", 3), sigma_orientation=specified("orientation", 3))
+    exact = replace(exact, covariance=None, source="predictions")
     if not n:
         return exact
     middle = poses.position.mean(axis=0)

@@ -221,9 +221,7 @@ class Measurements(FrozenArrays):
         rows_of: dict[str, Any] = {
             name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "sigma_joint"
         }
-        named: dict[str, Any] = {
-            name: {key: v[rows] for key, v in getattr(self, name).items()} for name in ("columns", "sigmas")
-        }
+        named: dict[str, Any] = {of: {k: v[rows] for k, v in getattr(self, of).items()} for of in ("columns", "sigmas")}
         labels = {name: of.of(rows) for name, of in self.labels.items()}
         return replace(self, **rows_of, **named, labels=labels, pairs=None, groups=None)
 
@@ -357,15 +355,12 @@ def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) ->
     if wanted > MOST_PAIRS:
         hint = "a random part will do, such as {random: 100000}"
         raise InputError("pairing", f"{pairing} forms {wanted} pairs", f"at most {MOST_PAIRS}", hint)
-    match pairing.strategy:
-        case "star":
-            first, second = np.zeros(n - 1, dtype=np.int64), np.arange(1, n)
-        case "chain":
-            first, second = np.arange(n - 1), np.arange(1, n)
-        case "all":
-            first, second = np.triu_indices(n, 1)
-        case "random":
-            first, second = _draw_pairs(n, pairing.count, generator)
+    second = np.arange(1, n)
+    first = second - 1 if pairing.strategy == "chain" else np.zeros_like(second)
+    if pairing.strategy == "all":
+        first, second = np.triu_indices(n, 1)
+    elif pairing.strategy == "random":
+        first, second = _draw_pairs(n, pairing.count, generator)
     return np.stack([rows[first], rows[second]], axis=1)
 
 
@@ -392,5 +387,4 @@ def _sigma_along(sigma: Floats, a: Integers, b: Integers, direction: Floats) -> 
     """Sigma of a difference along `direction` (any direction where it has none), shape (n,)."""
     length = np.linalg.norm(direction, axis=1, keepdims=True)
     unit = np.where(length > 0.0, direction / np.where(length > 0.0, length, 1.0), np.sqrt(1.0 / 3.0))
-    variance: Floats = np.sum(unit**2 * (sigma[a] ** 2 + sigma[b] ** 2), axis=1)
-    return np.sqrt(variance)
+    return np.sqrt(np.sum(unit**2 * (sigma[a] ** 2 + sigma[b] ** 2), axis=1))

@@ -24,8 +24,8 @@ class LandmarkKind:
     Attributes:
         letter: Letter of its GTSAM symbols, and of its name in `result.json`.
         name: Name of one: `target`, `anchor`.
-        description: Name of all where they explain a null-space direction.
         heading: Of its table in reports, with frame and unit; empty where reports do not show it.
+        description: Name of all where they explain a null-space direction; "the unknown targets" if empty.
         units: `m` or `rad` of each coordinate.
         key: Key of a job that may say where they are; empty where none does.
         column: Of a table, whose names they have; that called like the kind if empty.
@@ -42,8 +42,8 @@ class LandmarkKind:
 
     letter: str
     name: str
-    description: str
     heading: str
+    description: str = ""
     units: tuple[str, ...] = ("m", "m", "m")
     key: str = ""
     column: str = ""

@@ -32,7 +32,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import special
@@ -51,8 +51,7 @@ LEAST_VARIANCE = 0.1
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-@dataclass(frozen=True)
-class Moments:
+class Moments(NamedTuple):
     """Mean and variance of what is measured, as functions of what is true.
 
     Attributes:
@@ -75,8 +74,7 @@ def length_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Mom
         across: Variance in each direction across.
         own: Variance of the length's own error.
     """
-    vector = _vector_length(f, along, across)
-    return _folded(f, vector, own)
+    return _folded(f, _vector_length(f, along, across), own)
 
 
 def angle_moments(f: Floats, along: Floats, across: Floats, own: Floats) -> Moments:
@@ -114,8 +112,7 @@ def _vector_length(f: Floats, along: Floats, across: Floats) -> Moments:
     folds = (across == 0.0) & (along > 0.0)
     for rows, of in ((near, _near_length), (folds, lambda f, along, _: _fold(f, along))):
         if rows.any():
-            moments = of(f[rows], along[rows], across[rows])
-            excess[rows], slope[rows], variance[rows] = moments.excess, moments.slope, moments.variance
+            excess[rows], slope[rows], variance[rows] = of(f[rows], along[rows], across[rows])
     return Moments(excess, slope, variance)
 
 
@@ -137,8 +134,7 @@ def _near_length(f: Floats, along: Floats, across: Floats) -> Moments:
 
 def _folded(f: Floats, inner: Moments, own: Floats) -> Moments:
     """Moments of |n + e|, n a length with moments `inner` at f, e its private error."""
-    mean = f + inner.excess
-    fold = _fold(mean, own)
+    fold = _fold(f + inner.excess, own)
     variance = fold.variance + inner.variance * fold.slope**2
     return Moments(inner.excess + fold.excess, inner.slope * fold.slope, variance)
 

@@ -105,7 +105,7 @@ class MeasurementBlock(Brief):
 
 
 UNKNOWN = LandmarkKind(
-    "N", "unknown", "unknowns of kinds of your own", "Other unknowns, [m] and [rad]", must_be_fitted=False
+    "N", "unknown", "Other unknowns, [m] and [rad]", "unknowns of kinds of your own", must_be_fitted=False
 )
 
 
@@ -239,9 +239,8 @@ class Table(Brief):
         inputs.check_fields(self, "table: ")
         object.__setattr__(self, "own", tuple(self.own))
         if self.model is None and self.frame == "unknown":
-            raise InputError(
-                "table: frame", "unknown, without a model", "a kind with unknowns of its own for the frame"
-            )
+            expected = "a kind with unknowns of its own for the frame"
+            raise InputError("table: frame", "unknown, without a model", expected)
 
     @property
     def is_plain(self) -> bool:

@@ -138,7 +138,8 @@ def find_confounding(problem: Problem, parameters: Floats, directions: Floats) -
 
 def confounding_in_words(letters: Sequence[str]) -> str:
     """Name the confounding of a direction, and which additional knowledge would show it."""
-    names = [OTHERS.get(letter) or LANDMARKS[letter].description for letter in letters]
+    described = {letter: of.description or f"the unknown {of.name}s" for letter, of in LANDMARKS.items()} | OTHERS
+    names = [described[letter] for letter in letters]
     kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
     remedy = f": to see it, give places of {kind.name}s (key {kind.key})" if kind is not None and kind.key else ""
     together = " together" if len(letters) > 1 else ""

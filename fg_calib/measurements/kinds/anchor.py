@@ -12,20 +12,13 @@ from fg_calib.measurements import Coincidence, Landmark, LandmarkKind, Landmarks
 from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Column, Instrument, Kinds
 
 ANCHOR = LandmarkKind(
-    "A",
-    "anchor",
-    "the unknown anchors",
-    "Anchors (in the base frame), mm",
-    key="anchors",
-    away=2.0,
-    n_configurations=4,
-    stays=True,
+    "A", "anchor", "Anchors (in the base frame), mm", key="anchors", away=2.0, n_configurations=4, stays=True
 )
 OFFSET = LandmarkKind(
     "O",
     "offset",
-    "what the instrument adds to every length",
     "Offsets of instruments on lengths, mm",
+    "what the instrument adds to every length",
     units=("m",),
     is_one=True,
 )

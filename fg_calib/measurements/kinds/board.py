@@ -17,7 +17,6 @@ from fg_calib.robot import cross_matrix, inverse_right_jacobian, left_jacobian
 BOARD: LandmarkKind = LandmarkKind(
     "B",
     "board",
-    "the unknown boards",
     "Boards (in the base frame: rotation vector in deg, position in mm)",
     units=("rad", "rad", "rad", "m", "m", "m"),
     away=2.0,

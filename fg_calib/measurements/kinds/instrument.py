@@ -206,11 +206,8 @@ class Instrument:
         for kind, chosen in kinds:
             rows = np.flatnonzero(chosen & ~np.isnan(data).any(axis=1))
             if len(rows):
-                fields: dict[str, Any] = {
-                    "nuisances": np.ascontiguousarray(nuisances[rows, : kind.n_nuisances]),
-                    "test": m.test[rows],
-                }
-                fields |= {"source": m.source, **self.more(table, rows)}
+                fields: dict[str, Any] = {"test": m.test[rows], "source": m.source, **self.more(table, rows)}
+                fields["nuisances"] = np.ascontiguousarray(nuisances[rows, : kind.n_nuisances])
                 arrays = data[rows, : kind.width], self.sigma(m, rows)
                 found.append(MeasurementBlock.of_rows(kind, number, rows, *arrays, **fields))
         return found

@@ -15,7 +15,7 @@ from fg_calib.measurements.kinds.pose import ORIENTATION, POSE_COLUMNS, POSITION
 from fg_calib.robot import Poses, kernels, over_spans
 
 POINT = measurements.LandmarkKind(
-    "L", "point", "the unknown contact points", "Contact points (in the base frame), mm", must_be_fitted=False
+    "L", "point", "Contact points (in the base frame), mm", "the unknown contact points", must_be_fitted=False
 )
 
 
@@ -187,13 +187,9 @@ class PairGauge(Instrument):
             if not len(rows):
                 continue
             data, sigma = np.nan_to_num(values[rows, : kind.width]), sigmas[rows, : max(1, kind.width)]
-            fields: dict[str, Any] = {
-                "ends": np.stack([pairs.a[rows], pairs.b[rows]], axis=1),
-                "test": pairs.test[rows],
-                "formed": formed,
-                "excluded": {"same_configuration": same[rows]},
-                "source": pairs.source,
-            } | ({"measured": there[rows]} if kind.width else {})
+            ends, excluded = np.stack([pairs.a[rows], pairs.b[rows]], axis=1), {"same_configuration": same[rows]}
+            fields: dict[str, Any] = {"ends": ends, "test": pairs.test[rows], "formed": formed, "excluded": excluded}
+            fields |= {"source": pairs.source} | ({"measured": there[rows]} if kind.width else {})
             sigma = once(np.zeros_like(data) if formed else sigma)
             found.append(MeasurementBlock.of_rows(kind, number, rows.astype(pairs.a.dtype), data, sigma, **fields))
         return found + (contact_blocks(table, number, landmarks) if self.sees_position else [])
@@ -234,11 +230,8 @@ def contact_blocks(table: Table, number: int, landmarks: Landmarks) -> list[Meas
         if (sigma := m.sigma("point")) is None or not np.isfinite(sigma[rows]).all():
             raise ProblemError(m.source, "no sigma for contact points", "noise.point or a column sigma_point")
         touched = groups.index[rows]
-        fields: dict[str, Any] = {
-            "nuisances": place[touched],
-            "of": measurements.Labels(groups.names, touched),
-            "source": m.source,
-        }
+        of = measurements.Labels(groups.names, touched)
+        fields: dict[str, Any] = {"nuisances": place[touched], "of": of, "source": m.source}
         arrays = rows, np.zeros((len(rows), 0)), sigma[rows, None]
         found.append(MeasurementBlock.of_rows(TouchedPoint(), number, *arrays, test=m.test[rows], **fields))
     if n := pairs.n_pairs:

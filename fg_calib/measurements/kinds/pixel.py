@@ -125,9 +125,8 @@ def _poses_of_images(
         expected = "four points or more that are not on a line"
         raise ProblemError(block.source, "no image of a board to start from", expected)
     rows, boards, choices = zip(*poses, strict=True)
-    rotations, places = (
-        np.array([[getattr(f, of) for f in each] for each in choices]) for of in ("rotation", "translation")
-    )
+    rotations = np.array([[frame.rotation for frame in each] for each in choices])
+    places = np.array([[frame.translation for frame in each] for each in choices])
     return np.array(rows), np.array(boards), (rotations, places)
 
 

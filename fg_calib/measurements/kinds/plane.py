@@ -26,7 +26,6 @@ BEHIND = LandmarkKind("C", "point behind a plane", "", "", column="plane", away=
 PLANE = LandmarkKind(
     "F",
     "plane",
-    "the unknown planes",
     "Planes (unit normal in the base frame, distance from the base in mm)",
     away=-2.0,
     n_configurations=4,

@@ -14,8 +14,8 @@ from fg_calib.robot import cross_matrix, inverse_right_jacobian, kernels
 TARGET = LandmarkKind(
     "P",
     "target",
-    "the unknown places of the targets on the tool",
     "Targets (in the tool frame), mm",
+    "the unknown places of the targets on the tool",
     key="targets",
     n_configurations=2,
     stays=True,
