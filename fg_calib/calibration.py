@@ -9,11 +9,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike
 from fg_calib import inputs, io
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.graph import Knowledge, Solution, Variables, build_variables, frame_of, tables_of
-from fg_calib.inputs import Brief, Floats, InputError, Options, SolverError, checked
+from fg_calib.inputs import Brief, CalibrationError, Floats, InputError, Options, SolverError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
@@ -32,7 +33,7 @@ from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
 from fg_calib.report import Drawing, ReportData, draw, format_result, judged, notebook_html, notes_of, pages_of, summary
 from fg_calib.robot import Robot, names_of
-from fg_calib.statistics import ParameterEstimate, TangentCovariance, cross_validate
+from fg_calib.statistics import CrossValidation, ParameterEstimate, TangentCovariance, cross_validate
 
 if TYPE_CHECKING:
     import polars as pl
@@ -268,7 +269,7 @@ class Calibration:
             robot=nominal,
             values=values,
             knowledge=known,
-            options=replace(result.options, folds=None),
+            options=result.options,
             noise=result.carried.noise,
             noise_degrees=degrees or None,
         )
@@ -339,18 +340,33 @@ class Calibration:
         if growth and days is None:
             raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
         table, digests = self._rows(rows, pairs, like)
-        found = updated(
+        add = partial(
+            updated,
             self.calibrated,
-            table,
             growth={name: size * float(np.sqrt(days or 0.0)) for name, size in (growth or {}).items()},
             changed=names,
             anchors_stay=anchors_stay,
         )
+        found = add(table)
         uncertainty = assess(found)
         if uncertainty.acceptance is not None and not names:
             uncertainty = uncertainty.with_held_out(predicted_before(self.calibrated, table), found)
+        elif self.result.options.folds:
+            with suppress(CalibrationError):  # too few new rows to be without any
+                folds = self._cross_validate(table, add)
+                uncertainty = replace(uncertainty.with_held_out(folds.by_table, found), cross_validation=folds)
         job = self.result.carried.job
         return Calibration.of(found, uncertainty, inputs=digests, job=job, date=new, history=history)
+
+    def _cross_validate(self, rows: Rows, add: Callable[[Rows], Solution]) -> CrossValidation:
+        """New rows held out in folds, each predicted by an update with the others."""
+        like = {t.measurements.source: name for t, name in zip(rows.tables, rows.like, strict=True)}
+        n = min(self.result.options.folds or 0, sum(int(np.sum(~t.measurements.test)) for t in rows.tables))
+
+        def solve(job: Job) -> Solution:
+            return add(Rows(job.tables, tuple(like[t.measurements.source] for t in job.tables)))
+
+        return cross_validate(Job(None, self.robot, rows.tables, self.result.options), solve, n)
 
     def _require_trust(self) -> None:
         if not self.trustworthy:
@@ -363,7 +379,7 @@ class Calibration:
         Raises:
             InputError: The rows are of another robot, or cannot be read.
         """
-        options, robot = replace(self.result.options, folds=None), self.posterior.variables.robot
+        options, robot = self.result.options, self.posterior.variables.robot
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
             path, of_pairs = Path(given), None if pairs is None else Path(pairs)
             job = self.result.carried.job

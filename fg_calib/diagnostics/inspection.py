@@ -305,7 +305,7 @@ def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
     yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before", still)
     yield from check_excitation(found.identifiability)
     text = "no test rows: nothing would check how well the calibration predicts (column split)"
-    yield Statement("note", text, not (found.evaluated or tested))
+    yield Statement("note", text, not held_out)
 
 
 def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:

@@ -227,6 +227,18 @@ def test_a_limit_that_the_arm_before_misses_is_not_evaluated():
     assert "no measurement of any position was held out" in calibration.update(rows, changed="theta3").not_accepted[0]
 
 
+def test_after_a_change_limits_are_judged_by_folds_of_the_new_rows():
+    calibration, true, rng = calibrated(11, accept=ACCEPT, folds=4)
+    rows = measured(slipped(true, theta3=2e-3), 8, rng)
+    found = calibration.update(rows, changed="theta3").result
+    assert found.acceptance.verdict == "pass"
+    assert found.folds.kinds["position"].n == 8
+    assert found.options.folds == 4
+    assert not any("no test rows" in note for note in found.notes)
+    few = calibration.update(rows.select([0]), changed="theta3")
+    assert "no measurement of any position was held out" in few.not_accepted[0]
+
+
 def test_rows_that_are_counted_already_are_refused_in_memory():
     """As they are, in another order, with more rows behind them, or from a table of another length unit."""
     calibration, true, rng = calibrated(13)
