@@ -8,8 +8,6 @@
 Names are imported when they are first used, so that `fg-calib --help` need not wait for GTSAM.
 """
 
-from __future__ import annotations
-
 import logging
 
 import lazy_loader  # type: ignore[import-untyped]

@@ -4,8 +4,6 @@ with local_processes(4) as executor:
 found = calibrate_jobs(["arm1.yaml", "arm2.yaml"], executor)
 """
 
-from __future__ import annotations
-
 import json
 import os
 import time

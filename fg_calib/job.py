@@ -1,7 +1,5 @@
 """A calibration job: a robot, what was measured of it, and every choice."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any

@@ -5,8 +5,6 @@ one. Kernels spread fixed parts over all processors (`kinematics.over_spans`), s
 A worker process that dies costs its own job: the jobs that its pool has lost run once more, each on a fresh process.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

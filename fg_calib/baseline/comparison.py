@@ -19,8 +19,6 @@ References:
     Orbit. International Journal of Aerospace Engineering.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal

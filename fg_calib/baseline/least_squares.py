@@ -22,8 +22,6 @@ References:
     Orbit. International Journal of Aerospace Engineering.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

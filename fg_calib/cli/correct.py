@@ -1,7 +1,5 @@
 """`fg-calib correct`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -4,8 +4,6 @@ Exit codes: 0 good; 1 bad input, or the reader of the output has gone; 2 wrong u
 to be trusted; 130 interrupted.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import sys

@@ -1,7 +1,5 @@
 """`fg-calib history`."""
 
-from __future__ import annotations
-
 from fg_calib.cli.output import Json, ResultFolder, show_result
 
 

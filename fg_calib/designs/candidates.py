@@ -7,8 +7,6 @@ those that the tool must contact, have poses of their own.
 Pairs have two ends. In a star all pairs share the reference pose, the first candidate; the pose is the other end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any

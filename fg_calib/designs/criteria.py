@@ -30,8 +30,6 @@ References:
     Sun, Hollerbach (2008), Observability index selection for robot calibration. ICRA.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Literal
 

@@ -7,8 +7,6 @@ The criterion is worked out for all candidates at once (see `criteria`). The exp
 anew from the rows of its poses alone, by the code that assesses a calibration.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ A solved job becomes a scenario: each table is an instrument in the frame in whi
 where they were estimated. Candidates for more rows are then drawn as those of any scenario.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import replace

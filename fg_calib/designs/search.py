@@ -9,8 +9,6 @@ References:
     Mitchell (1974), An algorithm for the construction of D-optimal experimental designs. Technometrics 16(2).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -28,8 +28,6 @@ is that at which it correlates most with the speed of the measured positions, to
 by more than that at both ends.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter

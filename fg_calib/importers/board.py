@@ -16,8 +16,6 @@ seen. A turn w of the board about its origin and a shift dt, both along the came
 The only module that calls OpenCV, so that nothing else needs it installed.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence

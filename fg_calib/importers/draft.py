@@ -3,8 +3,6 @@
 Lines marked DECIDE hold what only the user knows.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Measurements from arrays in Python: the columns of a table, without a file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

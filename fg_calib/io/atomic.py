@@ -1,7 +1,5 @@
 """Files: read or refused in one line, and written whole or not at all."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import stat

@@ -1,7 +1,5 @@
 """Calibration jobs: which robot, which measurements, which model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """YAML mappings, checked against pydantic schemas, with their units; whatever is wrong with them becomes one line."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping

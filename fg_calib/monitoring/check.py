@@ -9,8 +9,6 @@ Rows of one configuration that are gross errors are named and left out of the ju
 small is no change of the arm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -20,8 +20,6 @@ them, nor needs to.
 What to measure next are the random configurations where the two likeliest changes move the tool most differently.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

@@ -4,8 +4,6 @@ A fingerprint is a hash of one measurement's values, joint readings included, to
 file's format make no difference: integers multiplied and added modulo 2^64, of which the upper bits count.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Collection, Mapping, Sequence

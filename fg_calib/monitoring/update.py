@@ -8,8 +8,6 @@ Where the arm may have changed, tolerances no longer say where it is, but where 
 known before that grows by the change, and are no priors of the new calibration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 A chart is a caption and its SVG. It stands in the page as it is, or in a file of its own (`standalone`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape

@@ -1,7 +1,5 @@
 """Comparisons: estimators on one job, two calibrations, the runs of a calibration, a calibration with new rows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import reduce
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """The report of `fg-calib design`, and the tables and the job that it writes: what to measure, and what to expect."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from functools import partial

@@ -1,7 +1,5 @@
 """Reports before a calibration: what a model can identify, and what a job holds."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Sequence
 from typing import Any

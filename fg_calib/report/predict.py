@@ -1,7 +1,5 @@
 """Expected errors of a calibrated arm, and joint positions that correct them: for the terminal and for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path

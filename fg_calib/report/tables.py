@@ -1,7 +1,5 @@
 """The parts of a terminal report: units, headings, sentences and tables without a frame."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ Poses are drawn and brought within reach by inverse kinematics. A pose that the 
 is in a box, and one that is near another are rejected, and counted by reason.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

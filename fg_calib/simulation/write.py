@@ -1,7 +1,5 @@
 """Simulations, written as calibration jobs that run as they are; tables of instruments, in the units of a file."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -21,8 +21,6 @@ References:
     Shao & Tu (1995), The Jackknife and Bootstrap, section 2.3: the jackknife that deletes groups.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace

@@ -5,8 +5,6 @@ by less: by `sqrt(sigma^2 - s^2)`, s the posterior sigma of the joint value. The
 has a sigma of 1 for a healthy reading, however little the measurements say of its joint.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

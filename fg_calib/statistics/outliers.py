@@ -11,8 +11,6 @@ References:
     Hadi, Simonoff (1993), Procedures for the identification of multiple outliers in linear models. JASA 88(424).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -45,8 +45,6 @@ References:
     Gelman (2006), Prior distributions for variance parameters in hierarchical models. Bayesian Analysis 1(3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 

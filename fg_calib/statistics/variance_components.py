@@ -29,8 +29,6 @@ References:
     Patterson and Thompson (1971), Recovery of inter-block information when block sizes are unequal. Biometrika 58(3).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
