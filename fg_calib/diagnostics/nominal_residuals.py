@@ -79,11 +79,6 @@ class Setup:
         return tuple(self.robot.parameters[i].name for i in self.robot.owned_by(self.robot.n_joints + 1))
 
     @property
-    def fitted_tool(self) -> frozenset[str]:
-        """Names of those of the tool's parameters that are fitted."""
-        return frozenset(p.name for p in self.robot.parameters if p.estimated) & frozenset(self.tool)
-
-    @property
     def has_landmarks(self) -> bool:
         """Whether landmarks have to be located before anything can be said of the table."""
         without = self.instrument.is_pose or self.instrument.uses_pairs
@@ -183,8 +178,7 @@ def residuals_at(
             of, unit = used & (kinds == kind), noise.block.kind.units[kinds.tolist().index(kind)]
             rows = of.any(axis=1)
             if rows.any():
-                size, expected = (
-                    float(np.median(np.sqrt(np.sum(v, axis=1, where=of)[rows]))) for v in (squares, variance)
-                )
+                lengths = [np.sqrt(np.sum(v, axis=1, where=of)[rows]) for v in (squares, variance)]
+                size, expected = (float(np.median(each)) for each in lengths)
                 found.append(TypicalResidual(kind, unit, size, max(expected, 1e-9), int(rows.sum())))
     return tuple(found) if all(np.isfinite([r.size, r.expected]).all() for r in found) else ()

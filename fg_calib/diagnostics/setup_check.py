@@ -377,7 +377,8 @@ def _frame(setup: Setup) -> _Found:
 def _tool(setup: Setup) -> _Found:
     """A tool that is not where the robot's file says."""
     rotations, lengths = setup.instrument.sees_orientation, setup.sees_lengths
-    point, fitted = frozenset(setup.tool[:3]), setup.fitted_tool
+    estimated = frozenset(p.name for p in setup.robot.parameters if p.estimated)
+    point, fitted = frozenset(setup.tool[:3]), estimated.intersection(setup.tool)
     if setup.tool and lengths and not point <= fitted:
         yield "the tool point is another one (estimate: [tool.x, tool.y, tool.z])", setup.with_tool(fitted | point)
     if setup.tool and rotations and setup.instrument.is_pose and not fitted & frozenset(setup.tool[3:]):

@@ -262,9 +262,8 @@ def _regional_variance(problem: Problem, fit: LinearFit) -> float:
     none, at = np.full((1, problem.robot.n_joints), np.nan), list[Floats]()
     for part in problem.rows.parts:
         s, ends = part.block, problem.data.places[part.table][part.block.ends[:, -1:]].ravel()
-        at.append(
-            np.repeat(problem.data.readings[ends] if s.kind.ends else none.repeat(s.n, axis=0), s.residual_dim, 0)
-        )
+        readings = problem.data.readings[ends] if s.kind.ends else none.repeat(s.n, axis=0)
+        at.append(np.repeat(readings, s.residual_dim, 0))
     squares = list[float]()
     for readings in np.concatenate(at).T:
         edges = np.nanquantile(readings, [0.25, 0.5, 0.75])
@@ -379,10 +378,8 @@ def regress(solution: Solution) -> Regression:
     scale = np.clip(np.sqrt(float(left @ left) / dof), 0.1, 1.0) if dof >= LEAST_LEFT else 1.0
     J, r = J / scale, r / scale  # of noise specified too large: else columns take up the pull of the priors
     n = problem.n_independent + len(r_prior) + len(r_unknown)
-    basis, r = (
-        basis_of(np.concatenate([J[:, ~more], J_prior, J_unknown])),
-        np.concatenate([r[:, 0], r_prior, r_unknown]),
-    )
+    basis = basis_of(np.concatenate([J[:, ~more], J_prior, J_unknown]))
+    r = np.concatenate([r[:, 0], r_prior, r_unknown])
     if solution.problem.state.weights is not None:
         most = MOST_TYPICAL * 1.4826 * float(np.median(np.abs(r)))
         r = np.clip(r, -most, most)  # before outliers spread over all rows
@@ -461,5 +458,4 @@ def basis_of(columns: Floats, fitted: Floats | None = None, least: float = 0.0) 
     scale = np.maximum(size, max(_NOTHING * float(np.max(size, initial=0.0)), 1e-300))
     Q, R, order = scipy.linalg.qr(rest / scale, mode="economic", pivoting=True)
     left = np.abs(np.diag(R))
-    basis: Floats = Q[:, (left > _RANK * np.sqrt(len(size))) & (left * scale[order[: len(left)]] > least)]
-    return basis
+    return np.asarray(Q[:, (left > _RANK * np.sqrt(len(size))) & (left * scale[order[: len(left)]] > least)])

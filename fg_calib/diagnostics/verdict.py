@@ -191,8 +191,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
         case = replace(case, setup=check_problem(problem, solution.before, doubtful=doubts or much))
     fits = not (doubts or solution.estimated_noise is not None)
     found[check_fit] = list(check_fit(case))  # which names an effect only if the set-up is right
-    lacking = list(check_missing(case))
-    offsets = list(check_offsets(case))
+    lacking, offsets = list(check_missing(case)), list(check_offsets(case))
     explained = bool(offsets) or any(s.severity == "error" for s in lacking)  # why residuals are systematic
     statements = [*check_setup(case, fits=fits), *check_optima(case)]
     statements += () if explained else check_systematic(case, doubts=doubts or much)
@@ -457,9 +456,8 @@ def check_missing(case: Case) -> Iterator[Statement]:
     asked = case.high and not case.setup.explanations and case.problem.knowledge is None
     for motion in case.identifiability.missing:
         certain = asked and case.regression is not None and effects.explains_misfit(case.regression, motion)
-        few = not any(
-            p.estimated and p.owner in motion.axes and p.kind != "theta" for p in case.problem.robot.parameters
-        )
+        of_axes = [p for p in case.problem.robot.parameters if p.estimated and p.owner in motion.axes]
+        few = all(p.kind == "theta" for p in of_axes)
         text = f"{motion}; estimate more than zeros first" if few else str(motion)
         yield Statement("error" if certain and not few else "note", text)
 
@@ -467,10 +465,8 @@ def check_missing(case: Case) -> Iterator[Statement]:
 def check_excitation(found: Identifiability) -> Iterator[Statement]:
     """Check whether other configurations would determine more; of more than these do their result is mostly priors."""
     n, rank = sum(direction.reason == NOT_EXCITED for direction in found.lost), found.observability.rank
-    text = (
-        f"these rows determine {rank} of {len(found.observability.names)} parameters; directions not excited by these"
-    )
-    text += f" configurations although the model sees more: {n}; move every joint more"
+    text = f"these rows determine {rank} of {len(found.observability.names)} parameters; directions not excited by"
+    text += f" these configurations although the model sees more: {n}; move every joint more"
     yield Statement("warning" if n > rank else "note", text, n)
 
 

@@ -91,10 +91,8 @@ class Nearly:
 
     def __str__(self) -> str:
         first, second = self.axes
-        return (
-            f"axes {first} and {second} are parallel within {np.rad2deg(self.angle):.2g} deg, not exactly: "
-            f"their common normal is {self.away:.3g} m away"
-        )
+        parallel = f"axes {first} and {second} are parallel within {np.rad2deg(self.angle):.2g} deg, not exactly"
+        return f"{parallel}: their common normal is {self.away:.3g} m away"
 
 
 @dataclass(frozen=True)

@@ -150,9 +150,7 @@ def ur_kinematics(robot: Robot, base: UrBase) -> tuple[dict[str, dict[str, float
         raise InputError(robot.name, found, "six joints that turn, as ur_description has")
     arm = in_table(robot, "dh-hayati").robot
     kinematics = {}
-    before = _frame_of(arm, "base")
-    if base == "base_link":
-        before = transform(theta=-np.pi) @ before
+    before = transform(theta=-np.pi if base == "base_link" else 0.0) @ _frame_of(arm, "base")
     for i, name in enumerate(UR_LINKS):
         row = {arm.parameters[k].kind: arm.parameters[k].nominal for k in arm.owned_by(i + 1)}
         origin = frame_values(name, before @ transform(theta=row["theta"], d=row["d"]))

@@ -14,7 +14,7 @@ from fg_calib.graph.problem import Problem, named_rows, problem_at, start_of, ta
 from fg_calib.graph.variables import Variables
 from fg_calib.inputs import Floats, Options, ProblemError, check_names, checked
 from fg_calib.job import Job
-from fg_calib.measurements import Frames, Measurements, Table, build, check_rows, is_ours, missing_values
+from fg_calib.measurements import Frames, Table, Tables, build, check_rows, is_ours, missing_values
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Robot, forward, names_of
 
@@ -29,12 +29,7 @@ FIRST_TOLERANCE = 1e-3
 
 @checked
 @single_threaded
-def build_problem(
-    robot: Robot,
-    measurements: Measurements | Table | Sequence[Measurements | Table],
-    options: Options | None = None,
-    **choices: Any,
-) -> Problem:
+def build_problem(robot: Robot, measurements: Tables, options: Options | None = None, **choices: Any) -> Problem:
     """The calibration problem of a robot and its measurements.
 
     Measurements that are all test rows make a problem of evaluation (see `Problem.evaluated`): their rows are those of

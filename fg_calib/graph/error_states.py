@@ -354,8 +354,7 @@ def correlation_of(noises: Sequence[RowNoise], rows: WhitenedRows, J: Floats) ->
     private = [block_diagonal(W @ noise.loading[noise.block.train]) for noise, W in each]
     own = scipy.sparse.block_diag(private).T @ J
     common = all_errors(noises, rows).T @ J
-    out: Floats = common.T @ common - own.T @ own
-    return out
+    return np.asarray(common.T @ common - own.T @ own)
 
 
 def all_errors(noises: Sequence[RowNoise], rows: WhitenedRows) -> Sparse:

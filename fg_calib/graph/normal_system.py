@@ -232,8 +232,7 @@ class NormalSystem:
     @cached_property
     def z_variance(self) -> Floats:
         """Posterior variance of the error states, shape (m,); their prior variance is 1."""
-        out: Floats = self.states.variances + np.sum((self._follow @ self.full_root) ** 2, axis=1)
-        return out
+        return np.asarray(self.states.variances + np.sum((self._follow @ self.full_root) ** 2, axis=1))
 
     @cached_property
     def states(self) -> SchurComplement:
@@ -260,8 +259,7 @@ class NormalSystem:
     @cached_property
     def _weighed_root(self) -> Floats:
         """C^-1 A R, shape (n, rank)."""
-        out: Floats = (self.A - self.states.loadings @ self._follow) @ self.full_root
-        return out
+        return np.asarray((self.A - self.states.loadings @ self._follow) @ self.full_root)
 
     def trace(self, E: Sparse) -> float:
         """Trace of E^T P E, E sparse, shape (n, k); of large systems an estimate (see `error_states.N_PROBES`)."""

@@ -23,7 +23,7 @@ from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
 from fg_calib.inputs import Floats, FrozenArrays, Integers, Options, ProblemError, SolverError
-from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, by_station, start_frames
+from fg_calib.measurements import Dataset, MeasurementBlock, Measurements, Table, Tables, by_station, start_frames
 from fg_calib.robot import Chain, Parameter, Robot, forward
 
 N_REMEMBERED = 4
@@ -534,9 +534,7 @@ def variables_of(robot: Robot, data: Dataset, options: Options) -> Variables:
     return build_variables(robot, frames, options.has_priors).with_unknowns(data.landmarks, data.estimated())
 
 
-def tables_of(
-    measurements: Measurements | Table | Sequence[Measurements | Table], options: Options
-) -> tuple[Table, ...]:
+def tables_of(measurements: Tables, options: Options) -> tuple[Table, ...]:
     """Tables, those without choices of their own with those of the options.
 
     Raises:

@@ -73,9 +73,7 @@ def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None
 def _spread(points: Floats) -> bool:
     """Whether there are four points or more that are not on one line."""
     about = points - points.mean(axis=0) if len(points) else points
-    return len(points) >= LEAST_CORNERS and bool(
-        np.linalg.svd(about, compute_uv=False)[1] > 1e-3 * np.abs(about).max(initial=0.0)
-    )
+    return len(points) >= LEAST_CORNERS and bool(np.linalg.matrix_rank(about, 1e-3 * np.abs(about).max()) == 2)
 
 
 def undistorted(camera: Camera, pixels: Floats) -> tuple[Floats, Booleans]:
@@ -198,9 +196,8 @@ def _refined(camera: Camera, image: Floats, weight: Floats, start: Frame) -> Fra
 
     def derivatives(x: Floats) -> Floats:
         J = camera.image(turned(x) + x[3:])[1] * weight[:, :, None]
-        return np.concatenate([np.cross(turned(x)[:, None], J) @ left_jacobian(x[None, :3])[0], J], axis=2).reshape(
-            -1, 6
-        )
+        turns = np.cross(turned(x)[:, None], J) @ left_jacobian(x[None, :3])[0]
+        return np.concatenate([turns, J], axis=2).reshape(-1, 6)
 
     x = leastsq(misses, np.append(np.zeros(3), start.translation), Dfun=derivatives, full_output=True)[0]
     if np.min(turned(x)[:, 2] + x[5]) <= 0.0:

@@ -46,6 +46,13 @@ class Frame:
     translation: Floats
 
 
+Poses = tuple[Floats, Floats]
+"""Rotations, shape (n, 3, 3), and translations, shape (n, 3), [m]."""
+
+Frames = tuple[Frame, Frame]
+"""World_T_base and flange_T_tool."""
+
+
 @dataclass(frozen=True)
 class Unknown:
     """Parts of the two frames to be found.
@@ -67,11 +74,8 @@ class Unknown:
 
 
 def start_from_poses(
-    flange: tuple[Floats, Floats],
-    measured: tuple[Floats | None, Floats | None],
-    nominal: tuple[Frame, Frame],
-    unknown: Unknown,
-) -> tuple[Frame, Frame]:
+    flange: Poses, measured: tuple[Floats | None, Floats | None], nominal: Frames, unknown: Unknown
+) -> Frames:
     """World_T_base and flange_T_tool from measured poses, positions or orientations.
 
     Args:
@@ -91,12 +95,10 @@ def start_from_poses(
             candidates += [(R, _tool_rotation(R_F, R_M, R)) for R in aligned]
     elif unknown.frame and p_M is not None:
         candidates = [(R, T.rotation) for R in _frame_rotations(R_F, p_F, p_M, T.translation, unknown)]
-    return _with_translations(R_F, p_F, p_M, candidates, X, T, unknown)
+    return _with_translations((R_F, p_F), p_M, candidates, nominal, unknown)
 
 
-def start_from_most_poses(
-    flange: tuple[Floats, Floats], choices: tuple[Floats, Floats], nominal: tuple[Frame, Frame], unknown: Unknown
-) -> tuple[Frame, Frame]:
+def start_from_most_poses(flange: Poses, choices: Poses, nominal: Frames, unknown: Unknown) -> Frames:
     """`start_from_poses` of poses that may each be one of several, or wrong.
 
     In turns each is taken as what frame and tool say that it is, and those that are far beyond what most are off by
@@ -126,9 +128,7 @@ def start_from_most_poses(
     return X, T
 
 
-def start_from_distances(
-    flange: tuple[Floats, Floats], ends: Integers, distance: Floats, tool: Frame, free: Booleans
-) -> Frame:
+def start_from_distances(flange: Poses, ends: Integers, distance: Floats, tool: Frame, free: Booleans) -> Frame:
     """The tool point from distances alone.
 
     `|dp + dR t|^2 = d^2` is linear in t and the six products of its coordinates; a few Gauss-Newton steps on the
@@ -154,7 +154,7 @@ def start_from_distances(
     return Frame(tool.rotation, min(fits, key=lambda fit: fit[1])[0])
 
 
-def start_from_touches(flange: tuple[Floats, Floats], touched: Integers, nominal: Floats, free: Booleans) -> Floats:
+def start_from_touches(flange: Poses, touched: Integers, nominal: Floats, free: Booleans) -> Floats:
     """The tool point that brings touches of each point nearest together, from the nominal one, shape (3,), [m].
 
     Args:
@@ -183,8 +183,7 @@ def _seen(A: Floats, b: Floats) -> Floats:
     """
     U, s, Vt = np.linalg.svd(A, full_matrices=False)
     kept = s > max(1e-10 * s.max(initial=0.0), LEAST_TURN * np.sqrt(max(len(A), 1)))
-    out: Floats = Vt[kept].T @ ((U[:, kept].T @ b) / s[kept])
-    return out
+    return np.asarray(Vt[kept].T @ ((U[:, kept].T @ b) / s[kept]))
 
 
 def _tool_point_by_distances(
@@ -258,8 +257,7 @@ def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Float
 def _common_axis(R_F: Floats) -> Floats:
     """The axis that takes the first rotation to the others, in the base frame, shape (3,); any if there is none."""
     _, axes = rotation_angle(R_F @ R_F[0].T)
-    axis: Floats = np.linalg.svd(axes, full_matrices=False)[2][0]
-    return axis
+    return np.asarray(np.linalg.svd(axes, full_matrices=False)[2][0])
 
 
 def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: Unknown) -> list[Floats]:
@@ -284,20 +282,15 @@ def align_points(measured: Floats, predicted: Floats) -> Floats:
 
 
 def _with_translations(
-    R_F: Floats,
-    p_F: Floats,
-    p_M: Floats | None,
-    candidates: Sequence[tuple[Floats, Floats]],
-    X: Frame,
-    T: Frame,
-    unknown: Unknown,
-) -> tuple[Frame, Frame]:
+    flange: Poses, p_M: Floats | None, candidates: Sequence[tuple[Floats, Floats]], nominal: Frames, unknown: Unknown
+) -> Frames:
     """The candidates' rotations that fit best, with their translations; the first where positions say nothing.
 
     Translations are linear, from the nominal ones in the minimum-norm sense. Where frame and tool act together the
     frame takes it all: the tool is near nominal, the frame may be anywhere. Seen from the base, with R_X^T t_X in place
     of t_X, all candidates have one matrix.
     """
+    (R_F, p_F), (X, T) = flange, nominal
     if p_M is None:
         R_X, R_T = candidates[0]
         return Frame(R_X, X.translation), Frame(R_T, T.translation)

@@ -124,8 +124,7 @@ def _trilaterated(points: Floats, length: Floats) -> Floats:
     across = np.linalg.svd(np.vstack([about, np.zeros((3, 3))]), full_matrices=False)[2][-1]
     mirrored = lifted - 2.0 * (lifted @ across) * across
     starts = np.vstack([lifted, mirrored, reach * np.eye(3), -reach * np.eye(3)])
-    found: Floats = middle + _by_lengths(about, length, starts)
-    return found
+    return np.asarray(middle + _by_lengths(about, length, starts))
 
 
 def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:

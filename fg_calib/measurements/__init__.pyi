@@ -23,7 +23,7 @@ from .kinds.pose import TARGET
 from .landmarks import Estimate, Landmark, LandmarkKind, Landmarks
 from .moments import Moments, angle_moments, length_moments
 from .residuals import Block, pack, squares_along, unit_whitening, unpack
-from .table import UNKNOWN, CustomMeasurements, KnownPoint, MeasurementBlock, Table, by_station
+from .table import UNKNOWN, CustomMeasurements, KnownPoint, MeasurementBlock, Table, Tables, by_station
 
 __all__ = [
     "ANGLE_SLACK",
@@ -60,6 +60,7 @@ __all__ = [
     "RotationAngle",
     "Rows",
     "Table",
+    "Tables",
     "angle_moments",
     "build_dataset",
     "by_station",

@@ -286,8 +286,7 @@ def check_limits(
 def outside_limits(readings: Floats, robot: Robot) -> Booleans:
     """Which readings, shape (n, n_joints), [rad] (prismatic: [m]), are beyond their joints' limits."""
     lower, upper = robot.limits.T
-    outside: Booleans = (readings < lower - LIMIT_SLACK) | (readings > upper + LIMIT_SLACK)
-    return outside
+    return np.asarray((readings < lower - LIMIT_SLACK) | (readings > upper + LIMIT_SLACK))
 
 
 def _limit_hint(readings: Floats, robot: Robot, joint: int, unit: str) -> str:

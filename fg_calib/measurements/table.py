@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -284,6 +284,10 @@ class Table(Brief):
     def unknown_frame(self) -> bool:
         """Whether its world_T_base is estimated."""
         return self.frame == "unknown" and (self.model in inputs.POSE_MODELS or self.fixed_camera)
+
+
+Tables = Measurements | Table | Sequence[Measurements | Table]
+"""A table, or several; those that are no `Table` are understood as options say."""
 
 
 def by_station(table: Table) -> tuple[Table, ...]:

@@ -256,8 +256,7 @@ class ToolPoseUncertainty(FrozenArrays):
 
     def _without_fit(self, points: Floats, motion: Floats) -> Floats:
         moved = np.cross(self.turn[None], (points - self.centre)[:, :, None], axis=1) + self.shift
-        left: Floats = motion - np.concatenate([np.broadcast_to(self.turn, moved.shape), moved], axis=1)
-        return left
+        return np.asarray(motion - np.concatenate([np.broadcast_to(self.turn, moved.shape), moved], axis=1))
 
     def _rms(self, motion: Floats) -> Floats:
         return _lengths(self.covariance.variance(motion.reshape(6 * len(motion), motion.shape[2])).reshape(-1, 6))

@@ -107,8 +107,7 @@ class PredictedErrors(FrozenArrays):
         """Configuration with the largest error; None where it is known nowhere."""
         if self.unknown == 1.0:
             return None
-        row = int(np.nanargmax(self.expected[:, 0]))
-        return _worst(self, row)
+        return _worst(self, int(np.nanargmax(self.expected[:, 0])))
 
     @property
     def undetermined(self) -> tuple[str, ...]:

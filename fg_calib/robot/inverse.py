@@ -67,8 +67,7 @@ def random_readings(robot: Robot, n: int, generator: np.random.Generator) -> Flo
 
     A revolute joint without limits turns over +-180 degrees, a prismatic one slides over +-1 m.
     """
-    lower, upper = _range_of_starts(robot)
-    return generator.uniform(lower, upper, (n, robot.n_joints))
+    return generator.uniform(*_range_of_starts(robot), (n, robot.n_joints))
 
 
 @checked
@@ -143,8 +142,7 @@ def _starts(
     middle = as_floats("near", near, f"({n_joints})" if np.ndim(near) == 1 else f"({n_poses}, {n_joints})")
     spread = np.linspace(0.0, 1.0, n_starts)[:, None]  # [rad] (prismatic: [m]), 0 for the first start
     starts = np.atleast_2d(middle)[:, None, :] + spread * generator.normal(size=shape)
-    lower, upper = robot.limits.T
-    return np.clip(starts, lower, upper)
+    return np.clip(starts, *robot.limits.T)
 
 
 class _Search:
@@ -197,8 +195,7 @@ class _Search:
         gram = J @ np.swapaxes(J, 1, 2) + damping[:, None, None] * np.eye(6)
         step = (np.swapaxes(J, 1, 2) @ np.linalg.solve(gram, miss[:, :, None]))[:, :, 0]
         largest = np.abs(step).max(axis=1, keepdims=True)
-        moved: Floats = q + step * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, LARGEST_STEP)) * self._unit
-        return moved
+        return np.asarray(q + step * np.minimum(1.0, LARGEST_STEP / np.maximum(largest, LARGEST_STEP)) * self._unit)
 
     def _turned(self, q: Floats) -> Floats:
         """Revolute joints that are outside their limits, or +-180 degrees, turned back by whole turns."""

@@ -292,8 +292,7 @@ def turning_of_base(w: Floats, rotation: Floats) -> Floats:
     values, V = np.linalg.eigh(np.eye(3) - R_mean.T @ R_mean)
     right = rotation.reshape(-1, 3).T @ w.reshape(3 * len(w), w.shape[2]) / len(w) - R_mean.T @ w_mean
     inverse = np.divide(1.0, values, out=np.zeros(3), where=values > LEAST_TURNING)
-    a: Floats = w_mean - R_mean @ ((V * inverse) @ (V.T @ right))
-    return a
+    return np.asarray(w_mean - R_mean @ ((V * inverse) @ (V.T @ right)))
 
 
 @checked

@@ -584,16 +584,12 @@ class RobotBuilder:
         both = sorted(set(fixed) & set(estimate))
         if both:
             raise InputError(f"{place}: estimate", f"{both[0]!r} is under fixed too", "it under one of the two")
-        tolerance = _checked_tolerance(tolerance or {}, self._parameters, place)
-        parameters = tuple(
-            replace(
-                p,
-                estimated=(p.estimated or p.name in estimate) and p.name not in fixed,
-                tolerance=tolerance.get(p.name, tolerance.get(tolerance_kind(p) or "")),
-            )
-            for p in self._parameters
-        )
-        return replace(robot, parameters=parameters)
+        tolerance, parameters = _checked_tolerance(tolerance or {}, self._parameters, place), list[Parameter]()
+        for p in self._parameters:
+            estimated = (p.estimated or p.name in estimate) and p.name not in fixed
+            sigma = tolerance.get(p.name, tolerance.get(tolerance_kind(p) or ""))
+            parameters.append(replace(p, estimated=estimated, tolerance=sigma))
+        return replace(robot, parameters=tuple(parameters))
 
     def _add_parameter(
         self, name: str, kind: str, owner: int, nominal: float, estimated: bool, joint: int | None = None

@@ -51,8 +51,7 @@ def yaw_pitch_roll(rotation: Floats, near: Floats | None = None) -> Floats:
         return angles
     same = np.array([angles, [yaw + np.pi, np.pi - pitch, roll + np.pi]])
     same += 2.0 * np.pi * np.round((near - same) / (2.0 * np.pi))
-    nearest: Floats = same[np.argmin(np.sum((same - near) ** 2, axis=1))]
-    return nearest
+    return np.asarray(same[np.argmin(np.sum((same - near) ** 2, axis=1))])
 
 
 def rotation_of(yaw: float, pitch: float, roll: float) -> Floats:
@@ -66,8 +65,7 @@ def nearest_rotation(M: Floats) -> Floats:
     """The rotations R nearest to matrices M, shape (..., 3, 3): they maximise trace(R^T M)."""
     U, _, Vt = np.linalg.svd(M)
     U[..., 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
-    rotation: Floats = U @ Vt
-    return rotation
+    return np.asarray(U @ Vt)
 
 
 def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
@@ -107,5 +105,4 @@ def inverse_right_jacobian(v: Floats) -> Floats:
     half = 0.5 * np.maximum(angle, 1e-4)
     g = np.where(angle < 1e-4, 1.0 / 12.0 + angle**2 / 720.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
     cross = cross_matrix(v)
-    out: Floats = np.eye(3) + 0.5 * cross + g[:, None, None] * (cross @ cross)
-    return out
+    return np.asarray(np.eye(3) + 0.5 * cross + g[:, None, None] * (cross @ cross))
