@@ -1,4 +1,4 @@
-"""`fg-calib calibrate`."""
+"""`fg-calib calibrate` and `report`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, argument, end, option, say, show_result
+from fg_calib.cli.output import Json, ResultFolder, argument, end, option, say, show_result
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -101,3 +101,16 @@ def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
     table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows, wrap=True)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())
     return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))
+
+
+def report(
+    result: ResultFolder,
+    out: Annotated[Path | None, option("--out", "DIR", "Write there instead of to the result's folder.")] = None,
+    figures: Annotated[bool, option("--figures", None, "Write its figures too, as SVG files.")] = False,
+) -> None:
+    """Write report.html of a calibration: one page to look at and to pass on, which needs nothing else."""
+    from fg_calib.calibration import write_report
+
+    write_report(result, out, figures=figures)
+    folder = (result if result.is_dir() else result.parent) if out is None else out
+    say(f"wrote {folder / 'report.html'}")

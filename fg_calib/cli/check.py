@@ -1,22 +1,30 @@
-"""`fg-calib check`."""
+"""`fg-calib check`, `update` and `history`: a calibration and new rows."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fg_calib.cli.output import Json, ResultFolder, angle_option, argument, length_option, option, show_result
+from fg_calib.cli.calibrate import show_calibration
+from fg_calib.cli.output import Json, ResultFolder, argument, option, quantity, show_result
+
+if TYPE_CHECKING:
+    from fg_calib.robot import Robot
 
 NewTable = Annotated[Path, argument("TABLE", "New rows: a table like the job's, or a job with several.")]
 Pairs = Annotated[Path | None, option("--pairs", "TABLE", "Table of pairs, if the job has one.")]
 Like = Annotated[str | None, option("--like", "NAME", "Which of the job's tables it is like, if there are several.")]
+Many = list[str] | None
 
 
 def check(
     result: ResultFolder,
     table: NewTable,
-    limit: Annotated[float | None, length_option("--limit", "Largest RMS error of positions, such as 0.5mm.")] = None,
-    limit_angle: Annotated[float | None, angle_option("--limit-angle", "Of orientations, such as 0.05deg.")] = None,
+    limit: Annotated[float | None, quantity("--limit", "m", "Largest RMS error of positions, such as 0.5mm.")] = None,
+    limit_angle: Annotated[float | None, quantity("--limit-angle", "rad", "Of orientations, such as 0.05deg.")] = None,
     pairs: Pairs = None,
     like: Like = None,
     as_json: Json = False,
@@ -31,3 +39,66 @@ def check(
     show_result(as_json, lambda: check_document(found), lambda: build_check_report(found, joints))
     if found.verdict != "pass":
         raise typer.Exit(3)
+
+
+def update(
+    result: ResultFolder,
+    table: NewTable,
+    out: Annotated[Path, option("--out", "DIR", "Write the new result there, with its history.")],
+    date: Annotated[str | None, option("--date", "DATE", "When the rows were measured; now if left out.")] = None,
+    growth: Annotated[Many, option("--growth", "NAME=FIGURE", "1 sigma of drift in a day: theta=0.001deg.")] = None,
+    changed: Annotated[Many, option("--changed", "NAME", "What has changed since: it is estimated anew.")] = None,
+    anchors_stay: Annotated[bool, option("--anchors-stay", None, "Anchors of the same name have not moved.")] = False,
+    pairs: Pairs = None,
+    like: Like = None,
+    as_json: Json = False,
+) -> None:
+    """Add new rows to the information of a calibration: its own rows are not read again."""
+    from fg_calib import calibration, inputs, io
+
+    if out.resolve() == (result.parent if result.is_file() else result).resolve():
+        raise inputs.InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
+    io.require_writable(out)
+    io.require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
+    before = calibration.Calibration.load(result)
+    found = before.update(
+        table,
+        date=date,
+        growth=_growth(growth or (), before.robot),
+        changed=changed or (),
+        anchors_stay=anchors_stay,
+        pairs=pairs,
+        like=like,
+    )
+    found.save(out)
+    show_calibration(found, as_json)
+
+
+def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
+    """Growth by name or kind, in [m] and [rad].
+
+    Raises:
+        InputError: One is not `NAME=FIGURE` with a unit.
+    """
+    from fg_calib.inputs import InputError
+    from fg_calib.io import quantity
+    from fg_calib.robot import tolerance_kind
+
+    units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}
+    found = {}
+    for one in given:
+        name, equals, figure = one.partition("=")
+        if not equals:
+            raise InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
+        found[name] = quantity(figure, units.get(name, "rad"), None, f"--growth: {name}")
+    return found
+
+
+def history(result: ResultFolder, as_json: Json = False) -> None:
+    """Show the runs that a calibration came from."""
+    from fg_calib.io import read_result
+    from fg_calib.report import build_history, history_document
+
+    found = read_result(result)
+    runs = (*found.history, found.run)
+    show_result(as_json, lambda: history_document(found.robot, runs), lambda: build_history(found.robot, runs))

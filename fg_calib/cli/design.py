@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from fg_calib.cli.output import Json, Seed, argument, end, length_option, option, say, show_result
+from fg_calib.cli.output import Json, Seed, argument, end, option, quantity, say, show_result
 
 if TYPE_CHECKING:
     from fg_calib.io import Units
@@ -22,13 +22,13 @@ Frame = Literal["base", "fitted"]
 def design(
     of: Annotated[str, argument("SCENARIO|JOB", "A scenario, or a job, whose rows count already.")],
     n: Annotated[int | None, option("--n", "N", "How many poses; 30 if neither this nor --target.")] = None,
-    target: Annotated[float | None, length_option("--target", "As few as reach this RMS error, such as 0.5mm.")] = None,
+    target: Annotated[float | None, quantity("--target", "m", "As few as reach this RMS error, such as 0.5mm.")] = None,
     given: Annotated[Path | None, option("--given", "TABLE", "Configurations that are measured in any case.")] = None,
     candidates: Annotated[str | None, option("--candidates", "N|TABLE|SCENARIO|rows", "How many, or which.")] = None,
     task: Annotated[Path | None, option("--task", "TABLE", "Where the tool is to be right; anywhere if none.")] = None,
     criterion: Annotated[Criterion, option("--criterion", None, "What is made small: I, the error.")] = "I",
     error: Annotated[Frame | None, option("--error", None, "In the base frame, or after the best fit.")] = None,
-    lever: Annotated[float | None, length_option("--lever", "Where orientations count by what they move.")] = None,
+    lever: Annotated[float | None, quantity("--lever", "m", "Where orientations count by what they move.")] = None,
     out: Annotated[Path | None, option("--out", "DIR", "Write tables and a job to fill in there.")] = None,
     seed: Seed = 0,
     as_json: Json = False,

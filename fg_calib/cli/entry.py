@@ -20,7 +20,13 @@ COMMANDS = (
     *("init", "inspect", "calibrate", "report", "export", "correct", "predict", "compare", "check", "update"),
     *("history", "observe", "design", "simulate", "example", "bag", "board"),
 )
-"""The commands in the order of the help: each is the function of that name in the module of that name."""
+"""The commands in the order of the help: each is the function of that name."""
+
+MODULES = {
+    **{"report": "calibrate", "correct": "predict", "compare": "inspect", "observe": "inspect"},
+    **{"update": "check", "history": "check", "simulate": "init", "example": "init"},
+}
+"""The modules of commands that are not in that of their name."""
 
 
 def build_app(commands: Iterable[str] = COMMANDS) -> typer.Typer:
@@ -33,7 +39,7 @@ def build_app(commands: Iterable[str] = COMMANDS) -> typer.Typer:
         callback=_options,
     )
     for command in commands:
-        app.command()(getattr(import_module(f"fg_calib.cli.{command}"), command))
+        app.command()(getattr(import_module(f"fg_calib.cli.{MODULES.get(command, command)}"), command))
     return app
 
 

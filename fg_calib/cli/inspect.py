@@ -1,9 +1,13 @@
-"""`fg-calib inspect`."""
+"""`fg-calib inspect`, `observe` and `compare`: what rows can determine, and what estimators make of them."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fg_calib.cli.output import Json, argument, end, show_result
+from fg_calib.cli.output import Angle, BaseLink, Json, Length, TipLink, argument, end, names_in, option, show_result
+from fg_calib.inputs import FrameKnowledge, Model
+
+Sigma = float | None
+Strategy = Literal["star", "chain", "all"]
 
 
 def inspect(job: Annotated[Path, argument("JOB", "The job, such as calibration.yaml.")], as_json: Json = False) -> None:
@@ -15,3 +19,68 @@ def inspect(job: Annotated[Path, argument("JOB", "The job, such as calibration.y
     found = diagnostics.inspect_job(given)
     show_result(as_json, lambda: inspection_document(found, given), lambda: build_inspection_report(found, given))
     end(found.findings, "look at this first")
+
+
+def observe(
+    robot: Annotated[Path, argument("ROBOT", "The robot: robot.yaml or a URDF.")],
+    model: Annotated[Model, option("--model", None, "What is measured.")] = "distance-rotation",
+    configurations: Annotated[Path | None, option("--configurations", "TABLE", "Random ones if not given.")] = None,
+    out: Annotated[Path | None, option("--out", "DIR", "Write observability.json there.")] = None,
+    frame: Annotated[FrameKnowledge, option("--frame", None, "Whether world_T_base is estimated too.")] = "known",
+    pairing: Annotated[Strategy, option("--pairing", None, "Pairs of TABLE's configurations.")] = "star",
+    base_link: BaseLink = None,
+    tip_link: TipLink = None,
+    prefer: Annotated[str, option("--prefer", "NAMES", "Parameters to keep, first choice first: theta2,d5.")] = "",
+    length: Length = "m",
+    angle: Angle = "rad",
+    position_noise: Annotated[Sigma, option("--position-noise", "SIGMA", "1 mm if not given.", min=0.0)] = None,
+    orientation_noise: Annotated[Sigma, option("--orientation-noise", "SIGMA", "1 mrad if not.", min=0.0)] = None,
+    joint_noise: Annotated[float, option("--joint-noise", "SIGMA", "1 sigma of a joint reading.", min=0.0)] = 0.0,
+    seed: Annotated[int, option("--seed", None, "Of the random configurations, without TABLE.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Say which parameters measurements can determine, which only together, and why not the others."""
+    from fg_calib import inputs, measurements
+    from fg_calib.io import Units, read_measurements, read_robot
+    from fg_calib.observability import observe_configurations, observe_structure
+    from fg_calib.report import build_identifiability_report, observability_document, write_document
+
+    arm, names = read_robot(robot, base_link=base_link, tip_link=tip_link), names_in(prefer)
+    if configurations is None:
+        found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
+    else:
+        units = Units(length, angle)
+        noise = measurements.Noise(
+            position=None if position_noise is None else position_noise * units.factor("m"),
+            orientation=None if orientation_noise is None else orientation_noise * units.factor("rad"),
+            joint=tuple(joint_noise * units.factor(joint.unit) for joint in arm.joints),
+        )
+        table = read_measurements(configurations, arm, units=units, noise=noise)
+        found = observe_configurations(arm, table, model, frame=frame, pairing=inputs.Pairing(pairing), prefer=names)
+    if out is not None:
+        write_document(out, "observability.json", observability_document(found))
+    show_result(as_json, lambda: observability_document(found), lambda: build_identifiability_report(found))
+
+
+def compare(
+    job: Annotated[Path, argument("JOB|OLD", "The job, such as calibration.yaml; or an older result.")],
+    new: Annotated[Path | None, argument("[NEW]", "A newer result, to compare with the older.")] = None,
+    out: Annotated[Path | None, option("--out", "DIR", "Write comparison.json there.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the factor graph with plain least squares on the same job, or a new result with an old one."""
+    from fg_calib import baseline, io
+    from fg_calib.report import compare as report
+    from fg_calib.report import write_document
+
+    if new is not None:
+        both, files = (io.read_result(job), io.read_result(new)), (job, new)
+        show_result(
+            as_json, lambda: report.changes_document(*both, files), lambda: report.build_changes_report(*both, files)
+        )
+        return
+    found = baseline.comparison.compare(io.read_job(job))
+    if out is not None:
+        write_document(out, "comparison.json", report.comparison_document(found))
+    show_result(as_json, lambda: report.comparison_document(found), lambda: report.build_comparison_report(found))
+    end(found.findings)

@@ -36,23 +36,15 @@ def option(name: str, metavar: str | None, about: str, **limits: Any) -> Any:
     return typer.Option(name, metavar=metavar, readable=False, help=about, **limits)
 
 
-def length_option(name: str, about: str) -> Any:
-    """An option whose value is a length with its unit; the command gets it in [m]."""
-    return _quantity_option(name, "LENGTH", "m", about)
+def quantity(name: str, unit: Literal["m", "rad"], about: str) -> Any:
+    """An option that takes a number with its unit."""
 
-
-def angle_option(name: str, about: str) -> Any:
-    """An option whose value is an angle with its unit; the command gets it in [rad]."""
-    return _quantity_option(name, "ANGLE", "rad", about)
-
-
-def _quantity_option(name: str, metavar: str, unit: Literal["m", "rad"], about: str) -> Any:
     def read(text: str) -> float:
-        from fg_calib.io import quantity
+        from fg_calib import io
 
-        return quantity(text, unit, None, name)
+        return io.quantity(text, unit, None, name)
 
-    return option(name, metavar, about, parser=read)
+    return option(name, {"m": "LENGTH", "rad": "ANGLE"}[unit], about, parser=read)
 
 
 Json = Annotated[bool, option("--json", None, "Print the result as JSON on stdout, and nothing else there.")]

@@ -1,15 +1,26 @@
-"""`fg-calib predict`."""
+"""`fg-calib predict` and `correct`: what a calibration is good for."""
 
 from pathlib import Path
 from typing import Annotated
 
-from fg_calib.cli.output import Angle, Json, Length, ResultFolder, end, length_option, option, say, show_result
+from fg_calib.cli.output import (
+    Angle,
+    Json,
+    Length,
+    ResultFolder,
+    argument,
+    end,
+    option,
+    quantity,
+    say,
+    show_result,
+)
 
 
 def predict(
     result: ResultFolder,
     at: Annotated[Path | None, option("--at", "TABLE", "Configurations; over the workspace if not given.")] = None,
-    limit: Annotated[float | None, length_option("--limit", "Say where errors are within it, such as 0.5mm.")] = None,
+    limit: Annotated[float | None, quantity("--limit", "m", "Say where errors are within it, such as 0.5mm.")] = None,
     out: Annotated[Path | None, option("--out", "DIR", "Write predict.json, predict.csv and pictures there.")] = None,
     length: Length = "m",
     angle: Angle = "rad",
@@ -35,3 +46,35 @@ def predict(
     if out is not None:
         say(f"wrote the prediction to {out}")
     end(arm.findings)
+
+
+def correct(
+    result: ResultFolder,
+    targets: Annotated[Path, argument("TARGETS", "Where the tool is to be: x y z, orientation, q1 ...")],
+    out: Annotated[Path | None, option("--out", "CSV", "Write the table of commands there.")] = None,
+    length: Length = "m",
+    angle: Angle = "rad",
+    world: Annotated[bool, option("--world", None, "The targets are in the measurement frame.")] = False,
+    table: Annotated[int | None, option("--table", None, "Number of the table whose frame that is, from 0.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
+    from fg_calib import calibration, io, report
+    from fg_calib.calibration import correct as correct_targets
+
+    if out is not None:
+        io.require_absent(out.parent, [out.name])
+    found, units = calibration.Calibration.load(result), io.Units(length, angle)
+    wanted = io.read_targets(targets, found.robot, units)
+    commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)
+    if out is not None:
+        report.write_commands(out, wanted.ids, commands, found.robot, units)
+    show_result(
+        as_json,
+        lambda: report.correction_document(found.robot.name, wanted.ids, commands),
+        lambda: report.build_correction_report(wanted.ids, commands, found.robot),
+    )
+    say(f"wrote {len(wanted.ids)} commands to {out}" if out else "nothing is written: --out commands.csv writes them")
+    left = int((~commands.reached).sum())
+    doubts = [f"the calibration was not to be trusted: {finding}" for finding in found.findings]
+    end([*doubts, *([f"{left} of {len(wanted.ids)} targets are not reached"] if left else [])], "doubtful")
