@@ -16,7 +16,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 os.environ["PYTHONSAFEPATH"] = "1"  # subprocesses have the package that is tested, compiled once, wherever they run
 
-from fg_calib import cli
+from fg_calib import calibrate_job, cli
 from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.observability import identifiability
 
@@ -62,12 +62,25 @@ def whole_example(tmp_path):
     return Path(shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path / "space-robot"))
 
 
+def with_few_rows(folder):
+    """Leave 50 of the example's 500 test rows: half of what it takes is judging these."""
+    poses = folder / "poses.csv"
+    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-450]))
+    return folder
+
+
 @pytest.fixture
 def example(whole_example):
-    """The same with 50 of its 500 test rows: half of what it takes is judging these."""
-    poses = whole_example / "poses.csv"
-    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-450]))
-    return whole_example
+    """The same with few test rows."""
+    return with_few_rows(whole_example)
+
+
+@pytest.fixture(scope="session")
+def calibrated_example(tmp_path_factory):
+    """The example with few test rows, and its result; nobody changes it."""
+    folder = shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path_factory.mktemp("example") / "job")
+    calibrate_job(with_few_rows(folder) / "calibration.yaml").save(folder / "result")
+    return folder
 
 
 @pytest.fixture

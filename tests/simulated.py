@@ -47,6 +47,12 @@ def true_robot(robot: Robot, rng: np.random.Generator) -> Robot:
     return robot.with_values(robot.nominal + error)
 
 
+def nees(found, true: Robot) -> tuple[float, int]:
+    """Squared error of an assessed arm over its covariance, and the number of its estimated parameters."""
+    error = (found.robot.nominal - true.nominal)[[found.robot.index(name) for name in found.names]]
+    return error @ np.linalg.solve(found.covariance, error), len(error)
+
+
 def plus(array, rows, amount):
     """A copy of an array with something added at some rows."""
     changed = array.copy()

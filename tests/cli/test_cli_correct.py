@@ -8,19 +8,15 @@ import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Calibration, calibrate_job
+from fg_calib import Calibration
+
+
+@pytest.fixture
+def result(calibrated_example):
+    return calibrated_example / "result"
+
 
 JOINTS = [f"q{i + 1}" for i in range(7)]
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    """The folder of the bundled example's result."""
-    from fg_calib.cli import EXAMPLES
-
-    folder = tmp_path_factory.mktemp("result")
-    calibrate_job(EXAMPLES / "space-robot" / "calibration.yaml").save(folder)
-    return folder
 
 
 def near(n):

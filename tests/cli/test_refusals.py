@@ -5,19 +5,7 @@ import shutil
 
 import pytest
 
-from fg_calib import calibrate_job, cli
-
 JOB, POSES, ROBOT = "calibration.yaml", "poses.csv", "robot_nominal.yaml"
-
-
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
-    """The bundled example with 50 of its test rows, and its result."""
-    folder = shutil.copytree(cli.EXAMPLES / "space-robot", tmp_path_factory.mktemp("refusals") / "job")
-    poses = folder / POSES
-    poses.write_text("".join(poses.read_text().splitlines(keepends=True)[:-450]))
-    calibrate_job(folder / JOB).save(folder / "result")
-    return folder
 
 
 def replaced(file, old, new):
@@ -117,9 +105,9 @@ USAGE = {
 
 
 @pytest.fixture
-def place(calibrated, tmp_path, monkeypatch):
+def place(calibrated_example, tmp_path, monkeypatch):
     """A copy of the folder, which is the current one."""
-    monkeypatch.chdir(shutil.copytree(calibrated, tmp_path / "job"))
+    monkeypatch.chdir(shutil.copytree(calibrated_example, tmp_path / "job"))
     monkeypatch.setenv("COLUMNS", "200")
     return tmp_path / "job"
 

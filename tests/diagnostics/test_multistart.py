@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from instruments import TOLERANCE
 from scipy.stats import chi2
-from simulated import small_arm, true_robot
+from simulated import nees, small_arm, true_robot
 from touches import reach_faces
 
 from fg_calib import Measurements, Table, assess, build_problem, calibrate, read_job, read_robot, solve
@@ -102,21 +102,9 @@ def on_planes(rng, reading, n=48, n_planes=3):
     readings = reading * rng.uniform(-1.0, 1.0, n)
     heights = np.einsum("ni,ni->n", normals, pose(true, rng.uniform(-1, 1, (n_planes, 4))).position)
     q = reach_faces(true, normals[which], heights[which] + readings, rng)
-    data = Measurements.from_arrays(
-        q,
-        plane=[f"p{i}" for i in which],
-        distance=readings + SIGMA * rng.normal(size=n) * (reading > 0.0),
-        sigma_distance=SIGMA,
-    )
+    distance = readings + SIGMA * rng.normal(size=n) * (reading > 0.0)
+    data = Measurements.from_arrays(q, plane=[f"p{i}" for i in which], distance=distance, sigma_distance=SIGMA)
     return robot, true, normals, Table(data, "plane")
-
-
-def error_of(found, true):
-    """Squared error of the arm over its covariance, as a probability."""
-    names = [p.name for p in found.robot.parameters if p.estimated]
-    places = [found.robot.index(name) for name in names]
-    e = found.robot.nominal[places] - true.nominal[places]
-    return chi2.cdf(e @ np.linalg.solve(found.covariance(names), e), len(names))
 
 
 def sides(problem, parameters, normals):
@@ -139,5 +127,5 @@ def test_planes_with_readings_below_what_the_arm_is_off_by_get_their_normals_rig
         assert not found.findings
         assert sides(found.solution.problem, found.solution.parameters, normals) == [1.0] * 3
         assert chi2.cdf(found.assessment.fit.chi_square.value, found.assessment.fit.chi_square.dof) < 0.999
-        assert error_of(found, true) < 0.999
+        assert chi2.cdf(*nees(found.assessment, true)) < 0.999
     assert wrong > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from scipy.spatial.transform import Rotation
-from simulated import measure, paper_robot, small_arm, true_robot
+from simulated import measure, nees, paper_robot, small_arm, true_robot
 from touches import TOLERANCE as TOUCH_TOLERANCE
 from touches import TOOL_POINT, corners, reach, touch
 
@@ -73,15 +73,14 @@ CASES = {
 def test_errors_and_residuals_are_as_large_as_said(name):
     """The mean of 20 draws, each within four of its own sigmas."""
     make, how, options = CASES[name]
-    nees, value, expected = [], 0.0, 0.0
+    squares, value, expected = [], 0.0, 0.0
     for seed in range(20):
         robot, true, measurements = make(np.random.default_rng(100 + seed), **how)
         found = assess(solve(build_problem(robot, measurements, **options)))
-        rows = [robot.index(parameter) for parameter in found.names]
-        error = (found.robot.nominal - true.nominal)[rows]
-        nees.append(error @ np.linalg.solve(found.covariance, error) / len(error))
+        square, n = nees(found, true)
+        squares.append(square / n)
         value, expected = value + found.fit.chi_square.value, expected + found.fit.chi_square.expected
-    assert np.mean(nees) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / len(error) / len(nees)))
+    assert np.mean(squares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / n / len(squares)))
     assert value / expected == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / expected) + 0.05)
 
 

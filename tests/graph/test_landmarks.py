@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 from instruments import CAMERA, TARGETS, measured_by
 from scipy.stats import chi2
-from simulated import small_arm, true_robot, write_job
+from simulated import nees, small_arm, true_robot, write_job
 from sparing import diagonal
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
@@ -169,8 +169,7 @@ def test_it_arrives_from_nominal_wherever_landmarks_are(instrument, seed):
     assert solution.iterations <= 6
     assert not found.verdict.errors
     assert chi2.cdf(found.fit.chi_square.value, found.fit.chi_square.dof) < 0.999
-    e = (found.robot.nominal - true.nominal)[[robot.index(name) for name in found.names]]
-    assert chi2.cdf(e @ np.linalg.solve(found.covariance, e), len(e)) < 0.999
+    assert chi2.cdf(*nees(found, true)) < 0.999
 
 
 @pytest.mark.slow

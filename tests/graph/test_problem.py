@@ -132,26 +132,22 @@ def test_what_cannot_be_solved_is_refused_in_one_line():
     poses = replace(measure(robot, 30, rng), source="poses.csv")
     fixed = replace(robot, parameters=tuple(replace(p, estimated=False) for p in robot.parameters))
     assert "nothing to estimate" in refused(fixed, poses, model="pose")
-    assert refused(robot, replace(poses, position=None), model="position") == (
-        "poses.csv: no columns x, y, z, expected measured positions for model position"
-    )
-    assert refused(robot, replace(poses, sigma_orientation=None), model="pose") == (
-        "poses.csv: no sigma for orientation, expected noise.orientation or a column sigma_orientation"
-    )
-    assert refused(robot, replace(poses, rotation=None), model="rotation") == (
-        "poses.csv: no columns qx, qy, qz, qw or roll, pitch, yaw, expected measured orientations for model rotation"
-    )
-    assert refused(robot, replace(poses, sigma_position=None), model="distance") == (
-        "pairs from poses.csv: no sigma for distance, expected noise.position or a column sigma_position"
-    )
-    lost = replace(poses, sigma_joint=np.array([1e-4, 1e8, 1e-4, 1e-4]))
-    assert refused(robot, lost, model="distance") == (
-        "poses.csv: noise.joint of 5.73e+09 deg at j2, expected less than half a turn; is it in degrees?"
-    )
-    still = planar_pairs([0.0, 0.0])
-    assert refused(planar_robot(), still, model="rotation") == (
-        "measurements: no row left to fit, 2 excluded for same configuration, expected train rows that the model uses"
-    )
+    lost, still = replace(poses, sigma_joint=np.array([1e-4, 1e8, 1e-4, 1e-4])), planar_pairs([0.0, 0.0])
+    for measurements, model, said in (
+        (replace(poses, position=None), "position",
+         "poses.csv: no columns x, y, z, expected measured positions for model position"),
+        (replace(poses, sigma_orientation=None), "pose",
+         "poses.csv: no sigma for orientation, expected noise.orientation or a column sigma_orientation"),
+        (replace(poses, rotation=None), "rotation", "poses.csv: no columns qx, qy, qz, qw or roll, pitch, yaw, "
+         "expected measured orientations for model rotation"),
+        (replace(poses, sigma_position=None), "distance",
+         "pairs from poses.csv: no sigma for distance, expected noise.position or a column sigma_position"),
+        (lost, "distance",
+         "poses.csv: noise.joint of 5.73e+09 deg at j2, expected less than half a turn; is it in degrees?"),
+        (still, "rotation", "measurements: no row left to fit, 2 excluded for same configuration, expected train rows "
+         "that the model uses"),
+    ):  # fmt: skip
+        assert refused(planar_robot() if measurements is still else robot, measurements, model=model) == said
 
 
 def test_priors_count_as_rows_when_there_are_few():

@@ -9,7 +9,7 @@ from boards import CAMERA, render, views
 from jobs import ur5e
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from simulated import true_robot
+from simulated import nees, true_robot
 
 from fg_calib.calibration import calibrate_job
 from fg_calib.importers.board import CalibrationBoard
@@ -66,8 +66,7 @@ def test_parameters_are_found_within_their_sigmas_from_images(tmp_path, fg_calib
         assert result.trustworthy, result.findings
         found[model] = u = result.assessment
         assert chi2.cdf(u.fit.chi_square.value, u.fit.chi_square.dof) < 0.999
-        error = (u.robot.nominal - true.nominal)[[true.index(name) for name in u.names]]
-        assert chi2.cdf(error @ np.linalg.solve(u.covariance, error), len(error)) < 0.999
+        assert chi2.cdf(*nees(u, true)) < 0.999
     apart = found["board"].robot.nominal - found["pixels"].robot.nominal
     apart = apart[[true.index(name) for name in found["pixels"].names]]
     assert np.abs(apart / np.sqrt(np.diag(found["pixels"].covariance))).max() < 1.0  # the same corners, summed up

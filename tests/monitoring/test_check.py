@@ -10,6 +10,7 @@ from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, slipped
 from oracle import central_differences
 from scipy import stats
 from simulated import true_robot
+from sparing import as_case
 
 from fg_calib import InputError, Measurements, Robot, Table, calibrate
 from fg_calib.measurements.dataset import Labels
@@ -60,16 +61,19 @@ def test_chi_square_is_that_of_the_covariance_written_out(known):
     assert found.p_value == pytest.approx(stats.chi2.sf(found.chi2, 9))
 
 
-@pytest.mark.sampled(1)
-@pytest.mark.parametrize("joint", [2, 3, 4, 5])
-def test_the_joint_that_slipped_is_named(known, joint):
+LARGE, TOOL = ("theta3", 0.05, 10, 0), ("tool_y", 1e-3, 8, 9)
+SLIPS = [as_case((f"theta{joint}", 2e-3, 10, joint), is_slow=joint > 2) for joint in (2, 3, 4, 5)]
+
+
+@pytest.mark.parametrize(("name", "size", "n", "seed"), [*SLIPS, LARGE, TOOL])
+def test_what_slipped_is_named_and_found_in_full(known, name, size, n, seed):
+    """Also where it is too large to be linear, or is the tool."""
     calibration, true, _ = known
-    new = slipped(true, **{f"theta{joint}": 2e-3})
-    found = calibration.check(measured(new, 10, np.random.default_rng(joint)))
+    found = calibration.check(measured(slipped(true, **{name: size}), n, np.random.default_rng(seed)))
     assert found.verdict == "fail"
-    assert likely(found) == [(f"theta{joint}",)]
+    assert likely(found) == [(name.replace("_", "."),)]
     best = found.explanations[0]
-    assert abs(best.change[0] - 2e-3) < 4 * best.sigma[0]
+    assert abs(best.change[0] - size) < 4 * best.sigma[0]
     assert found.deploy
 
 
@@ -86,14 +90,6 @@ def test_a_slip_is_named_by_the_joint_where_an_angle_of_hayati_is_alike():
     assert abs(change - best.change[0]) < best.sigma[0]
     assert updated.trustworthy
     assert updated.check(measured(true, 12, rng, frame=placed(rng))).verdict == "pass"
-
-
-def test_a_slip_too_large_to_be_linear_is_found_in_full(known):
-    calibration, true, _ = known
-    found = calibration.check(measured(slipped(true, theta3=0.05), 10, np.random.default_rng(0)))
-    best = found.explanations[0]
-    assert best.parameters == ("theta3",)
-    assert abs(best.change[0] - 0.05) < 4 * best.sigma[0]
 
 
 def few_rows_of_a_slip(seed=0, slip=4e-3):
@@ -182,13 +178,6 @@ def test_a_tracker_that_was_moved_is_fitted_anew(unknown):
     calibration, true, _ = unknown
     rng = np.random.default_rng(7)
     assert calibration.check(measured(true, 8, rng, frame=placed(rng))).verdict == "pass"
-
-
-def test_a_tool_that_was_changed_is_found(known):
-    calibration, true, _ = known
-    found = calibration.check(measured(slipped(true, tool_y=1e-3), 8, np.random.default_rng(9)))
-    assert likely(found) == [("tool.y",)]
-    assert abs(found.explanations[0].change[0] - 1e-3) < 4 * found.explanations[0].sigma[0]
 
 
 def test_two_joints_that_slipped_together_are_found(known):

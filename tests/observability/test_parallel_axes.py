@@ -29,29 +29,27 @@ SCARA = ((0.3, 0, 0.4), (0.25, 0, 0), (0, 0, 0, "slide"), (0, 0, 0.1))
 COAXIAL = ((0, 90, 0.1), (0, 0, 0.3), (0, 90, 0), (0, 90, 0), (0, 90, 0.1))
 GANTRY = ((0, 90, 0, "slide"), (0, 90, 0, "slide"), (0, 0, 0, "slide"), (0, 90, 0), (0, 90, 0.1))
 SKEW = ((0, 90, 0.1), (0.3, 80, 0), (0.2, -70, 0.1), (0, 90, 0.2))
+LACKS = "axes 2, 3 and 4 are parallel and convention dh has no parameter for a tilt about y between them: use dh-hayati"
 
 
 @pytest.mark.sampled(3)
-@pytest.mark.parametrize(
-    ("convention", "joints", "expected"),
-    [
-        ("dh", UR, [((2, 3, 4), TILT, "dh-hayati")]),
-        ("mdh", UR_CRAIG, [((2, 3, 4), TILT, "mdh-hayati")]),
-        ("dh-hayati", UR, []),
-        ("mdh-hayati", UR_CRAIG, []),
-        ("dh", SCARA, [((1, 2, 3, 4), TILT, "dh-hayati")]),
-        ("dh-hayati", SCARA, []),
-        # On one line there is no common normal that a could be measured along.
-        ("dh", COAXIAL, [((2, 3), BOTH, "a URDF")]),
-        ("dh-hayati", COAXIAL, [((2, 3), SHIFT, "a URDF")]),
-        # Where a slide is does not matter, only its direction.
-        ("dh", GANTRY, [((3, 4), TILT, "dh-hayati")]),
-        ("dh", SKEW, []),
-        ("dh", ((0, 90, 0.1), (0.4, 0.5, 0), (0, 90, 0.1), (0, 0, 0.1)), [((2, 3), TILT, "dh-hayati")]),
-        ("dh", ((0, 90, 0.1), (0.4, 10.0, 0), (0, 90, 0.1), (0, 0, 0.1)), []),
-        ("mdh", SKEW, []),
-    ],
-)
+@pytest.mark.parametrize(("convention", "joints", "expected"), [
+    ("dh", UR, [((2, 3, 4), TILT, "dh-hayati")]),
+    ("mdh", UR_CRAIG, [((2, 3, 4), TILT, "mdh-hayati")]),
+    ("dh-hayati", UR, []),
+    ("mdh-hayati", UR_CRAIG, []),
+    ("dh", SCARA, [((1, 2, 3, 4), TILT, "dh-hayati")]),
+    ("dh-hayati", SCARA, []),
+    # On one line there is no common normal that a could be measured along.
+    ("dh", COAXIAL, [((2, 3), BOTH, "a URDF")]),
+    ("dh-hayati", COAXIAL, [((2, 3), SHIFT, "a URDF")]),
+    # Where a slide is does not matter, only its direction.
+    ("dh", GANTRY, [((3, 4), TILT, "dh-hayati")]),
+    ("dh", SKEW, []),
+    ("dh", ((0, 90, 0.1), (0.4, 0.5, 0), (0, 90, 0.1), (0, 0, 0.1)), [((2, 3), TILT, "dh-hayati")]),
+    ("dh", ((0, 90, 0.1), (0.4, 10.0, 0), (0, 90, 0.1), (0, 0, 0.1)), []),
+    ("mdh", SKEW, []),
+])  # fmt: skip
 def test_parallel_neighbours_lack_a_tilt(convention, joints, expected):
     found = missing_motions(arm(convention, *joints))
     assert [(m.axes, m.motions, m.use) for m in found] == expected
@@ -60,9 +58,7 @@ def test_parallel_neighbours_lack_a_tilt(convention, joints, expected):
 
 def test_the_words_name_axes_convention_and_remedy():
     (parallel,) = missing_motions(arm("dh", *UR))
-    assert str(parallel) == (
-        "axes 2, 3 and 4 are parallel and convention dh has no parameter for a tilt about y between them: use dh-hayati"
-    )
+    assert str(parallel) == LACKS
     (nearly,) = missing_motions(arm("dh", (0, 90, 0.1), (0.4, 0.5, 0), (0, 90, 0.1), (0, 0, 0.1)))
     assert str(nearly).startswith("axes 2 and 3 are parallel within 0.5 deg and convention dh has no")
 
@@ -71,7 +67,6 @@ DH = {
     **{"convention": "dh", "tolerance": {k: v for k, v in UR5E["tolerance"].items() if k != "beta"}},
     "joints": [{k: v for k, v in joint.items() if k != "beta"} for joint in UR5E["joints"]],
 }
-LACKS = "axes 2, 3 and 4 are parallel and convention dh has no parameter for a tilt about y between them: use dh-hayati"
 
 
 @pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])

@@ -9,7 +9,7 @@ from oracle import tool_pose
 from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, WALL, scenario
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from simulated import planar_robot
+from simulated import nees, planar_robot
 from tolerances import rounding
 
 from fg_calib import InputError, calibrate, read_job, simulate
@@ -175,10 +175,7 @@ def test_every_instrument_calibrates_as_it_is_simulated(which):
     s = simulate(scenario(INSTRUMENTS[which], n=n, noise=replace(SIGMA, joint=1e-4)), 1)
     result = calibrate(s.robot, s.tables)
     assert result.trustworthy
-    found = result.assessment
-    rows = [s.robot.index(name) for name in found.names]
-    error = (found.robot.nominal - s.true_robot.nominal)[rows]
-    assert chi2.cdf(error @ np.linalg.solve(found.covariance, error), len(rows)) < 0.999
+    assert chi2.cdf(*nees(result.assessment, s.true_robot)) < 0.999
 
 
 @pytest.mark.sampled(1)
