@@ -78,15 +78,12 @@ class SeriesRows:
         value, along = self.r + s.data - offset, of_poses + of_joints
         across = np.maximum(trace - along, 0.0) / 2.0
         own = zero if s.formed else square
-        moments = [
-            (length_moments if isinstance(part, Length) else angle_moments)(
-                value[:, i], along[:, i], across[:, i], own[:, i]
-            )
-            for i, part in enumerate(s.kind.parts)
-        ]
-        excess, slope, variance = (
-            np.stack([getattr(one, name) for one in moments], axis=1) for name in ("excess", "slope", "variance")
-        )
+        moments = []
+        for i, part in enumerate(s.kind.parts):
+            of_part = length_moments if isinstance(part, Length) else angle_moments
+            moments.append(of_part(value[:, i], along[:, i], across[:, i], own[:, i]))
+        names = ("excess", "slope", "variance")
+        excess, slope, variance = (np.stack([getattr(one, name) for one in moments], axis=1) for name in names)
         self.r, self.J = self.r + excess, self.J * slope[:, :, None]
         self.joints = self.joints * slope[:, :, None, None]
         self.sources["joints"] = self.sources["joints"] * slope[:, :, None, None]

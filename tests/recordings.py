@@ -42,9 +42,8 @@ class Motion:
     def streams(self):
         source = Source("/joints", "sensor_msgs/msg/JointState")
         lag = Source("/pose", "geometry_msgs/msg/PoseStamped", lag=-self.offset)
-        return JointStream(self.joint_time, self.readings, source), PoseStream(
-            self.pose_time, self.position, self.rotation, lag
-        )
+        poses = PoseStream(self.pose_time, self.position, self.rotation, lag)
+        return JointStream(self.joint_time, self.readings, source), poses
 
 
 def correlated(generator, shape, phi):

@@ -46,9 +46,8 @@ def nodes(path):
 def offered(folder):
     """The module that has each name of a folder's front, as its stub says: `{"robot/Robot": "robot/model"}`."""
     stub = ast.parse((folder / "__init__.pyi").read_text(encoding="utf-8"))
-    found = [
-        (alias.name, node.module) for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names
-    ]
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    found = [(alias.name, node.module) for node in imports for alias in node.names]
     return {f"{folder.name}/{name}": f"{folder.name}/{module}" for name, module in found}
 
 
@@ -199,11 +198,8 @@ def test_all_that_is_imported_is_installed_with_the_package():
     """What the tests need besides, such as yourdfpy, is not; an extra is imported by one module."""
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     installed = {re.match(r"[\w-]+", line)[0] for line in project["dependencies"]}
-    installed = {name.replace("-", "_") for name in installed} - {"pyyaml"} | {
-        "yaml",
-        "pydantic_core",
-        "markupsafe",
-    }  # as imported; pydantic and jinja2 bring the latter
+    as_imported = {"yaml", "pydantic_core", "markupsafe"}  # pydantic and jinja2 bring the latter
+    installed = {name.replace("-", "_") for name in installed} - {"pyyaml"} | as_imported
     used = {"lazy_loader": {"the folders' fronts"}}
     for name, path in zip(NAMES, MODULES, strict=True):
         for library in libraries(path):

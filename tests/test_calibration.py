@@ -71,9 +71,8 @@ def test_one_call_does_the_steps(found, name):
     assert found[name].robot == uncertainty.robot
     assert found[name].trustworthy == uncertainty.trustworthy
     assert len(found[name].residuals) == uncertainty.fit.residuals.n
-    assert {k: g.p_value for k, g in found[name].result.goodness.items()} == {
-        fit.kind: fit.p_value for fit in uncertainty.fit.goodness.kinds
-    }
+    p_values = {fit.kind: fit.p_value for fit in uncertainty.fit.goodness.kinds}
+    assert {k: g.p_value for k, g in found[name].result.goodness.items()} == p_values
 
 
 def test_parameters_are_found_by_name(found):

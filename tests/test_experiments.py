@@ -22,9 +22,8 @@ QUICK = [
 @pytest.mark.parametrize(("script", "question"), QUICK)
 def test_an_experiment_answers_its_question(script, question, tmp_path, monkeypatch):
     module = __import__(script)
-    record = common.run(
-        module.QUESTIONS, script, module.__doc__, ["--quick", "--only", question, "--out", str(tmp_path)]
-    )
+    words = ["--quick", "--only", question, "--out", str(tmp_path)]
+    record = common.run(module.QUESTIONS, script, module.__doc__, words)
     assert json.loads((tmp_path / f"{script}.json").read_text()) == record
     assert len(record[question]["answer"]) > 20
     monkeypatch.setattr(verify, "RESULTS", tmp_path)

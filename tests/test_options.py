@@ -61,10 +61,8 @@ def test_a_word_in_capitals_is_refused_with_the_word_that_was_meant(function, ke
     for word in get_args(WORDS[key][0]):
         with pytest.raises(InputError) as caught:
             function(**{key: word.capitalize()})
-        possible = ", ".join(get_args(WORDS[key][0]))
-        assert (
-            str(caught.value) == f"{key}: found {word.capitalize()!r}, expected one of {possible}; did you mean {word}?"
-        )
+        expected = f"expected one of {', '.join(get_args(WORDS[key][0]))}; did you mean {word}?"
+        assert str(caught.value) == f"{key}: found {word.capitalize()!r}, {expected}"
 
 
 NAN, INF = float("nan"), float("inf")
@@ -125,9 +123,8 @@ def test_a_calibration_takes_nothing_for_exact(tmp_path, key):
 @pytest.mark.parametrize("value", [-1, NAN, INF, "10"], ids=repr)
 @pytest.mark.parametrize("key", [f.name for f in fields(SolverOptions)])
 def test_options_of_the_solver_are_finite_numbers_not_below_0(key, value):
-    with pytest.raises(
-        InputError, match=f"^solver: {key}: found {value!r}, expected a (finite|whole) number not below "
-    ):
+    said = f"^solver: {key}: found {value!r}, expected a (finite|whole) number not below "
+    with pytest.raises(InputError, match=said):
         SolverOptions(**{key: value})
 
 

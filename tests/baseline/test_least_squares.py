@@ -68,9 +68,7 @@ SECOND_ORDER = 0.01
 """Sigma by which the mean of a noisy length moves an estimate here: 0.3 mrad of joint noise over 10 m (0.004 found)."""
 
 
-@pytest.mark.parametrize(
-    ("model", "lacking"), [("pose", False), ("distance-rotation", False), ("distance-rotation", True)]
-)
+@pytest.mark.parametrize(("model", "lacking"), [*((model, False) for model in PAPERS[1:]), ("distance-rotation", True)])
 def test_weighted_by_joint_noise_it_is_the_graph(model, lacking):
     """With the weights of the same parameters; a row that was not measured does not weigh on the other of its pair."""
     robot = paper_robot()
@@ -101,10 +99,8 @@ def test_an_unknown_frame_is_the_graphs(model):
     measurements = measure(true_robot(robot, rng), 60, rng, sigma=(1e-4, 1e-4), frame=(turn, shift))
     problem = build_problem(robot, measurements, model=model, frame="unknown", gauge="keep")
     solution = solve(problem, TO_THE_END)
-    near = np.array([*robot.nominal, 6.9, -3.1, 2.05, 0.4, 1.2, 0.25])
-    fit = fit_least_squares(
-        robot, measurements, model=model, frame="unknown", names=[p.name for p in problem.estimated], start=near
-    )
+    start = {"start": np.array([*robot.nominal, 6.9, -3.1, 2.05, 0.4, 1.2, 0.25]), "frame": "unknown"}
+    fit = fit_least_squares(robot, measurements, model=model, names=[p.name for p in problem.estimated], **start)
     assert fit.converged, fit.message
     assert apart(fit, solution.parameters[:-6]) < NEGLIGIBLE
     rotation, expected = (Rotation.from_euler("ZYX", f.parameters[-3:]) for f in (fit, solution))

@@ -58,10 +58,8 @@ def add_wall(job):
 
 
 def run(fg_calib, folder, *arguments, camera=True):
-    given = ["--camera", folder / "camera.yaml"] if camera else []
-    return fg_calib(
-        *("board", folder / "images", "--board", folder / "board.yaml", "--out", folder / "out", *given, *arguments)
-    )
+    given = ["board", folder / "images", "--board", folder / "board.yaml", "--out", folder / "out"]
+    return fg_calib(*given, *(["--camera", folder / "camera.yaml"] if camera else []), *arguments)
 
 
 @pytest.mark.slow
@@ -69,9 +67,8 @@ def test_images_become_tables_of_corners_and_poses(drawing, job, fg_calib):
     add_wall(job)
     ended = run(fg_calib, job)
     assert (ended.code, ended.err) == (0, f"wrote {', '.join(sorted(TABLES))} to {job / 'out'}\n")
-    assert ended.out.startswith(
-        "checkerboard 9 x 6, square 20 mm: seen in 4 of 5 images, 216 corners\nRMS of residuals 0"
-    )
+    seen = "checkerboard 9 x 6, square 20 mm: seen in 4 of 5 images, 216 corners\nRMS of residuals 0"
+    assert ended.out.startswith(seen)
     assert "No board in wall.png: no board." in ended.out
     assert "The tables have no joint readings: add q1, q2" in ended.out
     assert {f.name for f in (job / "out").iterdir()} == TABLES
@@ -199,25 +196,19 @@ def _replace(path, old, new):
 CASES = {
     "an image that is none": (
         lambda job: (job / "images" / "view1.png").write_bytes(b"GIF89a"),
-        "view1.png: no image that OpenCV can read, expected PNG, JPEG, TIFF, BMP or the like",
-    ),
+        "view1.png: no image that OpenCV can read, expected PNG, JPEG, TIFF, BMP or the like"),
     "no images": (
         lambda job: [file.unlink() for file in (job / "images").iterdir()],
-        "{job}/images: no images, expected files that end in .png, .jpg, .jpeg, .tif, .tiff, .bmp, .pgm, .ppm,",
-    ),
+        "{job}/images: no images, expected files that end in .png, .jpg, .jpeg, .tif, .tiff, .bmp, .pgm, .ppm,"),
     "a board in none": (
         lambda job: (add_wall(job), [file.unlink() for file in (job / "images").glob("view*")]),
         "images: the board in none of 1 (no board), expected at least one; are columns, rows and dictionary those of "
-        "the board? older charuco boards: legacy: true",
-    ),
+        "the board? older charuco boards: legacy: true"),
     "a camera of other images": (
         lambda job: (job / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA) | {"width": 1280, "height": 960})),
-        "camera.yaml: width: found 1280, expected 640 px as the images have; the intrinsics of other",
-    ),
-    "readings without an id": (
-        lambda job: _replace(job / "poses.csv", "id,", "name,"),
-        "poses.csv: no column id, expected the name of each row's image without its ending",
-    ),
+        "camera.yaml: width: found 1280, expected 640 px as the images have; the intrinsics of other"),
+    "readings without an id": (lambda job: _replace(job / "poses.csv", "id,", "name,"),
+                               "poses.csv: no column id, expected the name of each row's image without its ending"),
 }  # fmt: skip
 
 

@@ -155,10 +155,8 @@ def test_the_calibrated_robot_holds_the_estimates(calibrated, result):
 def test_inputs_are_named_with_their_hashes(calibrated, result):
     import hashlib
 
-    expected = {
-        name: hashlib.sha256((calibrated[0] / name).read_bytes()).hexdigest() for name in (JOB, ROBOT, POSES, TRUTH)
-    }
-    assert result["inputs"] == expected
+    contents = {name: (calibrated[0] / name).read_bytes() for name in (JOB, ROBOT, POSES, TRUTH)}
+    assert result["inputs"] == {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
 
 
 # --- how the commands end --------------------------------------------------------------------------------------------
@@ -208,9 +206,8 @@ def test_the_example_is_written_and_its_next_step_named(fg_calib, tmp_path):
     ended = fg_calib("example", "space-robot", "--out", out)
     names = [JOB, POSES, ROBOT, TRUTH]
     assert (ended.code, ended.out) == (0, "")
-    assert ended.err == (
-        f"wrote {', '.join(names)} to {out}\nnow: fg-calib calibrate {out / JOB} --out {out / 'result'}\n"
-    )
+    next_step = f"now: fg-calib calibrate {out / JOB} --out {out / 'result'}\n"
+    assert ended.err == f"wrote {', '.join(names)} to {out}\n{next_step}"
     assert sorted(f.name for f in out.iterdir()) == names
     assert all((out / n).read_bytes() == (cli.EXAMPLES / "space-robot" / n).read_bytes() for n in names)
 

@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import Calibration
 
+JOINTS = [f"q{i + 1}" for i in range(7)]
+
 
 @pytest.fixture
 def result(calibrated_example):
     return calibrated_example / "result"
-
-
-JOINTS = [f"q{i + 1}" for i in range(7)]
 
 
 def near(n):
@@ -64,9 +63,8 @@ def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
     for target, row in zip(document["targets"], q, strict=True):
         there = tool_pose(found.robot, target["readings"])
         assert np.abs(there - tool_pose(nominal, row)).max() < 1e-9
-        assert target["uncorrected"]["position"] == pytest.approx(
-            np.linalg.norm((tool_pose(found.robot, row) - there)[:3, 3]), rel=1e-6
-        )
+        away = np.linalg.norm((tool_pose(found.robot, row) - there)[:3, 3])
+        assert target["uncorrected"]["position"] == pytest.approx(away, rel=1e-6)
 
 
 @pytest.mark.slow

@@ -43,10 +43,8 @@ def test_configurations_in_their_units_get_a_row_each(result, fg_calib, tmp_path
     ended = fg_calib("predict", result, "--at", tmp_path / "program.csv", "--angle", "deg", "--out", out, "--json")
     assert ended.code == 0, ended.err
     document = json.loads(ended.out)
-    assert (document["schema"], document["at"], document["n"], document["counts"]) == (
-        *("fg-calib/predict/1", "configurations", 3),
-        "base",
-    )
+    given = tuple(document[key] for key in ("schema", "at", "n", "counts"))
+    assert given == ("fg-calib/predict/1", "configurations", 3, "base")
     poses = found.predict(q)
     for k, one in enumerate(document["configurations"]):
         assert one["readings"] == pytest.approx(q[k], rel=1e-12)
@@ -54,9 +52,8 @@ def test_configurations_in_their_units_get_a_row_each(result, fg_calib, tmp_path
         assert one["base"]["orientation"] == pytest.approx(np.linalg.norm(poses.sigma_rotation[k]), rel=1e-9)
     written = pl.read_csv(out / "predict.csv")
     assert written["id"].to_list() == ["a", "b", "b"]
-    assert written["base_position_mm"].to_list() == pytest.approx(
-        [1e3 * one["base"]["position"] for one in document["configurations"]], rel=1e-12
-    )
+    in_mm = [1e3 * one["base"]["position"] for one in document["configurations"]]
+    assert written["base_position_mm"].to_list() == pytest.approx(in_mm, rel=1e-12)
     assert written.select("x", "y", "z").to_numpy() == pytest.approx(poses.position, abs=1e-12)
     assert sorted(file.name for file in out.iterdir()) == ["predict.csv", "predict.json"]
     assert json.loads((out / "predict.json").read_text())["n"] == 3

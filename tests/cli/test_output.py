@@ -127,9 +127,8 @@ def test_a_report_that_nobody_takes_loses_no_result(example, command, stdout):
         os.close(end)
     else:
         sink = os.open(stdout, os.O_WRONLY)
-    code, _, err = run(
-        [command, job, "--out", example / "out"], stdout=sink, stderr=subprocess.PIPE, capture_output=False
-    )
+    streams = {"stdout": sink, "stderr": subprocess.PIPE, "capture_output": False}
+    code, _, err = run([command, job, "--out", example / "out"], **streams)
     os.close(sink)
     full = "error: the output cannot be written: No space left on device\n"
     assert (code, err) == ((1, full) if stdout == "/dev/full" else (1, ""))

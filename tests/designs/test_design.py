@@ -141,9 +141,8 @@ def test_rows_of_a_job_are_chosen_among_themselves():
 
 
 def test_the_tool_is_planned_beside_targets_and_boxes_stay_free():
-    job = job_of(
-        Instrument(model="position", name="it", targets={"t": Spot([0.1, 0, 0.1])}, tool_too=True), RandomReadings(30)
-    )
+    tracker = Instrument(model="position", name="it", targets={"t": Spot([0.1, 0, 0.1])}, tool_too=True)
+    job = job_of(tracker, RandomReadings(30))
     box = np.array([[0.3, -99.0, -99.0], [99.0, 99.0, 99.0]])
     plan = design(replace(job, keep_out=(box,)), n=4, n_candidates=40)
     assert plan.tables[0].measurements.labels["target"].index.tolist() == [-1, 0] * 4  # -1: the tool

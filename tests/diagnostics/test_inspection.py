@@ -162,9 +162,8 @@ def test_copies_of_rows_are_distinguished_from_repeats(arm):
     again = replace(again, ids=np.arange(51).astype(str), test=np.append(m.test, False))
     found = inspected(arm, again)
     (caution,) = found.cautions
-    assert caution.startswith(
-        "measurements: rows that are exact copies of others: 1 (3 and 50); each counts as one more"
-    )
+    copies = "rows that are exact copies of others: 1 (3 and 50); each counts as one more"
+    assert caution.startswith(f"measurements: {copies}")
     assert (found.tables[0].n_copies, found.tables[0].n_repeats) == (1, 0)
     repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
     assert said(repeated) == ()

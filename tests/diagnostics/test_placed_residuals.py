@@ -50,9 +50,7 @@ CASES = [
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("instrument", "mistake", "spoil"), CASES, ids=[f"{case[0]}: {case[1][:20]}" for case in CASES]
-)
+@pytest.mark.parametrize(("instrument", "mistake", "spoil"), CASES, ids=[f"{of}: {what[:20]}" for of, what, _ in CASES])
 def test_a_mistake_in_an_instruments_table_is_named(instrument, mistake, spoil):
     robot, _, table = measured_by(instrument, np.random.default_rng(1))
     assert mistake in str(check(robot, table, **spoil(table.measurements)))

@@ -73,9 +73,8 @@ def test_another_tool_is_said_of_the_tables_that_disagree(tmp_path):
     values = true.nominal
     values[[true.index(f"tool.{k}") for k in "xyz"]] += [0.06, -0.02, 0.03]
     arms = {"one.csv": true, "other.csv": true.with_values(values)}
-    found = said(
-        robot, [Table(replace(tracker(arm, rng), source=name), "position") for name, arm in arms.items()], (0, 1)
-    )
+    tables = [Table(replace(tracker(arm, rng), source=name), "position") for name, arm in arms.items()]
+    found = said(robot, tables, (0, 1))
     assert {text.partition(":")[0] for text in found} == set(arms)
     assert all(text.endswith(f" if {OTHER_TOOL}") for text in found)
 

@@ -31,9 +31,7 @@ EFFECTS = {
 }
 """What moves the tool of the 6R arm by 2 to 4 sigma."""
 
-CAUSES = dict(
-    zip(EFFECTS, ("q2 yields to gravity", "q2 errs with the reach", "q3 errs with its position"), strict=False)
-)
+CAUSES = {"gravity": "q2 yields to gravity", "reach": "q2 errs with the reach", "gain": "q3 errs with its position"}
 
 
 @pytest.mark.sampled(2)

@@ -209,18 +209,12 @@ def test_ur_descriptions_urdf_has_the_tool_poses_with_the_file(convention, ur_ur
 
 def test_tesseracts_origins_put_into_the_urdf_give_the_tool_poses(arm, tmp_path):
     joints = yaml.safe_load(export(arm, "tesseract").text)["calibration"]["joints"]
-    origins = {
-        name: matrix(
-            Rotation.from_quat([of["orientation"][k] for k in "xyzw"]).as_matrix(), [of["position"][k] for k in "xyz"]
-        )
-        for name, of in joints.items()
-    }
-    nominal = (
-        export(off(arm, 0.1, frames=True), "urdf")
-        if arm.urdf is None
-        else export(arm.with_values(0 * arm.nominal), "urdf")
-    )
-    nominal.write(tmp_path / "nominal.urdf")
+    origins = {}
+    for name, of in joints.items():
+        R = Rotation.from_quat([of["orientation"][k] for k in "xyzw"]).as_matrix()
+        origins[name] = matrix(R, [of["position"][k] for k in "xyz"])
+    nominal = off(arm, 0.1, frames=True) if arm.urdf is None else arm.with_values(0 * arm.nominal)
+    export(nominal, "urdf").write(tmp_path / "nominal.urdf")
     q = drawn(arm, 10, 5)
     base, tip, before, behind = ends(arm)
     found = before @ yourdfpy_poses(tmp_path / "nominal.urdf", base, tip, names(arm), q, origins) @ behind

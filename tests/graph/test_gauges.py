@@ -116,9 +116,8 @@ def test_rows_say_the_same_by_the_columns_of_parameters_that_were_left_out(loss)
     distance = np.linalg.norm(p[:40] - p[40:], axis=1) + 1e-4 * rng.normal(size=40)
     distance[0] = 0.0  # one point, reached twice: three rows, of which the loss takes more
     pairs = {"a": np.arange(40), "b": np.arange(40, 80), "distance": distance, "sigma_distance": 1e-4}
-    solution = solve(
-        build_problem(robot, Measurements.from_arrays(q, pairs=pairs), model="distance", gauge="keep", loss=loss)
-    )
+    m = Measurements.from_arrays(q, pairs=pairs)
+    solution = solve(build_problem(robot, m, model="distance", gauge="keep", loss=loss))
     problem, x = solution.problem, solution.parameters
     wide = problem.whole.variables
     of_all = replace(problem, variables=wide).linearize(x, with_loss=True).left.A

@@ -21,10 +21,8 @@ from fg_calib.statistics.residual_table import residual_table
 RIGID = ("a1", "alpha1", "d1", "theta1")
 """Parameters of the small arm that move it as one body."""
 
-INSTRUMENTS = [
-    *("targets", "targets known", "targets stations", "anchors", "anchors offset", "anchors known"),
-    *("planes", "board", "pixels", "room"),
-]
+INSTRUMENTS = ["targets", "targets known", "targets stations", "anchors", "anchors offset", "anchors known"]
+INSTRUMENTS += ["planes", "board", "pixels", "room"]
 
 
 def case(seed=0, *, n_points=4, n_each=12, tolerance=TOLERANCE, sigma=SIGMA, distances=((0, 1, 1e-4),), **more):
@@ -264,13 +262,10 @@ def test_what_an_instruments_model_lacks_is_named():
     ):
         assert refused(robot, Table(m, model)).startswith(f"measurements: {lacks}")
     names = np.array(m.labels["anchor"].names)[m.labels["anchor"].index]
-    test = m.labels["anchor"].index == 1
-    data = Measurements.from_arrays(
-        m.readings, anchor=names, distance=m.value("distance"), sigma_distance=1e-4, test=test
-    )
-    assert "anchor a1 has test rows alone, expected train rows too, or its place as" in refused(
-        robot, Table(data, "anchor")
-    )
+    given = {"anchor": names, "distance": m.value("distance"), "test": m.labels["anchor"].index == 1}
+    data = Measurements.from_arrays(m.readings, sigma_distance=1e-4, **given)
+    said = "anchor a1 has test rows alone, expected train rows too, or its place as"
+    assert said in refused(robot, Table(data, "anchor"))
     known = {"a1": KnownPoint([1.0, 2.0, 3.0])}
     assert solve(build_problem(robot, Table(data, "anchor", known=known))).converged
     last = np.arange(40) >= 34
@@ -327,9 +322,6 @@ def test_a_station_without_rows_has_no_frame_and_pairs_are_of_one_station():
     first = m.select(np.flatnonzero(m.labels["station"].index == 0))
     both, alone = (build_problem(robot, replace(table, measurements=x)) for x in (m, first))
     of_pairs = build_problem(robot, replace(m, labels={"station": m.labels["station"]}), model="distance")
-    assert {t.measurements.source for t in of_pairs.data.tables} == {
-        "measurements, station s0",
-        "measurements, station s1",
-    }
+    assert {t.measurements.source for t in of_pairs.data.tables} == {f"measurements, station s{k}" for k in (0, 1)}
     assert [t.measurements.source for t in alone.data.tables] == ["measurements, station s0"]
     assert len(both.variables.frames) - len(alone.variables.frames) == 1

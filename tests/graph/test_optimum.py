@@ -187,9 +187,7 @@ def check_system(problem, x):
     assert np.linalg.matrix_rank(A / np.maximum(np.linalg.norm(A, axis=0), 1e-300), 1e-9) == root.shape[1]
     off = root.T @ (A.T @ r)  # the step in sigma, to where the rows have their optimum
     assert np.linalg.norm(off) == pytest.approx(system.decrement, rel=1e-6, abs=1e-6)
-    assert np.abs(system.step + root @ off)[:n] / np.sqrt(np.diag(system.covariance) + 1e-300) == pytest.approx(
-        0.0, abs=1e-6
-    )
+    assert np.max(np.abs(system.step + root @ off)[:n] / np.sqrt(np.diag(system.covariance) + 1e-300)) < 1e-6
     return system
 
 
@@ -213,9 +211,8 @@ def test_rows_optimum_and_covariance_are_those_of_dense_formulas(name):
                  problem.start)  # fmt: skip
 
 
-GRAPHS = [
-    name for name in CASES if not any(word in name for word in ("gauge", "equal", "pixels", "room", "positions and"))
-]
+NONE = ("gauge", "equal", "pixels", "room", "positions and")
+GRAPHS = [name for name in CASES if not any(word in name for word in NONE)]
 FEW = {
     *("poses, frame, tool, joint noise", "star, joint noise", "direct tree, joint noise", "touches", "gnc of a star"),
     *("anchors nearly, joint noise", "joint values of two tables", "all pairs as if independent"),
@@ -230,9 +227,8 @@ def test_the_graph_has_one_factor_a_measurement_and_the_same_optimum_and_margina
     graph, variables = problem.graph, problem.variables
     factors = [graph.at(i) for i in range(graph.size())]
     for kind, of in ((DistanceFactor, "distance"), (RotationAngleFactor, "angle")):
-        wanted = sum(
-            int(s.used[s.train, s.kind.names.index(of)].sum()) for s in problem.pair_blocks if of in s.kind.names
-        )
+        blocks = [s for s in problem.pair_blocks if of in s.kind.names]
+        wanted = sum(s.used[s.train, s.kind.names.index(of)].sum() for s in blocks)
         assert sum(isinstance(factor, kind) for factor in factors) == wanted
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setLinearSolverType("MULTIFRONTAL_QR")

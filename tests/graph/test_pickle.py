@@ -43,9 +43,7 @@ def through_pickle(thing):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    ("name", "again"), [*((name, through_pickle) for name in CASES), ("kept parameters", copy.deepcopy)]
-)
+@pytest.mark.parametrize(("name", "again"), [*((c, through_pickle) for c in CASES), ("kept parameters", copy.deepcopy)])
 def test_nothing_changes_on_the_way(name, again):
     given = problem(name)
     found = solve(given)

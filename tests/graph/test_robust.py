@@ -122,9 +122,8 @@ def test_weights_are_those_of_the_residuals_at_the_estimate(loss, model, encoder
         assessed = assess(solution)
         of_priors = solution.weighted_cost - 0.5 * np.sum((found * e**2)[train])
         if model == "pose":  # pairs share errors
-            assert solution.objective == pytest.approx(
-                of_priors + np.sum(cost(loss, e[train], tuning(loss, h))), rel=1e-6
-            )
+            of_rows = np.sum(cost(loss, e[train], tuning(loss, h)))
+            assert solution.objective == pytest.approx(of_priors + of_rows, rel=1e-6)
             assert solution.cost == pytest.approx(of_priors + 0.5 * np.sum(e[train] ** 2), rel=1e-6)
             kept, fit = train[found[train] >= 0.5], assessed.fit.chi_square  # outliers are not in chi-square
             assert fit.dof == h * len(kept)  # as many parameters as priors

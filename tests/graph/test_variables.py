@@ -106,9 +106,8 @@ def test_named_scalars_of_poses_follow_their_tangents_and_the_other_way_round():
         return variables.step(x, y)
 
     assert variables.tangent_derivative(x) == pytest.approx(central_differences(step_to, still), abs=1e-8)
-    assert np.isnan(
-        build_variables(pitched("tool", 90.0), [False]).named_derivative(pitched("tool", 90.0).nominal)
-    ).any()
+    singular = pitched("tool", 90.0)
+    assert np.isnan(build_variables(singular, [False]).named_derivative(singular.nominal)).any()
     # All six of the tool by the columns of five: the sixth is not estimated.
     some = build_variables(small_arm(estimate=[*TOOL[:5], *BASE]), [True])
     wide = variables.columns_of(some, x)
@@ -122,9 +121,8 @@ def test_named_scalars_of_poses_follow_their_tangents_and_the_other_way_round():
 @pytest.mark.parametrize("frame", ["tool", "base"])
 @pytest.mark.parametrize("pitch", [90.0, 20.0])
 def test_priors_pull_to_nominal_along_axes_and_about_a_frames_own_axes(frame, pitch):
-    tolerance = {"a": 2e-3} | {
-        f"{frame}.{k}": t for k, t in zip(("roll", "pitch", "yaw", "y"), (1e-3, 2e-3, 4e-3, 5e-3), strict=True)
-    }
+    of_frame = {"roll": 1e-3, "pitch": 2e-3, "yaw": 4e-3, "y": 5e-3}
+    tolerance = {"a": 2e-3} | {f"{frame}.{k}": t for k, t in of_frame.items()}
     variables = build_variables(pitched(frame, pitch, tolerance), [True])
     indices, x = indices_of(variables.robot, frame), variables.nominal()
     first = 0 if frame == "base" else 4  # the frame's four priors come before or after those of a1 ... a4
@@ -138,10 +136,9 @@ def test_priors_pull_to_nominal_along_axes_and_about_a_frames_own_axes(frame, pi
     expected = np.zeros(8)
     expected[[first, 5 - first]] = 2.0
     assert prior_rows(variables, x)[0] == pytest.approx(expected, abs=1e-9)
-    away = variables.moved(variables.nominal(), 0.5 * np.random.default_rng(1).normal(size=variables.n_columns))
-    numeric = central_differences(
-        lambda s: prior_rows(variables, variables.moved(away, s))[0], np.zeros(variables.n_columns)
-    )
+    n = variables.n_columns
+    away = variables.moved(variables.nominal(), 0.5 * np.random.default_rng(1).normal(size=n))
+    numeric = central_differences(lambda s: prior_rows(variables, variables.moved(away, s))[0], np.zeros(n))
     assert prior_rows(variables, away)[1] == pytest.approx(numeric, abs=1e-6 * np.abs(numeric).max())
 
 

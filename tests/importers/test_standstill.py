@@ -19,9 +19,8 @@ def nees(stops, motion):
     """Mean squared error over its variance, of positions and orientations."""
     k = [int(name[4:]) - 1 for name in stops.ids]
     off = (stops.means["position"] - motion.true_position[k]) / stops.sigmas["position"]
-    turned = Rotation.from_matrix(stops.means["orientation"].copy()).inv() * Rotation.from_matrix(
-        motion.true_rotation[k]
-    )
+    true = Rotation.from_matrix(motion.true_rotation[k])
+    turned = Rotation.from_matrix(stops.means["orientation"].copy()).inv() * true
     return np.mean(off**2), np.mean((turned.as_rotvec() / stops.sigmas["orientation"]) ** 2)
 
 
@@ -63,9 +62,8 @@ def test_of_motions_that_repeat_themselves_the_offset_nearest_to_receipt_is_take
     joints, poses = once.streams()
     period, many = once.joint_time[-1] + 1.0, 6
     time, pose_time = (np.concatenate([t + k * period for k in range(many)]) for t in (joints.time, poses.time))
-    readings, position, rotation = (
-        np.concatenate([x] * many) for x in (joints.readings, poses.position, poses.rotation)
-    )
+    repeated = (joints.readings, poses.position, poses.rotation)
+    readings, position, rotation = (np.concatenate([x] * many) for x in repeated)
     source = Source("/pose", "", lag=-(0.137 + turns * period))
     shifted = PoseStream(pose_time + turns * period, position, rotation, source)
     found = average_stops(JointStream(time, readings, joints.source), shifted, arm()).offset
@@ -75,9 +73,8 @@ def test_of_motions_that_repeat_themselves_the_offset_nearest_to_receipt_is_take
 def test_poses_of_something_else_are_refused():
     joints, _ = record(6).streams()
     _, poses = record(7, move=2.0).streams()
-    with pytest.raises(
-        InputError, match=r"the poses do not move as the joints do \(correlation .*\), expected poses of"
-    ):
+    said = r"the poses do not move as the joints do \(correlation .*\), expected poses of"
+    with pytest.raises(InputError, match=said):
         average_stops(joints, poses, arm())
     with pytest.raises(InputError, match=r"no standstill of 2 s, expected the arm at rest.*; the longest pause is"):
         averaged(record(11, rest=0.6), still=2.0)
@@ -119,9 +116,8 @@ def test_sigmas_of_orientations_are_about_the_tools_axes_and_of_positions_along_
     generator = np.random.default_rng(0)
     off, turn = generator.standard_normal((2, len(poses.time), 3)) * [[[1e-4, 1e-3, 1e-4]], [[1e-3, 1e-4, 1e-4]]]
     rotation = Rotation.from_matrix(poses.rotation.copy()) * Rotation.from_rotvec(turn)
-    stops = average_stops(
-        joints, PoseStream(poses.time, poses.position + off, rotation.as_matrix(), poses.source), arm()
-    )
+    noisy = PoseStream(poses.time, poses.position + off, rotation.as_matrix(), poses.source)
+    stops = average_stops(joints, noisy, arm())
     position, orientation = (np.median(stops.sigmas[kind], axis=0) for kind in ("position", "orientation"))
     assert position / position[0] == pytest.approx([1, 10, 1], rel=0.2)
     assert orientation / orientation[1] == pytest.approx([10, 1, 1], rel=0.2)

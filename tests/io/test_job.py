@@ -69,9 +69,8 @@ def test_a_short_job_has_the_defaults(folder):
     assert job.measurements.position[1].tolist() == [1000, 0, 0]
     assert job.options == Options("pose")
     assert job.measurements.sigma_position is None
-    assert job.inputs == {
-        name: sha256(folder / name) for name in ("calibration.yaml", "robots/robot.yaml", "poses.csv")
-    }
+    names = ("calibration.yaml", "robots/robot.yaml", "poses.csv")
+    assert job.inputs == {name: sha256(folder / name) for name in names}
 
 
 def test_a_full_job_is_converted_to_si(folder):

@@ -61,9 +61,8 @@ def test_a_loaded_result_has_the_same_document_and_prints_the_same(calibrations,
 
 def test_frames_and_combinations_have_the_promised_names(calibrations):
     document = calibrations["poses in an unknown frame"].result.document()
-    assert all(
-        one.keys() >= {"parameters", "lost", "relations", "keep"} for one in document["observability"]["relative"]
-    )
+    promised = {"parameters", "lost", "relations", "keep"}
+    assert all(one.keys() >= promised for one in document["observability"]["relative"])
     assert document["frame_estimate"].keys() == {"xyz", "quaternion_xyzw", "sigma"}
 
 

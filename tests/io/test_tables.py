@@ -69,9 +69,8 @@ def test_poses_and_configurations_are_read_in_order(write):
 
 
 def test_units_are_converted_to_si(write):
-    path = write(
-        "q1,q2,q3,x,y,z,roll,pitch,yaw,sigma_position,sigma_rx,sigma_ry,sigma_rz\n90,-90,250,1,2,3,10,20,30,5,1,2,3\n"
-    )
+    header = "q1,q2,q3,x,y,z,roll,pitch,yaw,sigma_position,sigma_rx,sigma_ry,sigma_rz"
+    path = write(f"{header}\n90,-90,250,1,2,3,10,20,30,5,1,2,3\n")
     m = read_measurements(path, ARM, units=Units(length="mm", angle="deg"))
     assert m.readings[0] == pytest.approx([math.pi / 2, -math.pi / 2, 0.25])
     assert m.position[0] == pytest.approx([1e-3, 2e-3, 3e-3])
@@ -99,11 +98,9 @@ def test_columns_may_bear_the_joints_names_in_any_order(write):
     assert m.readings.tolist() == [[2, 1]]
     m = read_measurements(write("q2,q1\n1,2\n"), robot)
     assert m.readings.tolist() == [[2, 1]]
-    with pytest.raises(InputError) as caught:
+    said = "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are x, y"
+    with pytest.raises(InputError, match=f"^{said}$"):
         read_measurements(write("x,y\n1,2\n"), arm(Joint("x"), Joint("y")))  # x and y are the tool's position
-    assert str(caught.value) == (
-        "poses.csv: no joint columns, expected q1 to q2 for the robot's 2 joints; the columns are x, y"
-    )
 
 
 @pytest.mark.parametrize("ends", ["\n\n\n", "\r\n\n", "\n\r\n", "\n\n\r", "\r\r\n", "\r\r\r"], ids=repr)
@@ -146,10 +143,8 @@ def test_columns_have_names_of_their_own_and_figures_their_scale(write):
     np.testing.assert_allclose(found.readings, [[0.5, 0.2, 0.1], [0.0, 0.3, 0.2]], rtol=0, atol=exact)
     assert found.position.tolist() == [[-18.0, 2.0, 3.0], [-16.0, 5.0, 6.0]]
     table = {"J1 [counts]": [33268, 32768], "A2": [0.2, 0.3], "lift axis": [0.1, 0.2]}
-    assert (
-        read_measurements(write(table, "poses.parquet"), ARM, columns=OWN).readings.tolist() == found.readings.tolist()
-    )
-    assert read_measurements(table, ARM, columns=OWN).readings.tolist() == found.readings.tolist()
+    for source in (write(table, "poses.parquet"), table):
+        assert read_measurements(source, ARM, columns=OWN).readings.tolist() == found.readings.tolist()
 
 
 def test_columns_of_no_use_and_rows_that_take_no_part_are_reported(write, caplog):
@@ -169,9 +164,8 @@ def test_parquet_and_csv_read_the_same(write):
     for name in ("readings", "ids", "test", "position", "rotation"):
         assert np.array_equal(getattr(csv, name), getattr(parquet, name)), name
     for name in ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "test"):
-        assert np.array_equal(getattr(csv.pairs, name), getattr(parquet.pairs, name), equal_nan=name[:4] != "test"), (
-            name
-        )
+        a, b = (getattr(pairs, name) for pairs in (csv.pairs, parquet.pairs))
+        assert np.array_equal(a, b, equal_nan=name != "test"), name
 
 
 def test_pairs_name_configurations_by_id(write):

@@ -52,9 +52,8 @@ class Pandas:
 
     def __init__(self, columns):
         empty = {"group": self.NAType(), "angle": float("nan")}
-        self._columns = {
-            k: [empty.get(k) if v is None else v for v in np.asarray(c).tolist()] for k, c in columns.items()
-        }
+        cells = {name: np.asarray(column).tolist() for name, column in columns.items()}
+        self._columns = {k: [empty.get(k) if v is None else v for v in column] for k, column in cells.items()}
         self.columns = list(columns)
 
     def to_dict(self, orient):

@@ -52,9 +52,8 @@ def test_a_row_without_weight_adds_nothing():
     block, chain = random_pairs(40, np.random.default_rng(17))
     whitening = block.whitening.copy()
     whitening[7:, :] = 0.0
-    short = replace(
-        block, ends=block.ends[:7], data=block.data[:7], whitening=whitening[:7], nuisances=np.zeros((7, 0))
-    )
+    seven = {"ends": block.ends[:7], "data": block.data[:7], "nuisances": np.zeros((7, 0))}
+    short = replace(block, whitening=whitening[:7], **seven)
     long = replace(block, whitening=whitening)
     with_rows, without = (residuals.triangle(each, chain) for each in (long, short))
     assert with_rows.T @ with_rows == pytest.approx(without.T @ without, abs=rounding(np.abs(without).max() ** 2, 10))

@@ -165,10 +165,8 @@ def test_many_pairs_of_few_configurations_are_judged_without_a_suspect_each():
 def test_noise_that_is_larger_than_specified_is_no_drift(known, factor):
     calibration, true, _ = known
     rows = measured(true, 30, np.random.default_rng(6), sigma=(factor * SIGMA[0], factor * SIGMA[1]))
-    specified = replace(
-        rows, sigma_position=rows.sigma_position / factor, sigma_orientation=rows.sigma_orientation / factor
-    )
-    found = calibration.check(specified)
+    smaller = {name: getattr(rows, name) / factor for name in ("sigma_position", "sigma_orientation")}
+    found = calibration.check(replace(rows, **smaller))
     assert found.explanations == ()
     assert found.verdict == ("fail" if factor > 2 else "pass")
     assert any("noise" in line or "times as large" in line for line in (*found.reasons, *found.cautions))

@@ -79,11 +79,8 @@ def test_targets_stay_known_although_a_month_does_not_see_them():
     rng = np.random.default_rng(4)
     robot = arm()
     true, spots = true_robot(robot, rng), {"a": [0.03, 0.08, 0.02], "b": [0.1, -0.02, 0.05]}
-    tables = [
-        seen(true, spots, rng, 40, "x"),
-        seen(true, {"a": spots["a"]}, rng, 10, "y"),
-        seen(true, {"b": spots["b"]}, rng, 10, "z"),
-    ]
+    some = ((("a", "b"), 40, "x"), (("a",), 10, "y"), (("b",), 10, "z"))
+    tables = [seen(true, {name: spots[name] for name in names}, rng, n, ids) for names, n, ids in some]
     updated = calibrate(robot, tables[0]).update(tables[1]).update(tables[2])
     batch = calibrate(robot, tables)
     off, of_sigma = difference(updated, batch)
@@ -121,9 +118,8 @@ def test_anchors_are_those_of_before_only_where_that_is_said():
     calibration = calibrate(robot, old)
     off, of_sigma = difference(calibration.update(new, anchors_stay=True), calibrate(robot, [old, new]))
     assert max(off, of_sigma) < 1e-5
-    others = replace(
-        new.measurements, labels={"anchor": Labels(("d", "e", "f"), new.measurements.labels["anchor"].index)}
-    )
+    labels = {"anchor": Labels(("d", "e", "f"), new.measurements.labels["anchor"].index)}
+    others = replace(new.measurements, labels=labels)
     off, of_sigma = difference(calibration.update(new), calibrate(robot, [old, replace(new, measurements=others)]))
     assert max(off, of_sigma) < 1e-5
 

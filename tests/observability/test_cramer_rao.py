@@ -53,9 +53,8 @@ def test_what_is_held_but_wrong_adds_what_the_kept_do_not_make_up_for():
     bound = cramer_rao(robot, stretched, model="position", prior=False, kept=["a1"])
     seen, folded = stretched.readings, stretched.readings + np.array([0.0, np.pi])
     assert bound.position(seen) == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 10), abs=0)
-    assert bound.position(folded) == pytest.approx(
-        np.sqrt(SIGMA**2 / N + 4.0 * TOLERANCE**2), rel=rounding(1, 10), abs=0
-    )
+    expected = np.sqrt(SIGMA**2 / N + 4.0 * TOLERANCE**2)
+    assert bound.position(folded) == pytest.approx(expected, rel=rounding(1, 10), abs=0)
     assert bound.position(folded, claimed=True) == pytest.approx(SIGMA / np.sqrt(N), rel=rounding(1, 10), abs=0)
     assert bound.rank == cramer_rao(robot, stretched, model="position", prior=False).rank == 1
 

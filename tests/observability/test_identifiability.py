@@ -21,9 +21,8 @@ def mdh_robot(name, a, alpha, d, tool=None, prismatic=(), theta=None):
 def generic(tool=None):
     rng = np.random.default_rng(0)
     alpha = rng.uniform(0.3, 1.2, 7) * rng.choice([-1, 1], 7)
-    return mdh_robot(
-        "generic", rng.uniform(0.2, 0.8, 7), alpha, rng.uniform(0.2, 0.8, 7), tool, theta=rng.uniform(-2, 2, 7)
-    )
+    a, d = rng.uniform(0.2, 0.8, (2, 7))
+    return mdh_robot("generic", a, alpha, d, tool, theta=rng.uniform(-2, 2, 7))
 
 
 def ur10(tool=None):
@@ -65,11 +64,13 @@ def reasons(robot, model, **options):
     return {tuple(sorted(lost.relation)): lost.reason for lost in found.lost}
 
 
+BLIND = "the measurement is blind to the base: the whole arm moves as one body"
+
+
 def test_reasons_of_the_papers_robot():
-    base = "the measurement is blind to the base: the whole arm moves as one body"
     on_axis = "the tool point lies on the last axis: "
     found = reasons(paper_robot(), "distance-rotation")
-    assert {found[(name,)] for name in ("a1", "alpha1", "d1", "theta1")} == {base}
+    assert {found[(name,)] for name in ("a1", "alpha1", "d1", "theta1")} == {BLIND}
     assert all(found[(name,)].startswith(on_axis) for name in ("beta6", "theta7", "beta7"))
     assert found[("beta1", "theta2")] == found[("beta5", "theta6")] == "only their sum turns about the same axis"
     assert found[("d3", "d4")] == "parallel axes 3, 4: only the sum of the shifts along them acts"
@@ -81,15 +82,13 @@ def test_reasons_of_the_papers_robot():
 
 
 def test_an_off_axis_tool_leaves_only_the_base():
-    assert set(reasons(generic(OFF_AXIS), "distance").values()) == {
-        "the measurement is blind to the base: the whole arm moves as one body"
-    }
+    assert set(reasons(generic(OFF_AXIS), "distance").values()) == {BLIND}
     assert "last axis" not in " ".join(reasons(ur10(OFF_AXIS), "distance").values())
 
 
 def test_an_unknown_frame_hides_the_base_from_poses():
     found = reasons(paper_robot(), "pose", frame="unknown")
-    assert found[("d1",)] == "the measurement is blind to the base: the whole arm moves as one body"
+    assert found[("d1",)] == BLIND
     assert ("beta6", "theta7") in found  # the tool's own frame is seen
 
 

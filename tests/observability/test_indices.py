@@ -74,10 +74,8 @@ def test_what_kept_members_stand_for_undoes_every_relation():
     sum_of_three = RelativeGroup(("d3", "d4", "d5"), ({"d3": 1.0, "d4": -1.0}, {"d4": 1.0, "d5": -1.0}), ("d5",))
     assert sum_of_three.combinations(["d5"]) == {"d5": {"d5": 1.0, "d3": 1.0, "d4": 1.0}}
     chain = RelativeGroup(("a1", "theta1", "alpha1"), ({"a1": 0.5, "theta1": -1.0, "alpha1": 0.25},), ())
-    assert chain.combinations(["a1", "alpha1"]) == {
-        "a1": {"a1": 1.0, "theta1": 0.5},
-        "alpha1": {"alpha1": 1.0, "theta1": 0.25},
-    }
+    expected = {"a1": {"a1": 1.0, "theta1": 0.5}, "alpha1": {"alpha1": 1.0, "theta1": 0.25}}
+    assert chain.combinations(["a1", "alpha1"]) == expected
 
 
 @pytest.mark.parametrize("model", ["pose", "distance-rotation"])
@@ -85,9 +83,8 @@ def test_classes_do_not_depend_on_tolerances(model):
     """What is determined is a matter of the data: a tight tolerance loses none, a ratio of 1e6 groups none."""
     rng = np.random.default_rng(3)
     measurements = measure(paper_robot(), 80, rng)
-    wild = {
-        f"{kind}{i}": 1e-3 * 10.0 ** rng.uniform(-4, 4) for kind in ("a", "d", "theta", "beta") for i in range(1, 8)
-    }
+    names = [f"{kind}{i}" for kind in ("a", "d", "theta", "beta") for i in range(1, 8)]
+    wild = {name: 1e-3 * 10.0 ** rng.uniform(-4, 4) for name in names}
     found = []
     for tolerance in (None, wild):
         problem = build_problem(paper_robot(tolerance=tolerance), measurements, model=model)

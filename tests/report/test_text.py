@@ -20,10 +20,7 @@ def planar_measurements(n_test=2) -> Measurements:
     """Positions by hand of an arm with links of 2.003 m and 0.998 m, each coordinate off by 1 mm to and fro."""
     q = np.deg2rad([[0, 0], [0, 90], [90, 90], [45, -90], [-30, 60], [120, -45], [10, 30], [-80, -20]])
     first, second = q[:, 0], q[:, 0] + q[:, 1]
-    position = np.stack(
-        [2.003 * np.cos(first) + 0.998 * np.cos(second), 2.003 * np.sin(first) + 0.998 * np.sin(second)]
-    )
-    position = np.vstack([position, np.zeros(8)]).T
+    position = np.array([2.003 * f(first) + 0.998 * f(second) for f in (np.cos, np.sin, np.zeros_like)]).T
     position[:, :2] += 1e-3 * np.array([[1, -1], [-1, 1], [1, 1], [-1, -1], [1, -1], [-1, 1], [1, 1], [-1, -1]])
     return Measurements.from_arrays(q, position=position, sigma_position=1e-3, test=np.arange(8) >= 8 - n_test)
 
@@ -144,17 +141,15 @@ def test_doubt_stands_first():
 
 def test_names_in_brackets_are_text():
     m = replace(planar_measurements(), ids=np.array([f"[red]{i}" for i in range(8)]))
-    assert "[red]0" in report(
-        planar_arm({"d2": 0.001}), replace(m, position=plus(m.position, [0], 0.05)), model="position"
-    )
+    wrong = replace(m, position=plus(m.position, [0], 0.05))
+    assert "[red]0" in report(planar_arm({"d2": 0.001}), wrong, model="position")
 
 
 def test_a_wrong_pose_of_pairs_is_the_first_suspicious_configuration():
     robot, rng = small_arm({"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}), np.random.default_rng(8)
     m = measure(true_robot(robot, rng), 12, rng)
-    m = replace(
-        m, position=plus(m.position, [7], 0.02 * np.array([1.0, -1.0, 1.0])), ids=np.array([f"p{i}" for i in range(12)])
-    )
+    position = plus(m.position, [7], 0.02 * np.array([1.0, -1.0, 1.0]))
+    m = replace(m, position=position, ids=np.array([f"p{i}" for i in range(12)]))
     found = sections(report(robot, m, model="distance", pairing=Pairing("all")))
     assert found["Suspicious configurations"].splitlines()[1].split()[:2] == ["p7", "11"]
     assert "p7" in found["Suspicious rows"].splitlines()[1].split()[:2]

@@ -79,9 +79,8 @@ def test_tangent_columns_are_small_motions_of_tool_base_and_measurement_frame_in
     robot = random_robot("mdh", 3, rng)
     q = rng.uniform(-3, 3, (1, 3))
     world_T_base = np.array([0.3, -2.0, 1.0, 2.5, 0.4, -1.0])  # x y z yaw pitch roll
-    chain = build_chain(robot, tool_tangent=0, frame_tangent=6, base_tangent=12, frame=True).at(
-        np.concatenate([robot.nominal, world_T_base])
-    )
+    chain = build_chain(robot, tool_tangent=0, frame_tangent=6, base_tangent=12, frame=True)
+    chain = chain.at(np.concatenate([robot.nominal, world_T_base]))
     values = dict(zip([p.name for p in robot.parameters], robot.nominal, strict=True))
     base = frame(*(values[f"base.{k}"] for k in ("x", "y", "z", "roll", "pitch", "yaw")))
     poses = forward(chain, robot.trig(q))

@@ -96,9 +96,8 @@ def test_a_robot_of_a_urdf(tmp_path):
         '<robot name="arm"><link name="a"/><link name="b"/><joint name="j" type="revolute"><parent link="a"/>'
         '<child link="b"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
     )
-    assert Robot.from_urdf(tmp_path / "arm.urdf", estimate=["tool.x"]) == read_urdf(
-        tmp_path / "arm.urdf", estimate=["tool.x"]
-    )
+    of_class, of_reader = (read(tmp_path / "arm.urdf", estimate=["tool.x"]) for read in (Robot.from_urdf, read_urdf))
+    assert of_class == of_reader
 
 
 def test_a_robot_of_many_joints_fits_a_screen():
@@ -134,13 +133,9 @@ def test_values_are_finite_and_one_a_parameter(values, message):
 def test_an_arm_reaches_as_far_as_its_lengths_and_what_slides_go(limits, slide):
     """From its base, wherever that stands; what slides is 0.1 m long at 0."""
     rows = [[-0.3, 1.0, 0.2, 0.5], [0.0, 1.0, 0.1, 0.5]]
-    settings = {
-        "types": ["revolute", "prismatic"],
-        "limits": [[-1.0, 2.0], limits],
-        "base": [0, 0, 5],
-        "tool": [0, 0, -0.7],
-    }
-    assert Robot.from_dh(rows, **settings).reach == pytest.approx(0.3 + 0.2 + slide + 0.7)
+    more = {"types": ["revolute", "prismatic"], "limits": [[-1.0, 2.0], limits]}
+    robot = Robot.from_dh(rows, base=[0, 0, 5], tool=[0, 0, -0.7], **more)
+    assert robot.reach == pytest.approx(0.3 + 0.2 + slide + 0.7)
     assert Robot.from_dh(np.zeros((2, 4))).reach == 1.0
 
 

@@ -121,9 +121,8 @@ def test_the_centre_is_anywhere_in_the_field_of_view_evenly():
     """1 - cosine of the angle to the axis, and the azimuth, are even: of 200 numbers the mean is 0.5 +- 0.0204."""
     board = Placement(np.eye(3), np.array([6.0, 0.0, 3.0]))
     robot = paper_robot()  # reaches nearly any of these, so that reach does not favour some
-    T = tool_poses(
-        robot, draw(robot, BoardViews(board, 199, distance=(0.3, 0.6), cone=0.7, field_of_view=0.4)).readings
-    )
+    views = BoardViews(board, 199, distance=(0.3, 0.6), cone=0.7, field_of_view=0.4)
+    T = tool_poses(robot, draw(robot, views).readings)
     seen = np.einsum("nji,nj->ni", T[:, :3, :3], board.position - T[:, :3, 3])
     even = (1.0 - np.cos(angle(seen, np.array([0.0, 0.0, 1.0])))) / (1.0 - np.cos(0.4))
     around = np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5

@@ -57,9 +57,7 @@ def test_what_passes_needs_a_result_to_be_trusted():
     assert "not to be trusted" in result.not_accepted[0]
 
 
-@pytest.mark.parametrize(
-    ("n_test", "words"), [(0, "no measurement of any position"), (4, "fewer than 5 were held out")]
-)
+@pytest.mark.parametrize(("n_test", "words"), [(0, "no measurement of any"), (4, "fewer than 5 were held out")])
 def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
     result = calibrated(n_test=n_test, accept={"position": 1.0})
     assert verdicts(result) == ["not evaluated"]
@@ -149,9 +147,8 @@ def test_rows_whose_prediction_nothing_determines_are_not_held_out():
     m = measure(true, 40, rng, sigma=(1e-4, 1e-4), n_test=20, readings=q)
     result = calibrate(robot, m, model="position", gauge="none", accept={"position": 1e-3})
     table = result.assessment.fit.residuals
-    assert np.array(table.reasons)[table.reason_code[table.test]].tolist() == (
-        [""] * 30 + ["depends on what is not determined"] * 30
-    )
+    reasons = np.array(table.reasons)[table.reason_code[table.test]].tolist()
+    assert reasons == [""] * 30 + ["depends on what is not determined"] * 30
     (one,) = result.result.acceptance.judgements
     assert (one.n, one.verdict) == (10, "pass")
     assert one.error == pytest.approx(result.assessment.fit.residuals.rms()["test"]["position"]["after"], rel=1e-12)

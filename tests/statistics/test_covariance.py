@@ -28,9 +28,7 @@ def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
     q = np.array([[0.0, 0.0]] * (n // 2) + [[0.0, np.pi]] * (n // 2))
     x = np.where(q[:, 1] == 0.0, 3.0, 1.0)
     position = np.stack([x, np.zeros(n), np.zeros(n)], axis=1)
-    measurements = Measurements(
-        q, np.arange(n).astype(str), np.zeros(n, bool), position, None, np.full((n, 3), sigma), None, np.zeros(2)
-    )
+    measurements = Measurements.from_arrays(q, position=position, sigma_position=sigma)
     found = sigma_of(assess(solve(build_problem(robot, measurements, model="position"))))
     # a1 + a2 and a1 - a2 are each the mean of n / 2 values, a2 theta2 that of n values (with both signs)
     assert found["a1"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
@@ -66,11 +64,9 @@ def test_covariance_equals_gtsams_marginals_where_these_exist(model, frame, esti
 
 
 def test_without_priors_only_determined_parameters_have_a_sigma():
-    rng = np.random.default_rng(1)
-    robot = paper_robot()
-    uncertainty = assess(
-        solve(build_problem(robot, measure(true_robot(robot, rng), 100, rng), model="distance-rotation"))
-    )
+    rng, robot = np.random.default_rng(1), paper_robot()
+    m = measure(true_robot(robot, rng), 100, rng)
+    uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation")))
     # Table 4 of Jia et al. (2019)
     ineffective = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]
     relative = ["beta1", "theta2", "beta2", "d3", "theta3", "d4", "d5", "beta5", "theta6"]
@@ -111,11 +107,9 @@ def test_bounds_of_chi_square_hold_its_distribution_and_a_factor_of_two():
 
 @pytest.mark.parametrize("model", ["pose", "distance-rotation"])
 def test_residual_table_holds_every_row_before_and_after(model):
-    rng = np.random.default_rng(7)
-    robot = small_arm()
-    solution = solve(
-        build_problem(robot, measure(true_robot(robot, rng), 20, rng, n_test=10), model=model, pairing=Pairing("chain"))
-    )
+    rng, robot = np.random.default_rng(7), small_arm()
+    m = measure(true_robot(robot, rng), 20, rng, n_test=10)
+    solution = solve(build_problem(robot, m, model=model, pairing=Pairing("chain")))
     table = assess(solution).fit.residuals
     assert table.n == (30 * 6 if model == "pose" else 2 * (19 + 9))
     assert table.test.sum() == (10 * 6 if model == "pose" else 2 * 9)

@@ -30,10 +30,8 @@ def poses(seed=0, n=40, n_test=0, tolerance=LARGE, **more):
 
 def job_of(robot, *tables, **options):
     options = Options.of(**{"model": "pose"} | options)
-    given = tuple(
-        t if isinstance(t, Table) else Table(t, options.model, options.pairing, options.frame) for t in tables
-    )
-    return Job(None, robot, given, options)
+    how = (options.model, options.pairing, options.frame)
+    return Job(None, robot, tuple(t if isinstance(t, Table) else Table(t, *how) for t in tables), options)
 
 
 def test_every_configuration_is_predicted_once_by_the_others():

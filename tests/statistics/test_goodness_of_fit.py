@@ -235,9 +235,8 @@ def test_touches_of_a_point_that_is_their_mean_share_its_noise():
         expected = np.einsum("nij,jk,nik->ni", J, C, J) / SIGMA**2 - 1 / n
         rows = np.isin(table.a, mine) & (table.family == table.families.index("point"))
         # The rows are turned; the sum over the three axes is not.
-        assert goodness.leverage[rows].reshape(-1, 3).sum(axis=1) == pytest.approx(
-            expected.sum(axis=1), rel=1e-3, abs=1e-3
-        )
+        found = goodness.leverage[rows].reshape(-1, 3).sum(axis=1)
+        assert found == pytest.approx(expected.sum(axis=1), rel=1e-3, abs=1e-3)
 
 
 @pytest.mark.parametrize("what", ["one table", "independent"])

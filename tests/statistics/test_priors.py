@@ -153,11 +153,8 @@ def test_not_knowing_the_scales_makes_sigmas_larger():
     solution = estimate_tolerances(problem)
     found, known = assess(solution), assess(replace(solution, estimated_tolerances=None))
     assert (found.fit.chi_square.p_value, known.fit.chi_square.p_value is None) == (None, False)
-    wider = [
-        a.sigma / b.sigma
-        for a, b in zip(found.estimates.parameters, known.estimates.parameters, strict=True)
-        if b.sigma
-    ]
+    both = zip(found.estimates.parameters, known.estimates.parameters, strict=True)
+    wider = [a.sigma / b.sigma for a, b in both if b.sigma]
     assert min(wider) > 0.9  # that of a mean scale need not be the least
     assert np.median(wider) > 1.02
 
@@ -263,8 +260,7 @@ def test_what_has_no_prior_follows_the_corrections():
     """The information on the corrections is that of the rows, the measurement frame moved along."""
     problem, _ = drawn_problem(frame="unknown")
     solution, n = solve(problem), len(prior_rows(problem.variables, problem.start)[0])
-    corrections, follow = priors_module._corrections(
-        solution, problem.variables, np.ones(n), np.zeros(n, dtype=np.int64)
-    )
+    sizes, groups = np.ones(n), np.zeros(n, dtype=np.int64)
+    corrections, follow = priors_module._corrections(solution, problem.variables, sizes, groups)
     rows = solution.problem.linearize(solution.parameters).left.A @ follow
     np.testing.assert_allclose(rows.T @ rows, corrections.information, rtol=1e-6, atol=1e-6 * np.max(rows**2))
