@@ -75,7 +75,7 @@ class Assessment(FrozenArrays):
             others: Held-out measurements, by table and kind of noise.
             solution: The assessed solution.
         """
-        tested = self.fit.residuals.held_out(solution.problem.data.labels)
+        tested = self.fit.residuals.held_out(solution.problem.data.labels, self.fit.goodness.suspect)
         kinds = {held.kind for held in tested}
         held_out = (*tested, *(held for held in others if held.kind not in kinds))
         limits = solution.problem.options.accept

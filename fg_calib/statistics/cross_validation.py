@@ -35,12 +35,15 @@ from fg_calib import graph, inputs, parallel, robot
 from fg_calib.inputs import Figure, Floats, FrozenArrays, InputError, Integers, Limits, ProblemError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Labels, Table
-from fg_calib.statistics.residual_table import HeldOut, pooled, residual_table, same_readings
+from fg_calib.statistics.residual_table import MAX_OUTLIER_SHARE, HeldOut, pooled, residual_table, same_readings
 
 Verdict = Literal["pass", "fail", "not evaluated"]
 
 LEAST = 5
 """Measurements that must have been held out for a limit to be judged by them."""
+
+NAMED = 10
+"""Outliers that are named."""
 
 CHANCE = 1e-3
 """Probability with which noise as specified alone makes the spread of any parameter worth naming."""
@@ -246,7 +249,8 @@ class Judgement:
         noise: RMS of the specified noise of these rows.
         n: Number of measurements held out.
         verdict: Whether the arm keeps to it.
-        reason: Why that was not evaluated, or which arm it was that passed, where it was not the calibrated one.
+        reason: Why that was not evaluated; outliers, where it failed; which arm it was that passed, if not the
+            calibrated one.
         table: Name of the table; empty where there is one alone.
     """
 
@@ -318,6 +322,10 @@ def _judge(kind: str, limit: float, held: HeldOut | None, findings: Sequence[str
         "the error is not known": not np.isfinite(held.after),
     }
     verdict: Verdict = "not evaluated" if any(doubts.values()) else "fail" if exceeds else "pass"
-    passed_by = f"new rows, by {held.by}" if held.by else ""
-    reason = next((doubt for doubt, applies in doubts.items() if applies), passed_by)
+    explained = f"new rows, by {held.by}" if held.by else ""
+    if verdict == "fail" and 0 < len(held.outliers) <= MAX_OUTLIER_SHARE * held.n:
+        more = len(held.outliers) - NAMED
+        named = ", ".join(held.outliers[:NAMED]) + f" and {more} more" * (more > 0)
+        explained = f"outliers among them, which count here: {named}; look at them"
+    reason = next((doubt for doubt, applies in doubts.items() if applies), explained)
     return Judgement(kind, limit, held.after, held.noise, held.n, verdict, reason, held.table)

@@ -11,7 +11,6 @@ References:
     Hadi, Simonoff (1993), Procedures for the identification of multiple outliers in linear models. JASA 88(424).
 """
 
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -128,8 +127,7 @@ def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, r
     causes = {group: "outliers" if group in wrong else "others" for group in fine}
     kinds = tuple(replace(kind, cause=causes.get((kind.table, kind.kind), "")) for kind in fit.kinds)
     rows = np.flatnonzero(out)
-    rows, names = rows[np.argsort(-size[rows], kind="stable")], ("", *table.names)
-    ends = dict.fromkeys((names[table.a[i] + 1], names[table.b[i] + 1]) for i in rows)
+    rows = rows[np.argsort(-size[rows], kind="stable")]
     n, chi2 = len(np.unique(table.measurement_number[rows])), chi_square(now[0], now[1])
     ratio = chi2.value / max(chi2.dof, 1)
     if now[0].estimated_noise is not None:
@@ -137,14 +135,4 @@ def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, r
         ratio = min((factors.get((kind.table, kind.kind), np.inf) / kind.factor) ** 2 for kind in fit.kinds)
         if ratio > 1.0 / FACTOR:
             return fit
-    return replace(fit, kinds=kinds, gross=GrossErrors(n, _names(list(ends)), ratio))
-
-
-def _names(ends: list[tuple[str, str]]) -> tuple[str, ...]:
-    """Names of measurements by what they are between: one that is an end of several is named in their place."""
-    count = Counter(name for both in ends for name in both if name)
-    found: dict[str, None] = {}
-    for both in ends:
-        worst = max(filter(None, both), key=lambda name: count[name])
-        found[worst if count[worst] > 1 else " and ".join(filter(None, both))] = None
-    return tuple(found)
+    return replace(fit, kinds=kinds, gross=GrossErrors(n, table.named(rows), ratio))

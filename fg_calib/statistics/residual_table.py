@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -73,6 +74,7 @@ class HeldOut:
         noise: Of the noise as specified.
         few: Whether they are few for the frame, base or tool that were fitted to them.
         by: Which arm predicted them if not the calibrated one, whose errors are at most as large.
+        outliers: Names of those that are too large.
     """
 
     table: str
@@ -83,6 +85,7 @@ class HeldOut:
     noise: Figure
     few: bool = False
     by: str = ""
+    outliers: tuple[str, ...] = ()
 
 
 def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
@@ -90,7 +93,9 @@ def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
     n, names = np.array([part.n for part in parts]), ("before", "after", "noise")
     squares = n @ np.array([[getattr(part, name) ** 2 for name in names] for part in parts]) / n.sum()
     rms = dict(zip(names, np.sqrt(squares).tolist(), strict=True))
-    return replace(parts[0], table=table, n=int(n.sum()), few=any(part.few for part in parts), **rms)
+    outliers = tuple(name for part in parts for name in part.outliers)
+    few = any(part.few for part in parts)
+    return replace(parts[0], table=table, n=int(n.sum()), few=few, outliers=outliers, **rms)
 
 
 @dataclass(frozen=True)
@@ -263,11 +268,26 @@ class ResidualTable(FrozenArrays):
             }
             return total(self.reason_code == 0).astype(np.int64), total((self.after / self.sigma) ** 2), rms
 
-    def held_out(self, labels: Sequence[str]) -> tuple[HeldOut, ...]:
+    def named(self, rows: Integers) -> tuple[str, ...]:
+        """Names of measurements by what they are between: one that is an end of several is named in their place.
+
+        Args:
+            rows: Rows of theirs, shape (m,).
+        """
+        names, found = ("", *self.names), dict[str, None]()
+        ends = dict.fromkeys((names[self.a[i] + 1], names[self.b[i] + 1]) for i in rows)
+        count = Counter(name for both in ends for name in both if name)
+        for both in ends:
+            worst = max(filter(None, both), key=lambda name: count[name])
+            found[worst if count[worst] > 1 else " and ".join(filter(None, both))] = None
+        return tuple(found)
+
+    def held_out(self, labels: Sequence[str], suspect: Booleans | None = None) -> tuple[HeldOut, ...]:
         """Test rows that count, by table and kind of noise; rows at readings that are fitted too are left out.
 
         Args:
             labels: Of the tables; a single one has none here.
+            suspect: Rows that are too large, shape (n,), to be named.
         """
         found, counted = [], (self.reason_code == 0) & (self.split == 1) & ~self.seen
         for k, (number, family) in enumerate(self.groups):
@@ -276,7 +296,11 @@ class ResidualTable(FrozenArrays):
                 table, few = labels[number] if len(labels) > 1 else "", len(rows) < ROWS_PER_FITTED * self.n_fitted
                 sizes = (self._lengths(rows, v) for v in (self.before, self.after, self.sigma))
                 before, after, noise = map(root_mean_square, sizes)
-                found.append(HeldOut(table, family, int(np.sum(self.begins[rows])), before, after, noise, few))
+                n, wrong = (
+                    int(np.sum(self.begins[rows])),
+                    self.named(rows[:0] if suspect is None else rows[suspect[rows]]),
+                )
+                found.append(HeldOut(table, family, n, before, after, noise, few, outliers=wrong))
         return tuple(found)
 
     def rows_of(self, number: int) -> slice:

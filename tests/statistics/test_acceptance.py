@@ -17,7 +17,7 @@ def calibrated(seed=0, n_test=20, wrong=0.0, model="pose", **options):
     rng = np.random.default_rng(seed)
     robot = small_arm(tolerance={"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}, estimate=TOOL)
     m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4), n_test=n_test)
-    if wrong:
+    if np.any(wrong):
         m = replace(m, position=m.position + wrong * m.test[:, None])
     return calibrate(robot, m, model=model, **options)
 
@@ -48,6 +48,15 @@ def test_an_arm_that_is_worse_fails():
     assert verdicts(result)[0] == "fail"
     assert result.result.acceptance.verdict == "fail"
     assert result.not_accepted[0].startswith("FAIL: position 17.3 mm (RMS of 20 held-out measurements), limit 5 mm")
+
+
+@pytest.mark.parametrize("loss", ["none", "gnc"])
+def test_outliers_by_which_test_rows_fail_are_named(loss):
+    result = calibrated(wrong=0.01 * (np.arange(60) > 57)[:, None], accept={"position": 1e-3}, loss=loss)
+    words = (
+        "FAIL: position 5.48 mm (RMS of 20 held-out measurements), limit 1 mm: outliers among them, which count here"
+    )
+    assert result.not_accepted == (f"{words}: 58, 59; look at them",)
 
 
 def test_what_passes_needs_a_result_to_be_trusted():

@@ -1,6 +1,7 @@
 """Few wrong measurements are told from noise and from what is not modelled, however far they are off."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from sparing import diagonal
 from systematic import measured, of_joint, problem_of
 
 from fg_calib import Pairing, assess, build_problem, solve
-from fg_calib.statistics.outliers import _names
+from fg_calib.statistics import ResidualTable
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 
@@ -66,7 +67,8 @@ def test_one_wrong_measurement_is_named_however_far_it_is_off(name, by):
 
 
 def test_what_is_an_end_of_several_wrong_pairs_is_named_in_their_place():
-    assert _names([("0", "9"), ("3", "9"), ("4", "5"), ("", "7")]) == ("9", "4 and 5", "7")
+    ends = SimpleNamespace(names="0123456789", a=[0, 3, 4, -1], b=[9, 9, 5, 7])
+    assert ResidualTable.named(ends, range(4)) == ("9", "4 and 5", "7")
 
 
 @pytest.mark.slow
