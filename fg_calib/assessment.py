@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from fg_calib import monitoring, parallel, statistics
 from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
 from fg_calib.diagnostics.multistart import multistart
 from fg_calib.graph import Problem, Solution, problem_of, solve
-from fg_calib.inputs import Floats, FrozenArrays, InputError, SolverError, as_figures, checked, escaped
+from fg_calib.inputs import Floats, FrozenArrays, InputError, Record, SolverError, as_figures, checked, escaped
 from fg_calib.job import Job
 from fg_calib.observability import Identifiability, Observability, identifiability_of
 from fg_calib.prediction import ExpectedError, expected_error
@@ -20,8 +20,7 @@ from fg_calib.robot import Robot
 from fg_calib.statistics.residual_table import residual_table
 
 
-@dataclass(frozen=True)
-class Prediction:
+class Prediction(Record):
     """A function of the parameters at the estimate.
 
     Attributes:
@@ -35,7 +34,6 @@ class Prediction:
     covariance: Floats
 
 
-@dataclass(frozen=True)
 class Assessment(FrozenArrays):
     """Assessment of a solution by `assess`.
 

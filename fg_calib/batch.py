@@ -9,12 +9,12 @@ import os
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 from fg_calib.calibration import Calibration, calibrate_job
-from fg_calib.inputs import InputError, checked, escaped, shown
+from fg_calib.inputs import InputError, Record, checked, escaped, shown
 from fg_calib.io import fill_folder, read_job, require_no_input, require_writable
 from fg_calib.job import Job
 from fg_calib.parallel import Failure, map_jobs
@@ -44,8 +44,7 @@ def calibrate_jobs(jobs: Sequence[Job | Path | str], executor: Executor | None =
     return map_jobs(calibrate_job, list(jobs), executor, names=names)
 
 
-@dataclass(frozen=True)
-class Order:
+class Order(Record):
     """A job whose result is written to a folder.
 
     Attributes:
@@ -84,8 +83,7 @@ class Order:
         return found
 
 
-@dataclass(frozen=True)
-class JobSummary:
+class JobSummary(Record):
     """One row of the table of many jobs.
 
     Attributes:

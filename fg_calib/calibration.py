@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from fg_calib import inputs, io
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.graph import Knowledge, Solution, Variables, build_variables, frame_of, tables_of
-from fg_calib.inputs import Brief, CalibrationError, Floats, InputError, Options, SolverError, checked
+from fg_calib.inputs import Brief, CalibrationError, Floats, InputError, Options, Record, SolverError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
@@ -126,7 +126,6 @@ Given = Path | str | Job | Measurements | Table | Sequence[Measurements | Table]
 """New rows: a table or a job, by its path or in memory."""
 
 
-@dataclass(frozen=True)
 class PredictedPoses(Brief):
     """Tool poses that a calibrated robot takes, with what its parameters may be off.
 
@@ -152,8 +151,7 @@ class PredictedPoses(Brief):
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)[:, 3:])
 
 
-@dataclass(frozen=True, repr=False, eq=False)
-class Calibration:
+class Calibration(Record, repr=False, eq=False):
     """A calibrated robot with its typed result and tables; printed it is the report.
 
     Attributes:

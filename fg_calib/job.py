@@ -1,6 +1,6 @@
 """A calibration job: a robot, what was measured of it, and every choice."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,6 @@ from fg_calib.measurements import Measurements, Table
 from fg_calib.robot import Robot
 
 
-@dataclass(frozen=True)
 class Job(Brief):
     """A calibration job with everything it refers to.
 

@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cache, wraps
 from multiprocessing import get_context, parent_process
 from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from fg_calib.inputs import CalibrationError, InputError, check_number, checked, printable, shown
+from fg_calib.inputs import CalibrationError, InputError, Record, check_number, checked, printable, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -153,8 +153,7 @@ def require_polars(place: str) -> None:
         raise InputError(place, found, hint='use multiprocessing.get_context("spawn") or "forkserver"')
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(Record):
     """A job without a result.
 
     Attributes:

@@ -20,7 +20,7 @@ References:
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -48,7 +48,6 @@ ESTIMATORS: Mapping[str, str] = {
 """The estimators in the order of a comparison, in words."""
 
 
-@dataclass(frozen=True)
 class PoseError(Brief):
     """Estimated minus true tool poses over some configurations.
 
@@ -65,7 +64,6 @@ class PoseError(Brief):
     orientation_rms: float
 
 
-@dataclass(frozen=True)
 class RealErrors(Brief):
     """Errors of an arm whose truth is known.
 
@@ -79,7 +77,6 @@ class RealErrors(Brief):
     best_rigid_fit: PoseError | None
 
 
-@dataclass(frozen=True)
 class Estimate(Brief):
     """Result of one estimator on a job.
 
@@ -121,7 +118,6 @@ class Estimate(Brief):
         return len(self.sigma)
 
 
-@dataclass(frozen=True)
 class Comparison(Brief):
     """Several estimators on one job.
 

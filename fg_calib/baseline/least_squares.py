@@ -24,13 +24,13 @@ References:
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, check_names, checked
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names, checked
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Chain, Robot, build_chain, names_of
@@ -54,7 +54,6 @@ _SMALL_STEP = 1e-12
 """Length of a step that ends a fit, metres and radians side by side."""
 
 
-@dataclass(frozen=True)
 class LeastSquares(Brief):
     """The result of plain least squares.
 
@@ -140,8 +139,7 @@ Weights = tuple[Floats, ...]
 """Whitening of each block of rows, shape (n, residual_dim, residual_dim)."""
 
 
-@dataclass(frozen=True)
-class Fit:
+class Fit(Record):
     """Unknowns where a method stopped, shape (n,), and why."""
 
     x: Floats
@@ -195,8 +193,7 @@ def claimed_covariance(r: Floats, J: Floats, weighted: bool) -> Floats:
     return covariance
 
 
-@dataclass(frozen=True)
-class _Rows:
+class _Rows(Record):
     """Train measurements of one kind from one table.
 
     Attributes:

@@ -3,18 +3,7 @@
 from pathlib import Path
 from typing import Annotated
 
-from fg_calib.cli.output import (
-    Angle,
-    Json,
-    Length,
-    ResultFolder,
-    argument,
-    end,
-    option,
-    quantity,
-    say,
-    show_result,
-)
+from fg_calib.cli.output import Angle, Json, Length, ResultFolder, argument, end, option, quantity, say, show_result
 
 
 def predict(

@@ -8,7 +8,7 @@ Pairs have two ends. In a star all pairs share the reference pose, the first can
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -35,7 +35,6 @@ hold more than both together: V is 1 and U' is U, six unknowns fewer. So poses c
 nearly the best for all pairs formed from them."""
 
 
-@dataclass(frozen=True)
 class Pool(Brief):
     """Candidate poses.
 

@@ -9,7 +9,7 @@ anew from the rows of its poses alone, by the code that assesses a calibration.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -41,8 +41,7 @@ _JUST = 1.0 + 1e-6
 """A target is reached to rounding."""
 
 
-@dataclass(frozen=True, repr=False)
-class Design(FrozenArrays):
+class Design(FrozenArrays, repr=False):
     """Which configurations to measure.
 
     Attributes:

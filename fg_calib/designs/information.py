@@ -15,7 +15,7 @@ best rigid fit where the task is *fitted*; C is the covariance of the arm's para
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -44,7 +44,6 @@ _UNDETERMINED_SHARE = 1e-6
 # --- rows of each pose ---
 
 
-@dataclass(frozen=True)
 class PoseRows(FrozenArrays):
     """Whitened rows that each pose would add.
 
@@ -139,7 +138,6 @@ def _compress(rows: Floats) -> Floats:
 # --- the system to choose from ---
 
 
-@dataclass(frozen=True)
 class System(FrozenArrays):
     """Candidates in coordinates that can be determined.
 
@@ -210,7 +208,6 @@ def build_system(poses: PoseRows, given: Floats, task: Floats) -> System:
 # --- the task, and what is known after measuring ---
 
 
-@dataclass(frozen=True)
 class Task(FrozenArrays):
     """Configurations at which the tool is to be right after calibration.
 
@@ -239,7 +236,6 @@ class Task(FrozenArrays):
         return flat.T @ flat / len(self.readings)
 
 
-@dataclass(frozen=True)
 class Posterior(Brief):
     """Posterior of the arm after some rows were measured.
 

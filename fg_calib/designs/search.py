@@ -10,13 +10,13 @@ References:
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from fg_calib.designs.criteria import Criterion, Measure
 from fg_calib.designs.information import System
-from fg_calib.inputs import Floats, Integers
+from fg_calib.inputs import Floats, Integers, Record
 from fg_calib.robot import Robot
 
 MAX_SWEEPS = 10
@@ -44,8 +44,7 @@ MIN_CURVE, N_CURVE = 4, 10
 """Number of poses with which the curve begins, and about the number of its points."""
 
 
-@dataclass(frozen=True)
-class CurvePoint:
+class CurvePoint(Record):
     """Expected error of a number of poses.
 
     Attributes:

@@ -118,7 +118,6 @@ class Disagreement:
     test: bool
 
 
-@dataclass(frozen=True)
 class Inspection(Brief):
     """A job before it is solved.
 

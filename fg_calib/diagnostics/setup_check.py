@@ -60,7 +60,6 @@ class Explanation:
         return max((residual.excess for residual in self.residuals), default=np.inf)
 
 
-@dataclass(frozen=True)
 class SetupCheck(Brief):
     """Residuals before a calibration, and what they say of its set-up.
 

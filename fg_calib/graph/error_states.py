@@ -158,7 +158,6 @@ def _configuration_graph(L: Sparse, width: int) -> Sparse:
     return Sparse(pattern.T @ pattern)
 
 
-@dataclass(frozen=True)
 class State(Brief):
     """The arm and the nuisance coordinates at some parameters.
 
@@ -181,7 +180,6 @@ class State(Brief):
         return replace(self, chains=tuple(chain.without_columns() for chain in self.chains), n_columns=0, n_nuisance=0)
 
 
-@dataclass(frozen=True)
 class WhitenedBlock(Brief):
     """Train rows of one block, whitened by their private noise.
 
@@ -235,7 +233,6 @@ class WhitenedBlock(Brief):
         yield out
 
 
-@dataclass(frozen=True)
 class WhitenedRows(Brief):
     """All train rows, whitened by their private noise.
 

@@ -14,7 +14,7 @@ linearised there, too (`nominal`), without what tolerances say.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import gtsam
@@ -41,7 +41,6 @@ View = tuple[Model, FrameKnowledge]
 """A model, and whether the measurement frame is known."""
 
 
-@dataclass(frozen=True)
 class Knowledge(FrozenArrays):
     """Information of earlier rows about an arm and what stays with it.
 

@@ -20,7 +20,6 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -82,7 +81,6 @@ def first_independent(N: Floats, count: int) -> list[int]:
     return chosen
 
 
-@dataclass(frozen=True)
 class Eliminated(Brief):
     """A linear system with its landmark columns eliminated by QR.
 

@@ -7,7 +7,7 @@ take part and why the others do not.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -33,7 +33,6 @@ NO_ROWS = whitened_rows((), sharing=False, joints=False, weights=None)
 """The rows of a problem before they are whitened."""
 
 
-@dataclass(frozen=True)
 class Problem(FrozenArrays):
     """A calibration problem, ready to be solved.
 

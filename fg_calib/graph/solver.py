@@ -118,7 +118,6 @@ class ToleranceScale:
     seen: float
 
 
-@dataclass(frozen=True)
 class ToleranceScales(FrozenArrays):
     """The scales of all groups.
 
@@ -131,7 +130,6 @@ class ToleranceScales(FrozenArrays):
     added: Floats
 
 
-@dataclass(frozen=True)
 class Solution(FrozenArrays):
     """Result of the solver.
 

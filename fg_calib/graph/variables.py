@@ -88,7 +88,6 @@ class Variable:
         return self.kind in ("tool", "base", "frame", "own pose")
 
 
-@dataclass(frozen=True)
 class Variables(Brief):
     """All variables of a problem, and the way between GTSAM's values and the parameter vector.
 

@@ -29,7 +29,7 @@ by more than that at both ends.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,13 +39,13 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
+from fg_calib import inputs
 from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, FrozenArrays, InputError, check_number, checked
 from fg_calib.io import joint_columns, require_absent, write_csv
 from fg_calib.robot import Robot, build_chain, forward
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(inputs.Record):
     """Origin of a stream.
 
     Attributes:
@@ -61,7 +61,6 @@ class Source:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
 class JointStream(FrozenArrays):
     """Joint readings over time.
 
@@ -76,7 +75,6 @@ class JointStream(FrozenArrays):
     source: Source
 
 
-@dataclass(frozen=True)
 class PoseStream(FrozenArrays):
     """Poses over time.
 
@@ -111,8 +109,7 @@ SPEED_WIDTH_S = 0.1
 """Time over which speeds are taken, [s]."""
 
 
-@dataclass(frozen=True)
-class ClockOffset:
+class ClockOffset(inputs.Record):
     """The stamp of a pose minus that of the joint reading of the same moment.
 
     Attributes:
@@ -189,8 +186,7 @@ class Skipped(NamedTuple):
     reason: str
 
 
-@dataclass(frozen=True)
-class Scatter:
+class Scatter(inputs.Record):
     """Scatter during stops of one quantity.
 
     Attributes:
@@ -206,7 +202,6 @@ class Scatter:
     slow: bool
 
 
-@dataclass(frozen=True)
 class Stops(FrozenArrays):
     """Measurements while the arm stood still, a row a stop.
 

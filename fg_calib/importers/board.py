@@ -20,7 +20,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__, io, measurements, parallel
 from fg_calib.initialization import Camera
-from fg_calib.inputs import Floats, InputError, Integers, check
+from fg_calib.inputs import Floats, InputError, Integers, Record, check
 
 Image = NDArray[np.uint8]
 
@@ -348,8 +348,7 @@ class Corners(NamedTuple):
     uv: Floats
 
 
-@dataclass(frozen=True)
-class View:
+class View(Record):
     """A board in an image.
 
     Attributes:
@@ -381,8 +380,7 @@ class View:
         return Rotation.from_matrix(self.rotation.copy()).as_rotvec()
 
 
-@dataclass(frozen=True)
-class BoardFit:
+class BoardFit(Record):
     """A board in some images, and the camera.
 
     Attributes:
@@ -653,8 +651,7 @@ def read_readings(path: Path) -> Readings:
     return {name: dict(zip(kept, row, strict=True)) for name, *row in zip(ids, *cells, strict=True)}
 
 
-@dataclass(frozen=True)
-class BoardTables:
+class BoardTables(Record):
     """Tables of a board's images.
 
     Attributes:

@@ -6,7 +6,7 @@ Lines marked DECIDE hold what only the user knows.
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from fg_calib import io
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, printable
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, Record, printable
 from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_PAIRS, Table, decoded, names_of, read_bytes, read_robot, read_yaml
 from fg_calib.measurements import COVARIANCE, INSTRUMENTS
 from fg_calib.robot import Robot
@@ -83,8 +83,7 @@ _NO_TOOL = """\
 """
 
 
-@dataclass(frozen=True)
-class _Recognised:
+class _Recognised(Record):
     """A table, recognised by its header.
 
     Attributes:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sized
-from dataclasses import fields
-from typing import Annotated, Any, ClassVar
+from dataclasses import dataclass, field, fields
+from typing import Annotated, Any, ClassVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -51,13 +51,22 @@ NORM_TOLERANCE = 1e-3
 """How far a quaternion or a rotation matrix may be from length 1: more is not rounding."""
 
 
-class Brief:
+@dataclass_transform(frozen_default=True, field_specifiers=(field,))
+class Record:
+    """Base of frozen dataclasses: a class that derives from it is one, with the options of `dataclass` as its own."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__()
+        dataclass(frozen=True, **options)(cls)
+
+
+class Brief(Record):
     """Base of dataclasses that hold arrays: a repr fits a screen, with shapes for arrays and types for long values."""
 
     def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
         if "__repr__" not in vars(cls):
             cls.__repr__ = lambda self: brief(self, (f.name for f in fields(self) if f.repr))  # type: ignore
+        super().__init_subclass__(**options)
 
 
 def brief(of: object, names: Iterable[str]) -> str:

@@ -11,7 +11,7 @@ import logging
 import os
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib import inputs, measurements, parallel
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, checked
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
@@ -85,8 +85,7 @@ class Column(Schema):
     zero: Number = 0.0
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(Record):
     """A table of named columns.
 
     Attributes:
@@ -585,7 +584,6 @@ def read_joint_table(
     return tuple(read_ids(table, repeated=True).tolist()), readings
 
 
-@dataclass(frozen=True)
 class Targets(FrozenArrays):
     """Targets of the tool.
 

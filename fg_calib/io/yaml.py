@@ -4,7 +4,6 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -251,8 +250,7 @@ ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 1e-3}
 """Radians in one unit of angle."""
 
 
-@dataclass(frozen=True)
-class Units:
+class Units(inputs.Record):
     """The units in which a file states lengths and angles.
 
     Attributes:

@@ -6,7 +6,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,6 @@ ASSUMED_SIGMA = 1e-3
 """1 sigma of what none is specified for, [m] and [rad]."""
 
 
-@dataclass(frozen=True)
 class Dataset(Brief):
     """All tables of a calibration, as estimation takes them.
 

@@ -76,7 +76,6 @@ class Noise:
 _NOISE = tuple(f.name for f in fields(Noise) if f.name != "more")
 
 
-@dataclass(frozen=True)
 class Pairs(FrozenArrays):
     """Pairs of configurations measured against each other; nan where not measured.
 
@@ -112,7 +111,6 @@ class Pairs(FrozenArrays):
         return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "source"})
 
 
-@dataclass(frozen=True)
 class Labels(FrozenArrays):
     """Name in each row: the target that was seen, the station it was seen from.
 
@@ -134,7 +132,6 @@ class Labels(FrozenArrays):
         return inside & ~outside
 
 
-@dataclass(frozen=True)
 class Groups(Labels):
     """Configurations in which the tool point touched the same physical point, whose position is unknown.
 
@@ -145,7 +142,6 @@ class Groups(Labels):
     pairs: Pairs
 
 
-@dataclass(frozen=True)
 class Measurements(FrozenArrays):
     """Configurations, and what was measured at them or between them.
 

@@ -15,7 +15,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 
 import numpy as np
 from scipy.linalg import lapack
@@ -35,7 +35,6 @@ _NOTHING = np.zeros((0, 0)), np.zeros((0, 0, 0, 0)), np.zeros((0, 0, 0))
 """Arrays that `_given` gives for a kind that has a twin."""
 
 
-@dataclass(frozen=True)
 class Block(Brief):
     """Measurements of one kind.
 

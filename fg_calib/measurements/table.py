@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from fg_calib.measurements.kind import Kind, check_kind
 from fg_calib.measurements.landmarks import Landmark, LandmarkKind, Landmarks
 
 
-@dataclass(frozen=True)
 class MeasurementBlock(Brief):
     """Measurements of one kind from one table.
 
@@ -109,7 +108,6 @@ UNKNOWN = LandmarkKind(
 )
 
 
-@dataclass(frozen=True)
 class CustomMeasurements(Brief):
     """Measurements of a custom kind, at the configurations of a table.
 
@@ -190,7 +188,6 @@ class CustomMeasurements(Brief):
         return MeasurementBlock.of_rows(self.kind, number, np.arange(n), self.data, np.asarray(self.sigma), **fields)
 
 
-@dataclass(frozen=True)
 class KnownPoint(inputs.FrozenArrays):
     """Position of a target on the tool, or of an anchor in the base frame.
 
@@ -209,7 +206,6 @@ class KnownPoint(inputs.FrozenArrays):
         super().__post_init__()
 
 
-@dataclass(frozen=True)
 class Table(Brief):
     """A table of measurements, and how it is to be understood.
 

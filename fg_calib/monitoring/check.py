@@ -10,14 +10,14 @@ small is no change of the arm.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from scipy import special
 
 from fg_calib.diagnostics import check_tables, reporting
-from fg_calib.inputs import LIMITED, Limits
+from fg_calib.inputs import LIMITED, Limits, Record
 from fg_calib.monitoring import hypotheses
 from fg_calib.monitoring.hypotheses import HypothesisTest
 from fg_calib.monitoring.new_data import Linear, Rows, linearise_new_data, place_new_data
@@ -40,8 +40,7 @@ ALSO_SHOWN = 3
 """Changes that the rows exclude and that are shown with the likely ones."""
 
 
-@dataclass(frozen=True)
-class Explanation:
+class Explanation(Record):
     """A change that explains new rows.
 
     Attributes:
@@ -72,8 +71,7 @@ class Explanation:
     same: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(Record):
     """Check of a calibration by new rows.
 
     Attributes:

@@ -21,14 +21,14 @@ What to measure next are the random configurations where the two likeliest chang
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 from scipy import special
 
 from fg_calib import graph, statistics
-from fg_calib.inputs import POSE_MODELS, CalibrationError, Floats, FrozenArrays
+from fg_calib.inputs import POSE_MODELS, CalibrationError, Floats, FrozenArrays, Record
 from fg_calib.monitoring.new_data import Linear, Rows, ends_of_rows, linearise_new_data, place_new_data
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, forward, names_of, random_readings
@@ -62,8 +62,7 @@ POSES = {"tool": "tool", "base": "frame"}
 """Variables that are a pose, and the hypothesis that it made any turn and shift."""
 
 
-@dataclass(frozen=True)
-class ChangeHypothesis:
+class ChangeHypothesis(Record):
     """A change that is tested.
 
     Attributes:
@@ -83,8 +82,7 @@ class ChangeHypothesis:
     same: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class HypothesisTest:
+class HypothesisTest(Record):
     """Test of a hypothesis.
 
     Attributes:
@@ -335,7 +333,6 @@ def merge_alike(rows: Linear, likely: Sequence[HypothesisTest], noise: Mapping[s
     return kept
 
 
-@dataclass(frozen=True)
 class Advice(FrozenArrays):
     """Configurations at which the two likeliest changes differ most, among random ones.
 

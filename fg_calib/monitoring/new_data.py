@@ -10,21 +10,20 @@ what nothing determined have no such rows. So the smallest sum of squares is chi
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from fg_calib import diagnostics, graph, statistics
-from fg_calib.inputs import Booleans, Floats, Integers, Options, ProblemError
+from fg_calib.inputs import Booleans, Floats, Integers, Options, ProblemError, Record
 from fg_calib.measurements import INSTRUMENTS, Dataset, KnownPoint, Table, build_dataset
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, names_of
 from fg_calib.statistics.residual_table import residual_table
 
 
-@dataclass(frozen=True)
-class Rows:
+class Rows(Record):
     """New tables, as they are to be compared with a calibrated arm.
 
     Attributes:
@@ -73,8 +72,7 @@ class Rows:
         return tuple(replace(t, known={n: at for n, at in t.known.items() if n not in stays}) for t in self.tables)
 
 
-@dataclass(frozen=True)
-class Placed:
+class Placed(Record):
     """New rows with the arm held, frames and all that does not stay with it fitted.
 
     Attributes:
@@ -144,8 +142,7 @@ def started(
     return graph.with_factors(made, x, replace(made.state, factors=fit.problem.state.factors))
 
 
-@dataclass(frozen=True)
-class Linear:
+class Linear(Record):
     """New rows and what is known of the arm as one linear system, what the arm may be off fitted.
 
     Attributes:

@@ -7,7 +7,7 @@ file's format make no difference: integers multiplied and added modulo 2^64, of 
 import math
 import zlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib import graph, observability, parallel
-from fg_calib.inputs import Floats, Options
+from fg_calib.inputs import Floats, Options, Record
 from fg_calib.measurements import LANDMARKS, Measurements, Table
 from fg_calib.robot import Robot
 
@@ -30,8 +30,7 @@ SAME_SHARE = 0.5
 _RESOLUTION, _NOT_MEASURED, _FACTOR = 1e-12, 9e6, np.uint64(0x9E3779B97F4A7C15)
 
 
-@dataclass(frozen=True)
-class Calibrated:
+class Calibrated(Record):
     """An arm that was calibrated before.
 
     Attributes:

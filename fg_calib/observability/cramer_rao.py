@@ -26,7 +26,6 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,7 +44,6 @@ _ENTERS = 1e-6
 """Share of an error above which it counts as entering the estimate's error."""
 
 
-@dataclass(frozen=True)
 class Bound(Brief):
     """The least error that some measurements allow, to first order.
 

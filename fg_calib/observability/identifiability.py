@@ -8,7 +8,7 @@ may be weak.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -41,7 +41,6 @@ def observability_of(
     return observability_of_rows(J, problem.estimated, scales=scales, n_measurements=n, prefer=prefer, floor=floor)
 
 
-@dataclass(frozen=True)
 class Identifiability(Brief):
     """Identifiability of a robot's parameters, with reasons for the rest.
 

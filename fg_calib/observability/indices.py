@@ -100,7 +100,6 @@ class WeakDirection:
     members: dict[str, float]
 
 
-@dataclass(frozen=True)
 class Observability(FrozenArrays):
     """Observability of the parameters by a set of measurements.
 

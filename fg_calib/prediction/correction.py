@@ -10,7 +10,6 @@ counts far more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -32,8 +31,7 @@ _WEIGHT = 100.0
 """Weight [1/m] of the point against a turn [rad] where the tool is turned about it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Correction(FrozenArrays):
+class Correction(FrozenArrays, eq=False):
     """Commands for n targets.
 
     Attributes:

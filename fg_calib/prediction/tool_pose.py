@@ -179,7 +179,6 @@ def predict_poses(
     return at.position, at.rotation, covariances
 
 
-@dataclass(frozen=True)
 class ToolErrors(FrozenArrays):
     """Expected RMS errors of the tool at configurations: position [m] and orientation [rad] in columns.
 
@@ -198,7 +197,6 @@ class ToolErrors(FrozenArrays):
     joint_noise: Floats | None
 
 
-@dataclass(frozen=True)
 class ToolPoseUncertainty(FrozenArrays):
     """Expected errors of the tool at any configuration, by a covariance.
 

@@ -57,7 +57,6 @@ class Responsible:
     change: float
 
 
-@dataclass(frozen=True)
 class WorstConfiguration(FrozenArrays):
     """Configuration with the largest expected position error, as far as known.
 
@@ -79,7 +78,6 @@ class WorstConfiguration(FrozenArrays):
     responsible: tuple[Responsible, ...]
 
 
-@dataclass(frozen=True)
 class PredictedErrors(FrozenArrays):
     """Expected errors of the tool of a calibrated arm.
 

@@ -4,14 +4,13 @@ A chart is a caption and its SVG. It stands in the page as it is, or in a file o
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fg_calib.inputs import Floats, escaped
+from fg_calib.inputs import Floats, Record, escaped
 
 WIDTH, HEIGHT = 360.0, 230.0
 """Size of an ordinary chart, in its own units; the page stretches it."""
@@ -56,8 +55,7 @@ def title(text: str) -> str:
     return tag("title", escape(escaped(text)))
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(Record):
     """An axis of a chart.
 
     Attributes:

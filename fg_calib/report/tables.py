@@ -3,7 +3,6 @@
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -74,8 +73,7 @@ Content = Table | Text | str
 """Content of a section: tables, lines with a style, and sentences."""
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(inputs.Record):
     """A part of a report, which the terminal and the page show alike.
 
     Attributes:

@@ -6,7 +6,6 @@ It is made of a typed result and its tables, so that a loaded calibration prints
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from rich.table import Table
 
 from fg_calib import assessment, graph, measurements, prediction
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
-from fg_calib.inputs import LIMITED, Booleans, Floats
+from fg_calib.inputs import LIMITED, Booleans, Floats, Record
 from fg_calib.io import Result, key_of
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
@@ -30,8 +29,7 @@ UNMOVED = 1e-9
 """How far an estimate that no step meant to move may be from its start, [m] and [rad]."""
 
 
-@dataclass(frozen=True)
-class ReportData:
+class ReportData(Record):
     """Data of the report, the page and the figures of a calibration.
 
     Attributes:

@@ -15,8 +15,6 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -41,7 +39,6 @@ FINISHED = 1e-13
 """Steps go on until the miss, lengths over the arm's length, is below: rounding of poses is some 1e-16."""
 
 
-@dataclass(frozen=True)
 class Inverse(Brief):
     """Configurations for poses.
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import TypeVar
 
@@ -36,7 +36,6 @@ from fg_calib.robot.model import FRAME_KINDS, PARAMETER_KINDS, Axis, Element, Ro
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
 class Chain(Brief):
     """A robot prepared for the compiled walk; `at` gives it other parameter values.
 
@@ -203,7 +202,6 @@ def _without_idle(chain: Chain, changing: set[int]) -> Chain:
     return replace(chain, **{name: getattr(chain, name)[keep] for name in names})
 
 
-@dataclass(frozen=True)
 class Poses(Brief):
     """Tool poses with their derivatives.
 

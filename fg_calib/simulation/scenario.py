@@ -81,7 +81,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar, cast, dataclass_transform
@@ -92,7 +92,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, InstanceOf, TypeAda
 from scipy.spatial.transform import Rotation
 
 from fg_calib import initialization, inputs, io
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, AngleUnit, Brief, Floats, InputError, Pairing
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, AngleUnit, Floats, InputError, Pairing, Record
 from fg_calib.measurements import Noise
 from fg_calib.robot import Robot, tolerance_kind, unit_of
 
@@ -108,8 +108,7 @@ Class = TypeVar("Class")
 # --- one type for Python and for the file -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FileContext:
+class FileContext(Record):
     """Context in which a file is read.
 
     Attributes:
@@ -230,8 +229,7 @@ def _require_order(distance: tuple[float, float]) -> None:
 # --- frames and where the arm goes ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Placement:
+class Placement(Record):
     """A frame in another one, such as world_T_base or base_T_board.
 
     Attributes:
@@ -645,7 +643,7 @@ def _errors(given: Any, context: FileContext) -> Errors:
 
 
 @schema
-class Scenario(Brief):
+class Scenario:
     """A simulation to run, in SI.
 
     Attributes:
@@ -678,6 +676,9 @@ class Scenario(Brief):
     name: str = "scenario"
     source: str = "scenario"
     instruments: tuple[Instrument, ...] = ()
+
+    def __repr__(self) -> str:
+        return inputs.brief(self, (f.name for f in fields(cast("Any", self))))
 
     def __post_init__(self) -> None:
         files: set[str] = set()

@@ -474,7 +474,6 @@ def merge_truths(tables: list[Table], truths: list[Truth], source: str) -> tuple
     return shared, {kind: landmarks for kind, landmarks in every.items() if landmarks}
 
 
-@dataclass(frozen=True)
 class Simulation(Brief):
     """One run of a scenario.
 

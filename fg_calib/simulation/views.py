@@ -6,7 +6,7 @@ is in a box, and one that is near another are rejected, and counted by reason.
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,6 @@ N_STARTS, N_STEPS = 4, 20
 that no start reaches."""
 
 
-@dataclass(frozen=True)
 class Candidates(FrozenArrays):
     """Configurations that can be had.
 

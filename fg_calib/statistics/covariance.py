@@ -18,7 +18,7 @@ estimate is known to be, whatever x_L, is that of the combination `x_K + G x_L`,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +31,6 @@ NO_ANGLE = 1.0
 """An angle of a pose with a larger sigma is not known, [rad]: near a pitch of a quarter turn yaw and roll are none."""
 
 
-@dataclass(frozen=True)
 class TangentCovariance(FrozenArrays):
     """The covariance in the tangent space of the variables, and the directions that nothing determines.
 
@@ -101,7 +100,6 @@ class TangentCovariance(FrozenArrays):
         return np.array([(at(h) - at(-h)) / (2.0 * h.sum()) for h in steps]).T
 
 
-@dataclass(frozen=True)
 class Spread(TangentCovariance):
     """The covariance of a solution, under the noise as it is taken to be and otherwise.
 

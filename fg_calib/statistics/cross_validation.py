@@ -23,7 +23,7 @@ References:
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Literal
 
@@ -32,7 +32,7 @@ from pydantic import computed_field
 from scipy import special
 
 from fg_calib import graph, inputs, parallel, robot
-from fg_calib.inputs import Figure, Floats, FrozenArrays, InputError, Integers, Limits, ProblemError, checked
+from fg_calib.inputs import Figure, Floats, FrozenArrays, InputError, Integers, Limits, ProblemError, Record, checked
 from fg_calib.job import Job
 from fg_calib.measurements import LANDMARKS, Dataset, Labels, Table
 from fg_calib.statistics.residual_table import MAX_OUTLIER_SHARE, HeldOut, pooled, residual_table, same_readings
@@ -55,7 +55,6 @@ NEEDED = {"station": 3} | {kind.name: kind.n_configurations for kind in LANDMARK
 """Configurations that must be left of those that see an anchor, a station, ...: fewer do not locate it."""
 
 
-@dataclass(frozen=True)
 class CrossValidation(FrozenArrays):
     """Result of a cross-validation.
 
@@ -238,8 +237,7 @@ def _observers(data: Dataset) -> Iterator[tuple[list[int], int]]:
         yield sorted(set(configurations)), NEEDED.get(kind, 1)
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(Record):
     """One limit, and what the held-out rows say of it.
 
     Attributes:
@@ -264,8 +262,7 @@ class Judgement:
     table: str = ""
 
 
-@dataclass(frozen=True)
-class Acceptance:
+class Acceptance(Record):
     """Outcome of all limits.
 
     Attributes:

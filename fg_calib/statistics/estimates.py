@@ -5,13 +5,13 @@ by less: by `sqrt(sigma^2 - s^2)`, s the posterior sigma of the joint value. The
 has a sigma of 1 for a healthy reading, however little the measurements say of its joint.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib import graph
-from fg_calib.inputs import Floats, FrozenArrays, Integers
+from fg_calib.inputs import Floats, FrozenArrays, Integers, Record
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level
@@ -20,8 +20,7 @@ LEAST_SHARE = 1e-3
 """Share of a reading's variance below which the measurements say nothing of its error."""
 
 
-@dataclass(frozen=True)
-class ParameterEstimate:
+class ParameterEstimate(Record):
     """One parameter of the robot after calibration.
 
     Attributes:
@@ -51,7 +50,6 @@ class ParameterEstimate:
     sigma_of_combination: float | None = None
 
 
-@dataclass(frozen=True)
 class FrameEstimate(FrozenArrays):
     """A measurement frame world_T_base.
 
@@ -67,7 +65,6 @@ class FrameEstimate(FrozenArrays):
     sigma: Floats
 
 
-@dataclass(frozen=True)
 class LandmarkEstimate(FrozenArrays):
     """A contact point, a target, an anchor, a plane, a board or an instrument's offset.
 
@@ -91,7 +88,6 @@ class LandmarkEstimate(FrozenArrays):
     units: tuple[str, ...] = ("m", "m", "m")
 
 
-@dataclass(frozen=True)
 class JointErrors(FrozenArrays):
     """Estimated joint values of the fitted configurations, of the joints that have noise.
 
@@ -128,8 +124,7 @@ class JointErrors(FrozenArrays):
         return np.where(n > 0, np.sqrt(total / np.maximum(n, 1)), np.nan)
 
 
-@dataclass(frozen=True)
-class Estimates:
+class Estimates(Record):
     """All that was estimated.
 
     Attributes:

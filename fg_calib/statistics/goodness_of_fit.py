@@ -26,7 +26,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +36,7 @@ from scipy import special
 
 from fg_calib import measurements, robot
 from fg_calib.graph import NoiseState, Solution, effect, mahalanobis_distances, noises_at
-from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
+from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers, Record
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel
@@ -72,8 +72,7 @@ _MEDIAN = 0.6744897501960817
 """Median of the size of a standard normal figure."""
 
 
-@dataclass(frozen=True)
-class KindFit:
+class KindFit(Record):
     """The fitted rows of one kind of noise.
 
     Attributes:
@@ -154,8 +153,7 @@ PREDICTION_VERDICTS = VERDICTS | {
 """Verdict on predicted rows."""
 
 
-@dataclass(frozen=True)
-class SuspectConfiguration:
+class SuspectConfiguration(Record):
     """A configuration whose rows are too large together.
 
     Attributes:
@@ -171,8 +169,7 @@ class SuspectConfiguration:
     expected: Figure
 
 
-@dataclass(frozen=True)
-class GrossErrors:
+class GrossErrors(Record):
     """The few measurements that make residuals of a fit too large.
 
     Attributes:
@@ -186,7 +183,6 @@ class GrossErrors:
     ratio: float
 
 
-@dataclass(frozen=True)
 class PredictedFit(FrozenArrays):
     """How well the calibrated arm predicts the test rows.
 
@@ -216,7 +212,6 @@ class PredictedFit(FrozenArrays):
     configurations: tuple[SuspectConfiguration, ...]
 
 
-@dataclass(frozen=True)
 class Goodness(FrozenArrays):
     """How well residuals and specified noise agree; arrays are in the order of the residual table, shape (n,).
 
@@ -256,8 +251,7 @@ class Goodness(FrozenArrays):
         return self.gross is not None and all(kind.verdict != "too small" for kind in self.kinds)
 
 
-@dataclass(frozen=True)
-class Fit:
+class Fit(Record):
     """How well a solution fits.
 
     Attributes:
@@ -301,8 +295,7 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
     )
 
 
-@dataclass(frozen=True)
-class JudgedRows:
+class JudgedRows(Record):
     """Rows that are judged together: those fitted, or those predicted.
 
     Attributes:
@@ -550,8 +543,7 @@ def upper_probability(ratio: float, nu: float, of_noise: float = np.inf) -> floa
     return float(special.gammaincc(nu / 2.0, nu / 2.0 * ratio))
 
 
-@dataclass(frozen=True)
-class ChiSquare:
+class ChiSquare(Record):
     """Chi-square of the fitted rows and the priors.
 
     Attributes:

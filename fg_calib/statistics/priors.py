@@ -46,13 +46,13 @@ References:
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import special
 
 from fg_calib import graph, parallel
-from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, SharedScale, checked
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Record, SharedScale, checked
 from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.variance_components import settle
@@ -120,8 +120,7 @@ def estimate_tolerances(
     )
 
 
-@dataclass(frozen=True)
-class Corrections:
+class Corrections(Record):
     """Information of the data on the corrections in prior sigmas.
 
     Attributes:
@@ -172,8 +171,7 @@ class ScalePosterior:
         )
 
 
-@dataclass(frozen=True)
-class EstimatedScales:
+class EstimatedScales(Record):
     """The posterior of the scales.
 
     Attributes:
@@ -272,8 +270,7 @@ MIN_SIGMA = 1e-3
 """Sigma of z below which data do not say more of a correction: rounding, and priors that alone hold a direction."""
 
 
-@dataclass(frozen=True)
-class Beyond:
+class Beyond(Record):
     """A correction that is too large for its prior sigma.
 
     Attributes:
@@ -289,7 +286,6 @@ class Beyond:
     is_place: bool
 
 
-@dataclass(frozen=True)
 class PriorFit(FrozenArrays):
     """How corrections and prior sigmas agree.
 

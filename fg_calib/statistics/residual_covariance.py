@@ -8,7 +8,7 @@ estimate is off, and -T F^T its covariance with the errors of configurations tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import scipy.sparse
@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
 from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, all_errors, loss_variance, reach
-from fg_calib.inputs import Booleans, Floats, Integers
+from fg_calib.inputs import Booleans, Floats, Integers, Record
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
 
@@ -26,8 +26,7 @@ FEW = 4
 """An error of more than one in so many rows is one of a covariance's low rank."""
 
 
-@dataclass(frozen=True)
-class ResidualCovariance:
+class ResidualCovariance(Record):
     """Covariance `D + L L^T + P M P^T` of rows.
 
     Attributes:

@@ -98,7 +98,6 @@ def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
     return replace(parts[0], table=table, n=int(n.sum()), few=few, outliers=outliers, **rms)
 
 
-@dataclass(frozen=True)
 class ResidualTable(FrozenArrays):
     """Every scalar residual, train and test, before and after, in its kind's unit. Words are codes: a table is long.
 

@@ -30,14 +30,14 @@ References:
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse
 
 from fg_calib import graph, parallel
-from fg_calib.inputs import Booleans, Floats, Integers, checked
+from fg_calib.inputs import Booleans, Floats, Integers, Record, checked
 
 Sparse = scipy.sparse.csr_array
 
@@ -67,8 +67,7 @@ MAX_EXACT, N_PROBES = 2000, 64
 TINY = 1e-100
 
 
-@dataclass(frozen=True)
-class NoiseComponents:
+class NoiseComponents(Record):
     """Noise of each origin by the residuals, with the noise as taken.
 
     Attributes:
