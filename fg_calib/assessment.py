@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import monitoring, parallel, statistics
-from fg_calib.diagnostics import LIKE_NOISE, MOST_ESTIMATED, Verdict, check_setup, judge
+from fg_calib import diagnostics, graph, monitoring, parallel, statistics
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.graph import Problem, Solution, problem_of, solve
 from fg_calib.inputs import Floats, FrozenArrays, InputError, Record, SolverError, as_figures, checked, escaped
 from fg_calib.job import Job
 from fg_calib.observability import Identifiability, Observability, identifiability_of
@@ -61,12 +59,12 @@ class Assessment(FrozenArrays):
     whole: statistics.Spread
     fit: statistics.Fit
     identifiability: Identifiability
-    verdict: Verdict
+    verdict: diagnostics.Verdict
     expected_error: ExpectedError | None
     acceptance: statistics.Acceptance | None = None
     cross_validation: statistics.CrossValidation | None = None
 
-    def with_held_out(self, others: Sequence[statistics.HeldOut], solution: Solution) -> Assessment:
+    def with_held_out(self, others: Sequence[statistics.HeldOut], solution: graph.Solution) -> Assessment:
         """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
 
         Args:
@@ -126,9 +124,9 @@ class Assessment(FrozenArrays):
             and verdict.change is None
             and fit.goodness.gross is None
             and not (too_large and self.identifiability.missing)
-            and all(kind.typical <= MOST_ESTIMATED for kind in too_large)
-            and (verdict.noise_like is None or verdict.noise_like > LIKE_NOISE)
-            and (fit.goodness.test is None or fit.goodness.test.p_value > LIKE_NOISE)
+            and all(kind.typical <= diagnostics.MOST_ESTIMATED for kind in too_large)
+            and (verdict.noise_like is None or verdict.noise_like > diagnostics.LIKE_NOISE)
+            and (fit.goodness.test is None or fit.goodness.test.p_value > diagnostics.LIKE_NOISE)
         )
 
     @property
@@ -152,7 +150,7 @@ def _figures(function: Callable[[Robot], ArrayLike], robot: Robot) -> Floats:
 
 
 @checked
-def solve_job(job: Job, problem: Problem | None = None) -> Solution:
+def solve_job(job: Job, problem: graph.Problem | None = None) -> graph.Solution:
     """The solution of a job: the best optimum that is found, with noise and prior scales estimated if it asks for that.
 
     Args:
@@ -163,15 +161,15 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
         ProblemError: The measurements lack what the model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    problem = problem or problem_of(job)
+    problem = problem or graph.problem_of(job)
     try:
-        solve_with = statistics.estimate_noise if job.options.estimate_noise else solve
+        solve_with = statistics.estimate_noise if job.options.estimate_noise else graph.solve
         solution = statistics.estimate_tolerances(problem, solve_with)
     except SolverError as error:
         for table in job.tables:
             if table.model is not None:
                 given = (job.robot, table.measurements, table.model, table.frame)
-                check = check_setup(*given, doubtful=True, table=table)
+                check = diagnostics.check_setup(*given, doubtful=True, table=table)
                 if check.explanations:
                     raise SolverError(f"{error}; {check}") from error
         raise
@@ -180,7 +178,7 @@ def solve_job(job: Job, problem: Problem | None = None) -> Solution:
 
 @checked
 @parallel.single_threaded
-def assess(solution: Solution) -> Assessment:
+def assess(solution: graph.Solution) -> Assessment:
     """Covariance, goodness of fit, residuals, identifiability and verdict of a solution.
 
     The covariance comes from a singular value decomposition of the whitened Jacobian of data and priors, its
@@ -202,7 +200,7 @@ def assess(solution: Solution) -> Assessment:
     table = table.without(goodness.unknown(table))
     chi_square, priors = statistics.chi_square(solution, spread), statistics.judge_priors(solution, spread)
     fit = statistics.Fit(chi_square, table, goodness, priors)
-    verdict = judge(solution, spread, fit, identifiability)
+    verdict = diagnostics.judge(solution, spread, fit, identifiability)
     spread = spread.inflated(verdict.variance)
     whole = statistics.with_left_out(solution, spread)
     assessment = Assessment(

@@ -22,14 +22,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import inputs, io
+from fg_calib import inputs, io, parallel
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.graph import Knowledge, Solution, Variables, build_variables, frame_of, tables_of
 from fg_calib.inputs import Brief, CalibrationError, Floats, InputError, Options, Record, SolverError, checked
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
-from fg_calib.parallel import single_threaded, tell
 from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
 from fg_calib.report import Drawing, ReportData, draw, format_result, judged, notebook_html, notes_of, pages_of, summary
 from fg_calib.robot import Robot, names_of
@@ -94,9 +93,9 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Ca
     given = job if isinstance(job, Job) else io.read_job(job)
     options = given.options
     try:
-        tell("calibrating")
+        parallel.tell("calibrating")
         solution = solve_job(given)
-        tell("judging the result")
+        parallel.tell("judging the result")
         assessment = assess(solution)
         if options.folds is not None:
             folds = cross_validate(given, solve_job, options.folds, executor=executor)
@@ -512,7 +511,7 @@ class Calibration(Record, repr=False, eq=False):
         return self.result.trustworthy
 
     @checked
-    @single_threaded
+    @parallel.single_threaded
     def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
         """Predict the true tool poses at joint readings, with their uncertainty.
 
@@ -558,7 +557,7 @@ class Calibration(Record, repr=False, eq=False):
 
 
 @checked
-@single_threaded
+@parallel.single_threaded
 def predict(
     calibration: Calibration | Path | str,
     readings: ArrayLike | None = None,

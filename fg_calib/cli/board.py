@@ -32,20 +32,19 @@ def board(
     """Make tables of images of a board: its corners, and its poses with their covariances."""
     if (camera is None) != estimate_camera:
         raise typer.BadParameter("one of the two is needed", param_hint="--camera and --estimate-camera")
-    from fg_calib import importers
-    from fg_calib.io import Units, read_bytes, read_camera, require_own, require_writable
+    from fg_calib import importers, io
 
     importers.load_opencv()
-    require_writable(out)
+    io.require_writable(out)
     target, files = importers.read_calibration_board(board), importers.image_files(images)
-    require_own(out, importers.BOARD_FILES)
+    io.require_own(out, importers.BOARD_FILES)
     readings = None if configurations is None else importers.read_readings(configurations)
     if camera is not None:
-        read_camera(camera)  # before the images, which take their time
+        io.read_camera(camera)  # before the images, which take their time
     found, without, size = importers.read_corners(files, target)
-    given, content = (None, None) if camera is None else (read_camera(camera, size), read_bytes(camera))
+    given, content = (None, None) if camera is None else (io.read_camera(camera, size), io.read_bytes(camera))
     fit = importers.fit_board(target, found, size, given)
-    tables = importers.BoardTables(fit, without, readings, Units(length, angle), content)
+    tables = importers.BoardTables(fit, without, readings, io.Units(length, angle), content)
     names = importers.write_board_tables(out, tables)
     show_result(as_json, tables.document, lambda: _report(tables))
     say(f"wrote {', '.join(names)} to {out}")

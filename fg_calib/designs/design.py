@@ -15,16 +15,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib import inputs, job, prediction
+from fg_calib import inputs, job, measurements, parallel, prediction
 from fg_calib.designs.candidates import Pool, build_pool, draw_groups
 from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
 from fg_calib.designs.information import N_TASK, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
 from fg_calib.inputs import Floats, FrozenArrays, InputError, Integers, ProblemError, check_number, checked
-from fg_calib.measurements import Table
 from fg_calib.observability import Observability, ObservedQuantities
-from fg_calib.parallel import single_threaded, tell
 from fg_calib.robot import Robot, random_readings
 from fg_calib.simulation import MOST_DRAWN, Box, Configurations, Scenario
 
@@ -68,7 +66,7 @@ class Design(FrozenArrays, repr=False):
     """
 
     pool: Pool
-    tables: tuple[Table, ...]
+    tables: tuple[measurements.Table, ...]
     criterion: Criterion
     task: Task
     readings: Floats
@@ -99,7 +97,7 @@ class Design(FrozenArrays, repr=False):
 
 
 @checked
-@single_threaded
+@parallel.single_threaded
 def design(
     of: Scenario | job.Job,
     *,
@@ -141,7 +139,7 @@ def design(
     draw = dict(zip(("candidates", "task", "random"), np.random.default_rng(seed).spawn(3), strict=True))
     if not any(p.estimated for p in of.robot.parameters):
         raise ProblemError(f"robot {of.robot.name}", "nothing to estimate", "at least one parameter that is not fixed")
-    tell("looking for candidates")
+    parallel.tell("looking for candidates")
     pool = _build_pool(of, candidates, given, n_candidates, draw["candidates"])
     readings = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
     blind_to_base = ObservedQuantities.of(pool.problem).blind_to_base
@@ -231,10 +229,10 @@ def design_from_pool(
         raise InputError("candidates", "none at which anything is measured", "some")
     system = build_system(pool.rows, pool.known, task.quadratic_form(pool.problem)).with_known(pool.given)
     chooser = Chooser(system.select(measurable), criterion, _error_of_formed_pairs(pool, task, measurable))
-    tell("choosing")
+    parallel.tell("choosing")
     wanted = max(1, min((n or N_POSES) - len(pool.references), len(measurable)))
     found = chooser.best(wanted, generator) if target is None else chooser.reaching(target)
-    tell("working out what to expect")
+    parallel.tell("working out what to expect")
     chosen = measurable[found]
     ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
     poses = np.concatenate([pool.given, ordered])
@@ -288,7 +286,7 @@ def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Call
     return error
 
 
-def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> Integers:
+def _configurations_of(pool: Pool, ordered: Integers, tables: list[measurements.Table]) -> Integers:
     """Configurations of the problem to visit: references that have pairs, then one a pose."""
     last = {number: k for k, number in enumerate(pool.pose_of.tolist())}
     used = {name for table in tables for name in table.measurements.ids.tolist()}
@@ -296,7 +294,7 @@ def _configurations_of(pool: Pool, ordered: Integers, tables: list[Table]) -> In
     return np.array([*references, *(last[number] for number in ordered.tolist())], dtype=np.int64)
 
 
-def rename_configurations(table: Table, names: Mapping[str, str]) -> Table:
+def rename_configurations(table: measurements.Table, names: Mapping[str, str]) -> measurements.Table:
     """A table with other names of its configurations."""
     ids = np.array([names[name] for name in table.measurements.ids.tolist()])
     return replace(table, measurements=replace(table.measurements, ids=ids))

@@ -13,13 +13,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib import assessment, simulation
+from fg_calib import assessment, graph, measurements, observability, simulation
 from fg_calib.designs.candidates import Pool, pool_of
-from fg_calib.graph import Problem, pose_of, relinearized_at
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
-from fg_calib.measurements import INSTRUMENTS, Measurements, Noise
-from fg_calib.observability import places_of
 from fg_calib.robot import pose
 from fg_calib.simulation import Configurations, Errors, Instrument, Placement, Plane, RandomReadings, Scenario, Spot
 
@@ -27,7 +24,7 @@ MIN_CONE_RAD = np.deg2rad(60.0)
 """New views may be at least as oblique as this angle between a board's normal and the direction to the camera."""
 
 
-def solve_for_design(job: Job) -> Problem:
+def solve_for_design(job: Job) -> graph.Problem:
     """Solve a job, with everything estimated; the problem at its solution.
 
     Raises:
@@ -43,10 +40,10 @@ def solve_for_design(job: Job) -> Problem:
     solution = assessment.solve_job(replace(job, options=options))
     if solution.problem.evaluated:
         raise InputError(str(job.path or "job"), "test rows alone", "train rows: what was measured is what counts")
-    return relinearized_at(solution.problem, solution.parameters)
+    return graph.relinearized_at(solution.problem, solution.parameters)
 
 
-def pool_of_rows(problem: Problem, source: str) -> Pool:
+def pool_of_rows(problem: graph.Problem, source: str) -> Pool:
     """The pool of a solved problem's train rows.
 
     Pairs must share one reference pose: the information of any other pair belongs to two poses.
@@ -60,7 +57,7 @@ def pool_of_rows(problem: Problem, source: str) -> Pool:
     return replace(pool, found={"": simulation.Candidates(pool.readings, len(pool.readings), {})})
 
 
-def scenario_of(problem: Problem, configurations: Configurations | None = None, source: str = "job") -> Scenario:
+def scenario_of(problem: graph.Problem, configurations: Configurations | None = None, source: str = "job") -> Scenario:
     """The scenario in which a solved problem's tables were measured.
 
     Args:
@@ -83,7 +80,7 @@ def scenario_of(problem: Problem, configurations: Configurations | None = None, 
         robot=problem.robot.with_values(problem.start[problem.variables.robot_span]),
         errors=Errors("values", {}),
         configurations=configurations or RandomReadings(1),
-        noise=Noise(joint=tuple(problem.sigma_joint.tolist())),
+        noise=measurements.Noise(joint=tuple(problem.sigma_joint.tolist())),
         frame="base",
         job={"gauge": problem.options.gauge},
         name=source,
@@ -92,9 +89,9 @@ def scenario_of(problem: Problem, configurations: Configurations | None = None, 
     )
 
 
-def _instrument_of(problem: Problem, number: int, name: str, configurations: Configurations | None) -> Instrument:
+def _instrument_of(problem: graph.Problem, number: int, name: str, configurations: Configurations | None) -> Instrument:
     """The instrument that measured a table, landmarks where the solution puts them."""
-    table, places = problem.data.tables[number], places_of(problem, problem.start)
+    table, places = problem.data.tables[number], observability.places_of(problem, problem.start)
     m, model = table.measurements, table.model
     given: dict[str, Any] = {"name": name, "model": model, "noise": _noise_of(problem, number)}
     given["configurations"] = configurations or RandomReadings(1)
@@ -106,7 +103,7 @@ def _instrument_of(problem: Problem, number: int, name: str, configurations: Con
 
     frame: Placement | str = "base"
     if table.unknown_frame:
-        found = pose_of(places["X", problem.data.labels[number]])
+        found = graph.pose_of(places["X", problem.data.labels[number]])
         frame = Placement(found.rotation().matrix(), found.translation())
     if m.groups is not None:
         given |= {"model": "distance", "sockets": {one: Spot(places["L", one]) for one in m.groups.names}}
@@ -123,7 +120,7 @@ def _instrument_of(problem: Problem, number: int, name: str, configurations: Con
         given |= {"planes": planes, "contact": contact}
     elif table.fixed_camera:
         given |= {"fixed": True, "frame": frame}
-    elif "board" in INSTRUMENTS[str(model)].labels:
+    elif "board" in measurements.INSTRUMENTS[str(model)].labels:
         robot = problem.robot.with_values(problem.start[problem.variables.robot_span])
         boards = {one: places["B", one] for one in _names(m, "board") or ("board",)}
         given = given | _seen(boards, pose(robot, m.readings).position)
@@ -133,7 +130,7 @@ def _instrument_of(problem: Problem, number: int, name: str, configurations: Con
     return Instrument(**given)
 
 
-def _names(m: Measurements, column: str) -> tuple[str, ...]:
+def _names(m: measurements.Measurements, column: str) -> tuple[str, ...]:
     """Landmarks that a column names; none without such a column."""
     return m.labels[column].names if column in m.labels else ()
 
@@ -144,7 +141,7 @@ def _plane(c: Floats, f: Floats) -> Plane:
     return Plane(n, float(n @ f))
 
 
-def _noise_of(problem: Problem, number: int) -> Noise:
+def _noise_of(problem: graph.Problem, number: int) -> measurements.Noise:
     """Specified noise of a table's train rows, times the factors where noise was estimated."""
     table = problem.data.tables[number]
     m, formed = table.measurements, dict[str, str]()
@@ -162,7 +159,7 @@ def _noise_of(problem: Problem, number: int) -> Noise:
         if np.isfinite(sigma).any():
             factor = problem.state.factors.get((number, formed.get(kind, kind)), 1.0)
             specified[kind] = factor * float(np.sqrt(np.nanmean(np.square(sigma))))
-    return Noise().updated(**specified)
+    return measurements.Noise().updated(**specified)
 
 
 def _seen(boards: Mapping[str, Floats], tool: Floats) -> dict[str, Any]:

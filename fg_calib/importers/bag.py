@@ -39,9 +39,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from fg_calib import inputs
+from fg_calib import inputs, io
 from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, FrozenArrays, InputError, check_number, checked
-from fg_calib.io import joint_columns, require_absent, write_csv
 from fg_calib.robot import Robot, build_chain, forward
 
 
@@ -429,13 +428,13 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
         InputError: The table cannot be written, or is there already.
     """
     path = Path(path)
-    require_absent(path.parent, [path.name])
+    io.require_absent(path.parent, [path.name])
     columns: dict[str, Any] = {
         "id": np.array(stops.ids),
         "begin": np.round(stops.interval[:, 0], 3),
         "seconds": np.round(np.diff(stops.interval, axis=1)[:, 0], 3),
         "samples": stops.samples.astype(np.int64),
-        **dict(zip(joint_columns(robot), stops.means["joint"].T, strict=True)),
+        **dict(zip(io.joint_columns(robot), stops.means["joint"].T, strict=True)),
         **dict(zip("xyz", stops.means["position"].T, strict=True)),
     }
     if "orientation" in stops.means:
@@ -444,7 +443,7 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
     for kind, prefix in (("position", "sigma_"), ("orientation", "sigma_r")):
         if kind in stops.sigmas:
             columns |= {f"{prefix}{axis}": stops.sigmas[kind][:, k] for k, axis in enumerate("xyz")}
-    write_csv(path, columns)
+    io.write_csv(path, columns)
 
 
 JOINT_TYPE = "sensor_msgs/msg/JointState"

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import inputs
+from fg_calib import inputs, measurements
 from fg_calib.inputs import InputError, checked, shown
 from fg_calib.io.tables import OF_CONFIGURATIONS, OF_PAIRS, ROUNDED, Table, measurements_of
 from fg_calib.io.yaml import Units
-from fg_calib.measurements import Column, Measurements, Noise
 
 COLUMNS: Mapping[str, str] = {
     "ids": "id",
@@ -41,7 +40,7 @@ def read_arrays(
     sigma_joint: Any = 0.0,
     source: str = "measurements",
     **arrays: ArrayLike | None,
-) -> Measurements:
+) -> measurements.Measurements:
     """Measurements from arrays in [m] and [rad], which are copied; n is the number of configurations.
 
     Args:
@@ -82,13 +81,13 @@ def read_arrays(
     each = {name: (OF_CONFIGURATIONS[COLUMNS.get(name, name)], values) for name, values in given.items()}
     table = _table_of(source, each, len(q), **{f"q{i + 1}": joint for i, joint in enumerate(q.T)})
     between = None if pairs is None else _pairs_of(pairs)
-    found = measurements_of(table, q, between, Units(), Noise(joint=sigma_joint))
+    found = measurements_of(table, q, between, Units(), measurements.Noise(joint=sigma_joint))
     if rotation is None:
         return found
     return found.with_values({"rotation": inputs.as_rotations("rotation", rotation, len(q))})
 
 
-def _columns_of(place: str, column: Column, given: Any, n: int) -> dict[str, Any]:
+def _columns_of(place: str, column: measurements.Column, given: Any, n: int) -> dict[str, Any]:
     """Columns of n rows that an array holds.
 
     Raises:
@@ -127,14 +126,14 @@ def _pairs_of(given: Any) -> Table:
         raise InputError("pairs", f"found {shown(given)}", expected)
     arrays = {key: frame[key] for key in (frame if isinstance(frame, Mapping) else frame.columns)}
     known = {"test" if name == "split" else name: of for name, of in OF_PAIRS.items()}
-    known |= {key: Column((key,), "", "") for key in ("a", "b")}
+    known |= {key: measurements.Column((key,), "", "") for key in ("a", "b")}
     inputs.check_names("pairs", arrays, list(known), "key")
     arrays |= {key: inputs.as_array(f"pairs: {key}", arrays[key], "iuUO", "ids") for key in ("a", "b") if key in arrays}
     n = max((np.size(values) for values in arrays.values()), default=0)
     return _table_of("pairs", {f"pairs: {key}": (known[key], values) for key, values in arrays.items()}, n)
 
 
-def _table_of(name: str, arrays: Mapping[str, tuple[Column, Any]], n: int, **more: Any) -> Table:
+def _table_of(name: str, arrays: Mapping[str, tuple[measurements.Column, Any]], n: int, **more: Any) -> Table:
     """A table of arrays of n rows, each with the columns that it holds, and of more columns."""
     each = [_columns_of(place, column, values, n) for place, (column, values) in arrays.items()]
     return Table.read({column: values for of in (more, *each) for column, values in of.items()}, name)

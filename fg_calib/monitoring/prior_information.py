@@ -14,9 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib import graph, observability, parallel
-from fg_calib.inputs import Floats, Options, Record
-from fg_calib.measurements import LANDMARKS, Measurements, Table
+from fg_calib import graph, inputs, measurements, observability, parallel
 from fg_calib.robot import Robot
 
 Words = NDArray[np.uint64]
@@ -30,7 +28,7 @@ SAME_SHARE = 0.5
 _RESOLUTION, _NOT_MEASURED, _FACTOR = 1e-12, 9e6, np.uint64(0x9E3779B97F4A7C15)
 
 
-class Calibrated(Record):
+class Calibrated(inputs.Record):
     """An arm that was calibrated before.
 
     Attributes:
@@ -43,9 +41,9 @@ class Calibrated(Record):
     """
 
     robot: Robot
-    values: Floats
+    values: inputs.Floats
     knowledge: graph.Knowledge | None
-    options: Options
+    options: inputs.Options
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     noise_degrees: float | None = None
 
@@ -68,7 +66,7 @@ class Calibrated(Record):
         return self.robot.with_values(self.values)
 
     @property
-    def fixed_options(self) -> Options:
+    def fixed_options(self) -> inputs.Options:
         """Options with noise and prior sigmas as estimated."""
         return replace(self.options, estimate_noise=False, estimate_tolerance=None)
 
@@ -111,7 +109,7 @@ def knowledge_of(solution: graph.Solution) -> graph.Knowledge | None:
     return replace(_known_at(problem, solution.parameters, with_loss=True), views=views, nominal=nominal)
 
 
-def at_nominal(problem: graph.Problem, before: Floats) -> tuple[graph.Problem, Floats]:
+def at_nominal(problem: graph.Problem, before: inputs.Floats) -> tuple[graph.Problem, inputs.Floats]:
     """A problem and the parameter vector at which one asks what its rows, and those before, determine.
 
     Args:
@@ -130,7 +128,7 @@ def at_nominal(problem: graph.Problem, before: Floats) -> tuple[graph.Problem, F
     return replace(problem, knowledge=known), x
 
 
-def _known_at(problem: graph.Problem, x: Floats, *, with_loss: bool) -> graph.Knowledge:
+def _known_at(problem: graph.Problem, x: inputs.Floats, *, with_loss: bool) -> graph.Knowledge:
     """Information of a problem's rows, and of those before, at a parameter vector; without the arm's tolerances."""
     v, known, unknowns = problem.variables, problem.knowledge, problem.data.landmarks
     staying = {name: _place(problem, name) for name in unknowns.keys if name[0] in graph.STAYING}
@@ -157,23 +155,23 @@ def _place(problem: graph.Problem, name: graph.Name) -> NDArray[np.int64] | None
     return graph.coordinates_of(problem.variables, problem.data.landmarks, name)
 
 
-def fingerprints(tables: Sequence[Table]) -> tuple[str, ...]:
+def fingerprints(tables: Sequence[measurements.Table]) -> tuple[str, ...]:
     """Fingerprints of the train rows of tables, 12 hexadecimal digits each, sorted; at most 1000 a table."""
     smallest = [np.sort(_of_rows(table.measurements) >> np.uint64(16))[:MAX_FINGERPRINTS] for table in tables]
     return tuple(sorted({f"{one:012x}" for some in smallest for one in some.tolist()}))
 
 
-def counted_before(table: Table, known: Collection[str]) -> bool:
+def counted_before(table: measurements.Table, known: Collection[str]) -> bool:
     """Whether half of a table's rows are among fingerprints."""
     own = fingerprints([table])
     return bool(own) and sum(one in known for one in own) >= SAME_SHARE * len(own)
 
 
-def _of_rows(m: Measurements) -> Words:
+def _of_rows(m: measurements.Measurements) -> Words:
     """Hashes of what was measured at, and between, configurations."""
     given = [v for v in (m.position, m.rotation, m.image, *m.columns.values()) if v is not None]
     values = [v.reshape(len(m.readings), -1) for v in given]
-    labels = [*(m.labels.get(kind.name) for kind in LANDMARKS.values()), m.groups]
+    labels = [*(m.labels.get(kind.name) for kind in measurements.LANDMARKS.values()), m.groups]
     named = [one for one in labels if one is not None]
     codes = [np.array([*(zlib.crc32(n.encode()) for n in of.names), 0], dtype=np.uint64)[of.index] for of in named]
     touched = np.zeros(len(m.readings), dtype=np.bool_) if m.groups is None else m.groups.index >= 0

@@ -11,11 +11,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from fg_calib import inputs, monitoring
 from fg_calib.baseline import ESTIMATORS, Comparison, Estimate
 from fg_calib.diagnostics import probability
-from fg_calib.inputs import InputError
 from fg_calib.io import NOISE_UNITS, Result, Run
-from fg_calib.monitoring import Check, Explanation
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, figure, in_words, line, section, table_of
 from fg_calib.report.text import summary
@@ -164,7 +163,7 @@ def changes(old: Result, new: Result) -> list[dict[str, Any]]:
         InputError: The calibrations are of different robots.
     """
     if [p.name for p in old.parameters] != [p.name for p in new.parameters]:
-        raise InputError(new.robot, "other parameters", f"those of {old.robot}")
+        raise inputs.InputError(new.robot, "other parameters", f"those of {old.robot}")
     rows = []
     for a, b in zip(old.parameters, new.parameters, strict=True):
         if a.identifiability == b.identifiability == "fixed":
@@ -245,7 +244,7 @@ def named(parameters: Sequence[str]) -> str:
     return " + ".join(parameters)
 
 
-def check_document(found: Check) -> dict[str, Any]:
+def check_document(found: monitoring.Check) -> dict[str, Any]:
     """A check for programs, in [m] and [rad]."""
     document = tables.document_of("check", **vars(found))
     for e in document["explanations"]:
@@ -255,7 +254,7 @@ def check_document(found: Check) -> dict[str, Any]:
     return document
 
 
-def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
+def build_check_report(found: monitoring.Check, joint_units: Sequence[str]) -> Group:
     """A check for the terminal.
 
     Args:
@@ -276,13 +275,13 @@ def build_check_report(found: Check, joint_units: Sequence[str]) -> Group:
     )
 
 
-def _rms_errors(found: Check) -> Table:
+def _rms_errors(found: monitoring.Check) -> Table:
     kinds = ((kind, NOISE_UNITS.get(kind, "m"), rms) for kind, rms in found.rms.items())
     rows = [(kind, unit, rms, found.noise[kind], found.limits.get(kind)) for kind, unit, rms in kinds]
     return table_of(("", "|unit", "error|q| ", "specified noise|q| ", "limit|q| "), rows)
 
 
-def _explanations(explanations: Sequence[Explanation]) -> Table:
+def _explanations(explanations: Sequence[monitoring.Explanation]) -> Table:
     rows = []
     for e in explanations:
         word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "no: these rows rule it out"
@@ -294,7 +293,7 @@ def _explanations(explanations: Sequence[Explanation]) -> Table:
     return table_of(columns, rows, wrap=True)
 
 
-def _conclusions(found: Check) -> Iterator[str]:
+def _conclusions(found: monitoring.Check) -> Iterator[str]:
     likely = [e for e in found.explanations if e.likely]
     if likely and likely[0].same:
         yield f"{likely[0].parameters[0]} is equivalent to {', '.join(likely[0].same)} for every position of the tool"
@@ -307,7 +306,7 @@ def _conclusions(found: Check) -> Iterator[str]:
         yield "do not deploy: residuals above noise remain after the most likely change"
 
 
-def _advice(found: Check, joint_units: Sequence[str]) -> list[Content]:
+def _advice(found: monitoring.Check, joint_units: Sequence[str]) -> list[Content]:
     advice = found.advice
     if advice is None:
         return []

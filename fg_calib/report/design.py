@@ -10,10 +10,9 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table as Shown
 
-from fg_calib import inputs, measurements, observability, prediction, simulation
+from fg_calib import inputs, measurements, observability, prediction, report, simulation
 from fg_calib.designs import Design
 from fg_calib.io import Units, fill_folder, require_absent, write_csv, write_robot, write_urdf
-from fg_calib.report import tables
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.predict import FRAMES
 from fg_calib.report.tables import in_words, line, section, table_of
@@ -28,7 +27,7 @@ UNKNOWN_ABOVE = 10.0
 
 def design_document(design: Design) -> dict[str, Any]:
     """A design for programs, in [m] and [rad]; null for what is unknown."""
-    return tables.document_of(
+    return report.tables.document_of(
         "design",
         design,
         "criterion n target reached expected before random travel",
@@ -57,7 +56,7 @@ def build_design_report(design: Design) -> Group:
         for p in design.curve
     ]
     columns = ("poses|>", "designed mm|>", "random mm|>", "80 % of random|>")
-    return tables.report(
+    return report.tables.report(
         line(_headline(design), "bold"),
         *section("Expected", *_expected(design)),
         *section("Poses and accuracy", table_of(columns, curve)),
@@ -91,7 +90,7 @@ def _poses(design: Design) -> Shown:
     with_table = bool(np.any(design.group != ""))
     tables_of = [[group or "all others"] * with_table for group in design.group]
     rows = [(name, *q, *of) for name, q, of in zip(design.ids, design.readings, tables_of, strict=True)]
-    columns = ("pose", *tables.joint_columns(design.pool.robot, ":z.1f"), *["table"] * with_table)
+    columns = ("pose", *report.tables.joint_columns(design.pool.robot, ":z.1f"), *["table"] * with_table)
     return table_of(columns, rows, most=MAX_POSES_LISTED)
 
 
@@ -168,7 +167,7 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     robot = design.pool.robot if design.pool.before is None else design.pool.before.robot
     scenario = design.pool.scenario
     measured = design.tables if scenario is not None else ()
-    files: dict[str, Any] = {DESIGN: tables.json_text(design_document(design))}
+    files: dict[str, Any] = {DESIGN: report.tables.json_text(design_document(design))}
     files |= {"design.svg": standalone([draw_design(design)])}
     files[CONFIGURATIONS] = partial(write_csv, columns=_configurations(design, robot, units))
     for t in measured:

@@ -13,14 +13,12 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
-from fg_calib import assessment, graph, measurements, prediction
+from fg_calib import assessment, graph, inputs, measurements, prediction, statistics
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
-from fg_calib.inputs import LIMITED, Booleans, Floats, Record
 from fg_calib.io import Result, key_of
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
 from fg_calib.robot import Robot
-from fg_calib.statistics import OUTLIER_WEIGHT, PREDICTION_VERDICTS, VERDICTS, Judgement, KindFit, TangentCovariance
 
 if TYPE_CHECKING:
     import polars as pl
@@ -29,7 +27,7 @@ UNMOVED = 1e-9
 """How far an estimate that no step meant to move may be from its start, [m] and [rad]."""
 
 
-class ReportData(Record):
+class ReportData(inputs.Record):
     """Data of the report, the page and the figures of a calibration.
 
     Attributes:
@@ -42,7 +40,7 @@ class ReportData(Record):
 
     result: Result
     robot: Robot
-    posterior: TangentCovariance
+    posterior: statistics.TangentCovariance
     configurations: pl.DataFrame | None
     residuals: pl.DataFrame | None
 
@@ -52,13 +50,13 @@ class ReportData(Record):
         return "test" if self.result.rms_after("test") else "train"
 
     @cached_property
-    def readings(self) -> Floats:
+    def readings(self) -> inputs.Floats:
         """Readings of the measured configurations, shape (n, n_joints), [rad] (prismatic: [m])."""
         assert self.configurations is not None
         return self.configurations.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
 
     @cached_property
-    def held_out(self) -> Booleans:
+    def held_out(self) -> inputs.Booleans:
         """Which configurations were held out, shape (n,)."""
         assert self.configurations is not None
         return (self.configurations["split"] == "test").to_numpy()
@@ -71,7 +69,7 @@ class ReportData(Record):
         return prediction.predict_errors(self.robot, self.posterior, self.readings, fitted=self.result.free_of_frame)
 
     @cached_property
-    def rms(self) -> tuple[str, Floats] | None:
+    def rms(self) -> tuple[str, inputs.Floats] | None:
         """The kind of residual that is nearest to the tool's position, and its RMS by configuration in the unit shown.
 
         Shape (n,), nan where a configuration has none; None where there is no such kind.
@@ -137,11 +135,11 @@ def verdict_word(result: Result) -> str:
     return "DOUBTFUL" if result.findings else "GOOD, with warnings" if result.reservations else "GOOD"
 
 
-def judged(judgements: Iterable[Judgement]) -> list[str]:
+def judged(judgements: Iterable[statistics.Judgement]) -> list[str]:
     """A line a limit: `PASS: position 0.31 mm (RMS of 30 held-out measurements), limit 0.5 mm`."""
     lines = []
     for one in judgements:
-        unit = LIMITED[one.kind]
+        unit = inputs.LIMITED[one.kind]
         error = "" if one.error is None else f" {in_words(one.error, unit)} (RMS of {one.n} held-out measurements)"
         reason = f": {one.reason}" if one.reason else ""
         of = f" of {one.table}" if one.table else ""
@@ -187,7 +185,7 @@ def _statistics(result: Result) -> Table:
     return table_of(("", ""), [row for row in rows.items() if row[1]])
 
 
-def _named(result: Result, fit: KindFit) -> str:
+def _named(result: Result, fit: statistics.KindFit) -> str:
     return fit.kind if len(result.tables) == 1 else f"{fit.kind} of {result.tables[fit.table][0]}"
 
 
@@ -195,7 +193,7 @@ def _goodness(result: Result, robot: Robot) -> list[Content]:
     """Specified and estimated noise by kind, and what their ratio means."""
     factors, fits, rows = result.noise_factors, tuple(result.goodness.values()), list[tuple[Any, ...]]()
     for fit in fits:
-        specified, ratio, words = fit.specified_sigma_rms, fit.observed_over_specified, VERDICTS[fit.verdict]
+        specified, ratio, words = fit.specified_sigma_rms, fit.observed_over_specified, statistics.VERDICTS[fit.verdict]
         if factors is not None:
             ratio, words = fit.factor, _estimated_noise(result, key_of(fit, fits))
         rows.append((_named(result, fit), fit.unit, specified, ratio * specified, ratio, fit.p_value, words))
@@ -222,7 +220,7 @@ def _prediction(result: Result) -> Iterator[Content]:
     if (fit := result.test) is None:
         return
     ratios = [(k.n, k.observed_over_specified / k.factor, k.p_value) for k in fit.kinds]
-    words = [PREDICTION_VERDICTS[k.verdict] for k in fit.kinds]
+    words = [statistics.PREDICTION_VERDICTS[k.verdict] for k in fit.kinds]
     rows = [(_named(result, k), *of, word) for k, of, word in zip(fit.kinds, ratios, words, strict=True)]
     yield table_of(("", "rows|d", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
     if fit.n_outliers:
@@ -384,7 +382,7 @@ def _frames(result: Result) -> list[Section]:
     return sections
 
 
-def _vector(values: Floats, *units: str) -> str:
+def _vector(values: inputs.Floats, *units: str) -> str:
     return "  ".join(map(figure, values.tolist(), units))
 
 
@@ -423,7 +421,7 @@ def notes_of(solution: graph.Solution, assessed: assessment.Assessment) -> Itera
         yield f"{formed} and counted as independent: with many more pairs than poses the sigmas are too small"
     yield from _noise_notes(solution, assessed)
     if weights is not None:
-        n = sum(int(np.sum(w[s.train] < OUTLIER_WEIGHT)) for s, w in zip(blocks, weights, strict=True))
+        n = sum(int(np.sum(w[s.train] < statistics.OUTLIER_WEIGHT)) for s, w in zip(blocks, weights, strict=True))
         lost = f"{n} of {sum(len(s.train) for s in blocks)} measurements lost more than half their weight"
         yield f"loss {problem.options.loss}: {lost} and do not count in chi-square"
     yield from _undetermined(solution, assessed)

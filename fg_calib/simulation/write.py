@@ -13,8 +13,7 @@ import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib import io
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError, checked
+from fg_calib import inputs, io
 from fg_calib.io import NOISE_UNITS, Units
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Measurements, Pairs, Table
 from fg_calib.robot import Robot, yaw_pitch_roll
@@ -30,7 +29,7 @@ MEASURED = (*"xyz", "qx", "qy", "qz", "qw", "angle", *"uv", *GENERIC_COLUMNS)
 """Columns of measured values."""
 
 
-@checked
+@inputs.checked
 def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, ...]:
     """Write a simulation as a calibration job that runs as it is, all of its files or none.
 
@@ -70,7 +69,7 @@ def write_simulation(folder: Path | str, simulation: Simulation) -> tuple[str, .
     job = folder / "calibration.yaml"
     words, _, rest = io.read_text(job).partition("\n") if io.exists(job) else ("", "", "")
     if words.startswith(_FIRST_WORDS) and not words.endswith(_digest(folder, rest)):
-        raise InputError(str(folder), "files that were changed since they were simulated", "another folder")
+        raise inputs.InputError(str(folder), "files that were changed since they were simulated", "another folder")
     own = {"calibration.yaml": _FIRST_WORDS.encode()}
     io.fill_folder(folder, files, own | dict.fromkeys(files, b"") | own)
     return tuple(sorted(files))
@@ -170,7 +169,7 @@ def _yaml(document: Mapping[str, Any]) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
 
 
-def joint_noise(sigma: Floats, robot: Robot, units: Units) -> float | list[float]:
+def joint_noise(sigma: inputs.Floats, robot: Robot, units: Units) -> float | list[float]:
     """Sigma of the joint readings as a job specifies it: one value, or one a joint."""
     values = [units.from_si(s, joint.unit) for s, joint in zip(sigma, robot.joints, strict=True)]
     return values[0] if len(set(values)) == 1 else values
@@ -195,10 +194,10 @@ def _entry(table: Table, units: Units) -> dict[str, Any]:
     entry: dict[str, Any] = {"table": m.source, "model": table.model}
     if between is not None:
         entry["pairs"] = between[0].source
-    elif table.model in PAIR_MODELS and m.groups is None:
+    elif table.model in inputs.PAIR_MODELS and m.groups is None:
         random = {"random": pairing.count, "seed": pairing.seed}
         entry["pairing"] = random if pairing.strategy == "random" else pairing.strategy
-    if table.model in POSE_MODELS or table.fixed_camera:
+    if table.model in inputs.POSE_MODELS or table.fixed_camera:
         entry["frame"] = table.frame
     if table.offset:
         entry["offset"] = "estimate"
@@ -221,7 +220,7 @@ def _noise(m: Measurements, units: Units) -> dict[str, float]:
 # --- the truth --------------------------------------------------------------------------------------------------------
 
 
-def _xyz(point: Floats, units: Units) -> dict[str, float]:
+def _xyz(point: inputs.Floats, units: Units) -> dict[str, float]:
     return {axis: units.from_si(float(v), "m") for axis, v in zip("xyz", point, strict=True)}
 
 

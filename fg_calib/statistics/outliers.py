@@ -15,8 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fg_calib.graph import Problem, Solution, solve, with_factors
-from fg_calib.inputs import Booleans, SolverError
+from fg_calib import graph, inputs
 from fg_calib.statistics.covariance import Spread, spread_of
 from fg_calib.statistics.goodness_of_fit import FACTOR, Goodness, GrossErrors, chi_square, judge_fit
 from fg_calib.statistics.residual_table import CHANCE, MAX_OUTLIER_SHARE, ResidualTable, residual_table, suspect_level
@@ -31,10 +30,10 @@ MAX_ROUNDS = 10
 FINE = ("as specified", "too large", "unknown")
 """Verdicts of kinds without gross errors."""
 
-_State = tuple[Solution, Spread, ResidualTable]
+_State = tuple[graph.Solution, Spread, ResidualTable]
 
 
-def judge_without_outliers(solution: Solution, table: ResidualTable, fit: Goodness) -> Goodness:
+def judge_without_outliers(solution: graph.Solution, table: ResidualTable, fit: Goodness) -> Goodness:
     """The goodness of a fit, by kind with its cause where a few outliers make it bad.
 
     Args:
@@ -60,7 +59,7 @@ def _is_fine(fit: Goodness) -> bool:
     return all(kind.verdict in FINE for kind in fit.kinds)
 
 
-def _far(table: ResidualTable, fit: Goodness, least: float) -> Booleans:
+def _far(table: ResidualTable, fit: Goodness, least: float) -> inputs.Booleans:
     """Fitted rows of measurements that are far from the others of their kind, shape (n,).
 
     Where most of a configuration's measurements are, all of them are: its reading or its pose is wrong.
@@ -81,8 +80,8 @@ def _far(table: ResidualTable, fit: Goodness, least: float) -> Booleans:
 
 
 def _fit_without_outliers(
-    solution: Solution, table: ResidualTable, fit: Goodness
-) -> tuple[Booleans, _State, Goodness] | None:
+    solution: graph.Solution, table: ResidualTable, fit: Goodness
+) -> tuple[inputs.Booleans, _State, Goodness] | None:
     """Rows left out, the fit without them, and its goodness; None without any, or where many are far.
 
     Args:
@@ -91,7 +90,7 @@ def _fit_without_outliers(
         fit: The goodness of fit to begin with.
     """
     out, found = np.zeros(table.n, dtype=np.bool_), None
-    least, solve_with = (1.0, solve) if solution.estimated_noise is None else (0.0, estimate_noise)
+    least, solve_with = (1.0, graph.solve) if solution.estimated_noise is None else (0.0, estimate_noise)
     for _ in range(MAX_ROUNDS):
         far = _far(table, fit, least)
         if np.array_equal(far, out) or np.sum(far) > MAX_OUTLIER_SHARE * np.sum(table.used):
@@ -101,7 +100,7 @@ def _fit_without_outliers(
             return None
         try:
             again = solve_with(_without(solution, table, out))
-        except SolverError:
+        except inputs.SolverError:
             break
         now = (again, spread_of(again), residual_table(again))
         fit = judge_fit(*now)
@@ -109,17 +108,17 @@ def _fit_without_outliers(
     return found
 
 
-def _without(solution: Solution, table: ResidualTable, out: Booleans) -> Problem:
+def _without(solution: graph.Solution, table: ResidualTable, out: inputs.Booleans) -> graph.Problem:
     """The problem whose rows left out are predicted, not fitted; from where the arm is nominal."""
     data, blocks = solution.problem.data, []
     for number, s in enumerate(data.blocks):
         test = s.test.copy()
         test[table.measurement[out & (table.block == number)]] = True
         blocks.append(replace(s, test=test))
-    return with_factors(solution.problem, solution.before, data=replace(data, blocks=tuple(blocks)))
+    return graph.with_factors(solution.problem, solution.before, data=replace(data, blocks=tuple(blocks)))
 
 
-def _combined(fit: Goodness, table: ResidualTable, out: Booleans, now: _State, rest: Goodness) -> Goodness:
+def _combined(fit: Goodness, table: ResidualTable, out: inputs.Booleans, now: _State, rest: Goodness) -> Goodness:
     """The fit with what the fit without the rows left out says of its kinds, and with the gross errors."""
     size = np.where(out, np.abs(rest.studentised), 0.0)
     wrong = {table.groups[code] for code in np.unique(table.group[size > rest.level])}
