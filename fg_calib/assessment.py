@@ -88,7 +88,6 @@ class Assessment(FrozenArrays):
         ]
         return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
 
-    @checked
     @parallel.single_threaded
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:
         """Value and sigma of any function of the robot: a tool position, a distance, a sum of parameters.
@@ -176,7 +175,6 @@ def solve_job(job: Job, problem: graph.Problem | None = None) -> graph.Solution:
     return multistart(solution)
 
 
-@checked
 @parallel.single_threaded
 def assess(solution: graph.Solution) -> Assessment:
     """Covariance, goodness of fit, residuals, identifiability and verdict of a solution.

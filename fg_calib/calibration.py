@@ -510,7 +510,6 @@ class Calibration(Record, repr=False, eq=False):
         """Whether the solver has converged and nothing speaks against the result."""
         return self.result.trustworthy
 
-    @checked
     @parallel.single_threaded
     def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
         """Predict the true tool poses at joint readings, with their uncertainty.
@@ -556,7 +555,6 @@ class Calibration(Record, repr=False, eq=False):
         return notebook_html(self.result)
 
 
-@checked
 @parallel.single_threaded
 def predict(
     calibration: Calibration | Path | str,

@@ -100,8 +100,9 @@ one_blas_thread = _OneThread()
 
 
 def single_threaded(function: Callable[P, R]) -> Callable[P, R]:
-    """A function that runs with BLAS on one thread; every public function that computes is one."""
+    """A function with its arguments checked and BLAS on one thread; every public function that computes is one."""
 
+    @checked
     @wraps(function)
     def limited(*args: P.args, **kwargs: P.kwargs) -> R:
         with one_blas_thread:

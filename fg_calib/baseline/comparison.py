@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.baseline.least_squares import LeastSquares, fit_least_squares
 from fg_calib.graph import Problem, Solution, corrections_of, problem_of
-from fg_calib.inputs import Brief, CalibrationError, Floats, ProblemError, checked
+from fg_calib.inputs import Brief, CalibrationError, Floats, ProblemError
 from fg_calib.job import Job
 from fg_calib.parallel import single_threaded
 from fg_calib.prediction import PoseRms, errors_at, judged_configurations, pose_rms
@@ -151,7 +151,6 @@ class Comparison(Brief):
         return float(corrections_of(self.job.robot, robot.nominal)[self.job.robot.index(name)])
 
 
-@checked
 @single_threaded
 def compare(job: Job) -> Comparison:
     """Run the factor graph and the plain estimators on one job.

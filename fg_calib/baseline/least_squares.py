@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names, checked
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Chain, Robot, build_chain, names_of
@@ -88,7 +88,6 @@ class LeastSquares(Brief):
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
-@checked
 @single_threaded
 def fit_least_squares(
     robot: Robot,

@@ -21,7 +21,7 @@ from fg_calib.designs.criteria import Criterion
 from fg_calib.designs.from_job import pool_of_rows, scenario_of, solve_for_design
 from fg_calib.designs.information import N_TASK, Task, build_system
 from fg_calib.designs.search import MAX_POSES, Chooser, CurvePoint, joint_travel, order_by_nearest
-from fg_calib.inputs import Floats, FrozenArrays, InputError, Integers, ProblemError, check_number, checked
+from fg_calib.inputs import Floats, FrozenArrays, InputError, Integers, ProblemError, check_number
 from fg_calib.observability import Observability, ObservedQuantities
 from fg_calib.robot import Robot, random_readings
 from fg_calib.simulation import MOST_DRAWN, Box, Configurations, Scenario
@@ -96,7 +96,6 @@ class Design(FrozenArrays, repr=False):
         return f"Design of {self.n} poses for {self.pool.robot.name!r}: expected RMS {error}, {self.criterion}"
 
 
-@checked
 @parallel.single_threaded
 def design(
     of: Scenario | job.Job,

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.verdict import Severity, Statement, check_excitation, listed, texts
 from fg_calib.graph import Problem, problem_of, solve, tables_of, unsolved
-from fg_calib.inputs import Brief, CalibrationError, checked
+from fg_calib.inputs import Brief, CalibrationError
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
 from fg_calib.observability import Identifiability, identifiability_of
@@ -156,7 +156,6 @@ class Inspection(Brief):
     cautions: tuple[str, ...] = ()
 
 
-@checked
 @single_threaded
 def inspect_job(job: Job) -> Inspection:
     """Inspect a job before it is solved; nothing of the arm is estimated.

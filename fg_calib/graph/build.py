@@ -27,7 +27,6 @@ FIRST_TOLERANCE = 1e-3
 """Prior sigma that a joint's parameter starts from where scales are estimated and none is specified, [m] and [rad]."""
 
 
-@checked
 @single_threaded
 def build_problem(robot: Robot, measurements: Tables, options: Options | None = None, **choices: Any) -> Problem:
     """The calibration problem of a robot and its measurements.

@@ -31,7 +31,7 @@ import numpy as np
 
 from fg_calib import inputs
 from fg_calib.graph import correlation, named_triangle
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, Model, Options, PairErrors, Pairing, checked
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Model, Options, PairErrors, Pairing
 from fg_calib.measurements import Measurements, Table
 from fg_calib.observability.predicted import predicted_problem, true_problem
 from fg_calib.parallel import single_threaded
@@ -62,7 +62,6 @@ class Bound(Brief):
     claimed: Floats
     rank: int
 
-    @checked
     @single_threaded
     def position(self, readings: Floats, *, fitted: bool = False, claimed: bool = False) -> float:
         """The bound on the root mean square error of the tool point at joint readings, over errors and noise, [m].
@@ -82,7 +81,6 @@ class Bound(Brief):
         return float(np.sqrt(np.einsum("nij,jk,nik->", G, covariance, G) / len(readings)))
 
 
-@checked
 @single_threaded
 def cramer_rao(
     robot: Robot,

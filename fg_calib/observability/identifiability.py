@@ -15,7 +15,7 @@ import numpy as np
 
 from fg_calib import inputs
 from fg_calib.graph import SIGNAL_FLOOR, Problem, named_triangle
-from fg_calib.inputs import Brief, Floats, FrameKnowledge, Model, ProblemError, check_names, check_number, checked
+from fg_calib.inputs import Brief, Floats, FrameKnowledge, Model, ProblemError, check_names, check_number
 from fg_calib.measurements import Measurements
 from fg_calib.observability.indices import Observability, observability_of_rows
 from fg_calib.observability.parallel_axes import MissingMotion, missing_motions
@@ -68,7 +68,6 @@ class Identifiability(Brief):
     lost: tuple[LostDirection, ...] = ()
 
 
-@checked
 @single_threaded
 def observe_structure(
     robot: Robot,
@@ -110,7 +109,6 @@ def observe_structure(
     return replace(whole, with_fixed_known=look(names_of(estimated)), fixed=fixed) if fixed and estimated else whole
 
 
-@checked
 @single_threaded
 def observe_configurations(
     robot: Robot,

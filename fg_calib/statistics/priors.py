@@ -52,7 +52,7 @@ import numpy as np
 from scipy import special
 
 from fg_calib import graph, parallel
-from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Record, SharedScale, checked
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Record, SharedScale
 from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.variance_components import settle
@@ -79,7 +79,6 @@ QUANTILE = 1.959963984540054
 """Half width of the 95 % interval, in sigma."""
 
 
-@checked
 @parallel.single_threaded
 def estimate_tolerances(
     problem: graph.Problem, solve_with: Callable[[graph.Problem], graph.Solution] = graph.solve

@@ -37,7 +37,7 @@ import numpy as np
 import scipy.sparse
 
 from fg_calib import graph, parallel
-from fg_calib.inputs import Booleans, Floats, Integers, Record, checked
+from fg_calib.inputs import Booleans, Floats, Integers, Record
 
 Sparse = scipy.sparse.csr_array
 
@@ -160,7 +160,6 @@ def _square_roots(covariance: Floats) -> Floats:
     return (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
 
 
-@checked
 @parallel.single_threaded
 def estimate_noise(problem: graph.Problem, options: graph.SolverOptions | None = None) -> graph.Solution:
     """Estimate the parameters and, with them, a factor on the specified noise of each kind.
