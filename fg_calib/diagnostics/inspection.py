@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
 from fg_calib.diagnostics.verdict import Severity, Statement, check_excitation, listed, texts
 from fg_calib.graph import Problem, problem_of, solve, tables_of, unsolved
-from fg_calib.inputs import Brief, CalibrationError
+from fg_calib.inputs import Brief, CalibrationError, Record
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
 from fg_calib.observability import Identifiability, identifiability_of
@@ -36,8 +36,7 @@ NEAR = 1e-3
 """How far each reading of two configurations may be apart that are nearly the same, [rad] (prismatic: [m])."""
 
 
-@dataclass(frozen=True)
-class JointRange:
+class JointRange(Record):
     """The readings of a joint in all tables.
 
     Attributes:
@@ -68,8 +67,7 @@ class JointRange:
         return bool(self.most - self.least < (MOTION_M if self.unit == "m" else MOTION_RAD))
 
 
-@dataclass(frozen=True)
-class TableSurvey:
+class TableSurvey(Record):
     """Counts of a table of measurements.
 
     Attributes:
@@ -103,8 +101,7 @@ class TableSurvey:
     n_leaked: int
 
 
-@dataclass(frozen=True)
-class Disagreement:
+class Disagreement(Record):
     """A measurement that disagrees with the others, by the arm that a robust loss fits to all.
 
     Attributes:

@@ -14,13 +14,11 @@ lies on a ring about the vector's axis, and the estimate may be opposite it, wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib.graph import Problem, Solution, noises_at, subsampled
-from fg_calib.inputs import Floats, SolverError
+from fg_calib.inputs import Floats, Record, SolverError
 from fg_calib.robot import forward
 from fg_calib.statistics import Spread
 
@@ -37,8 +35,7 @@ N_DRAWS = 8
 """Draws of d: sums of all determined directions, each a sigma one way or the other."""
 
 
-@dataclass(frozen=True)
-class Nonlinearity:
+class Nonlinearity(Record):
     """Mean squared errors beyond what the covariance says, over the covariance: 0 of what is linear.
 
     Attributes:
@@ -91,8 +88,7 @@ def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:
     return tuple(sorted((name for name in found if found[name] >= least), key=lambda name: -found[name]))
 
 
-@dataclass(frozen=True)
-class AmbiguousRows:
+class AmbiguousRows(Record):
     """Lengths and angles between configurations whose sign or direction is ambiguous within the priors.
 
     Attributes:

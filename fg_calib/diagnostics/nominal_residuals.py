@@ -11,14 +11,14 @@ gross errors. What is fitted takes up a part of the arm's errors, so healthy tab
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph import Problem, build_variables, noises_at, problem_of_tables, tables_of, take_steps
-from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, SolverError
+from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, Record, SolverError
 from fg_calib.measurements import INSTRUMENTS, Instrument, Table, residuals
 from fg_calib.robot import Robot
 
@@ -32,8 +32,7 @@ MAX_STEPS = 6
 """Steps from the start in closed form that suffice where the set-up is right."""
 
 
-@dataclass(frozen=True)
-class TypicalResidual:
+class TypicalResidual(Record):
     """Residuals of one kind of measurement before a calibration.
 
     Attributes:
@@ -56,8 +55,7 @@ class TypicalResidual:
         return self.size / self.expected
 
 
-@dataclass(frozen=True)
-class Setup:
+class Setup(Record):
     """Some rows of a table, and what the job says of them.
 
     Attributes:

@@ -14,7 +14,7 @@ and tool, which is reported of all that are far off together.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations, permutations
 
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.diagnostics.nominal_residuals import Setup, TypicalResidual, nominal_residuals, residuals_at, setup_of
 from fg_calib.graph import Problem
-from fg_calib.inputs import Booleans, Brief, Floats, FrameKnowledge, Model, checked
+from fg_calib.inputs import Booleans, Brief, Floats, FrameKnowledge, Model, Record, checked
 from fg_calib.measurements import Measurements, Table
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import CONVENTIONS, SCALES, Robot
@@ -42,8 +42,7 @@ NEGLIGIBLE_EXCESS = 1e-6
 OTHER_TOOL = "tool or base differ from those of the other tables (another target on the tool, another frame)"
 
 
-@dataclass(frozen=True)
-class Explanation:
+class Explanation(Record):
     """A mistake in the set-up that explains a table.
 
     Attributes:

@@ -27,7 +27,7 @@ Loads: by virtual work the torque about joint k of a weight in direction g at th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.graph import Problem, Solution, build_variables, prior_rows, subsampled, unknown_prior_rows
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Floats, Record
 from fg_calib.measurements import Block, residuals
 from fg_calib.observability import MissingMotion, end_of_link
 from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Chain, Element, Parameter, Robot, pose
@@ -92,8 +92,7 @@ MOST_TYPICAL = 4.0
 """Size in robust sigmas beyond which a residual is a gross error."""
 
 
-@dataclass(frozen=True)
-class Systematic:
+class Systematic(Record):
     """How systematic residuals are.
 
     Attributes:
@@ -107,8 +106,7 @@ class Systematic:
     variance: float = 1.0
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(Record):
     """Something that moved between two rows of a table.
 
     Attributes:
@@ -122,8 +120,7 @@ class Change:
     left: float
 
 
-@dataclass(frozen=True)
-class Offset:
+class Offset(Record):
     """An offset that an instrument seems to add to every length.
 
     Attributes:
@@ -137,8 +134,7 @@ class Offset:
     sigma: float
 
 
-@dataclass(frozen=True)
-class LinearFit:
+class LinearFit(Record):
     """The linearised fit of rows and priors, and its score tests.
 
     Attributes:
@@ -188,8 +184,7 @@ class LinearFit:
         return float(len(self.r) * np.log(self.r @ self.r) + self.fitted.shape[1] * np.log(len(self.r)))
 
 
-@dataclass(frozen=True)
-class Regression:
+class Regression(Record):
     """The fit of a solution, linearised, and columns that it does not have.
 
     These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of

@@ -51,13 +51,13 @@ R of the arm that is fitted, p' and R' of the calibrated one, and L the arm's le
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats, InputError, shown
+from fg_calib.inputs import Floats, InputError, Record, shown
 from fg_calib.robot import Axis, Element, Poses, Robot, RobotBuilder, build_chain, forward, model, pose, random_readings
 
 TableConvention = Literal["dh", "mdh", "dh-hayati"]
@@ -75,8 +75,7 @@ SAME = 1e-12
 """Entries of a transform up to this count as 0, [m] and [rad]: rounding of a product is some 1e-16."""
 
 
-@dataclass(frozen=True)
-class Nearly:
+class Nearly(Record):
     """Neighbouring axes that are too nearly parallel for a row of four figures.
 
     Attributes:
@@ -95,8 +94,7 @@ class Nearly:
         return f"{parallel}: their common normal is {self.away:.3g} m away"
 
 
-@dataclass(frozen=True)
-class TableRobot:
+class TableRobot(Record):
     """An arm in a table.
 
     Attributes:
@@ -264,8 +262,7 @@ def _tidy(T: Floats) -> Floats:
 # --- rigid transforms between joints ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Links:
+class Links(Record):
     """The rigid transforms of an arm, matrices of shape (4, 4), lengths in [m].
 
     Attributes:
@@ -352,8 +349,7 @@ millimetre by values of metres is none. Of a UR10 off by 0.5 mm and 0.5 mrad, 1e
 RMS; 1e-4 gives 0.163 mm with d of 16 m."""
 
 
-@dataclass(frozen=True)
-class PoseErrors:
+class PoseErrors(Record):
     """How far the tool of one arm is from that of another over some configurations.
 
     Attributes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, field, fields
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from fg_calib.calibration import Calibration
 from fg_calib.exports import dh
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
-from fg_calib.inputs import Floats, InputError, as_floats, checked, printable, shown
+from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, printable, shown
 from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, frame_values
 
@@ -35,8 +35,7 @@ _TABLES: Mapping[str, tuple[dh.TableConvention, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Export:
+class Export(Record):
     """An arm as others read it.
 
     Attributes:

@@ -25,7 +25,6 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -33,15 +32,14 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from fg_calib.exports.dh import Links, in_table, links_of, row_transform, transform
-from fg_calib.inputs import Floats, InputError
+from fg_calib.inputs import Floats, InputError, Record
 from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_values
 
 FARTHEST_SLIDE = 1000.0
 """Limit of a slide without one, [m]: URDF knows no slide without limits."""
 
 
-@dataclass(frozen=True)
-class UrdfJoint:
+class UrdfJoint(Record):
     """A joint of a new URDF.
 
     Attributes:

@@ -8,13 +8,12 @@ rank are left at 0. Of the others k the data determine `z_k + G z_l`, with `M_k 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from fg_calib.calibration import Calibration
 from fg_calib.graph import first_independent
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Floats, Record
 from fg_calib.monitoring import named_changes
 from fg_calib.robot import Robot
 
@@ -22,8 +21,7 @@ TOLD = 1e-3
 """Part of a direction, in changes of ordinary size, below which it is none."""
 
 
-@dataclass(frozen=True)
-class Zero:
+class Zero(Record):
     """The zero of a joint, as far as the data tell it from others.
 
     Attributes:

@@ -20,7 +20,7 @@ This matters where pairs are more than the errors, so that second-order terms ar
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -31,7 +31,7 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import splu
 
 from fg_calib.graph.noise_models import RowNoise, reach, whitening_of
-from fg_calib.inputs import Booleans, Brief, Floats, Integers, SolverError
+from fg_calib.inputs import Booleans, Brief, Floats, Integers, Record, SolverError
 from fg_calib.measurements import Block, pack, residuals, unpack
 from fg_calib.robot import SPAN, Chain, over_spans
 
@@ -62,8 +62,7 @@ MIN_WEIGHT = 1e-12
 """A robust weight below this is taken for this."""
 
 
-@dataclass(frozen=True)
-class SchurComplement:
+class SchurComplement(Record):
     """The elimination of the error states that rows share.
 
     Attributes:

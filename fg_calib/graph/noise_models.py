@@ -12,13 +12,13 @@ measured, with its slope and variance (see `measurements.moments`): at given par
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
 import scipy.sparse
 
-from fg_calib.inputs import Booleans, Floats, InputError, Integers
+from fg_calib.inputs import Booleans, Floats, InputError, Integers, Record
 from fg_calib.measurements import Block, Length, MeasurementBlock, Measurements, moments, residuals
 from fg_calib.robot import Chain, forward, kernels, nearest_rotation, over_spans, rotation_angle, whiten_small
 
@@ -40,8 +40,7 @@ _MOMENTS = (moments.length_moments, moments.angle_moments)
 """Moments of lengths, of pairs and to anchors, and of rotation angles."""
 
 
-@dataclass(frozen=True)
-class NoiseState:
+class NoiseState(Record):
     """Estimated noise of the measurements on the way to a solution.
 
     Attributes:
@@ -54,8 +53,7 @@ class NoiseState:
     factors: Mapping[NoiseName, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class TableState:
+class TableState(Record):
     """A table at a linearisation point.
 
     Attributes:

@@ -31,7 +31,6 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -39,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.inputs import Floats, Loss
+from fg_calib.inputs import Floats, Loss, Record
 
 EFFICIENCY = 0.95
 """Efficiency on clean Gaussian measurements of losses that do not reject."""
@@ -109,8 +108,7 @@ def constants(loss: Loss, residual_dim: NDArray[np.int64]) -> Floats:
     return np.array(of_dim)[residual_dim]
 
 
-@dataclass(frozen=True)
-class Effect:
+class Effect(Record):
     """Efficiency of a robust loss on Gaussian residuals, with some outliers among them.
 
     Attributes:

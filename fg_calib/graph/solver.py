@@ -14,7 +14,7 @@ estimate. The fixed point solves J^T C(x)^-1 r = 0: quasi-likelihood, consistent
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -34,7 +34,7 @@ from fg_calib.graph.problem import (
     with_user_factors,
 )
 from fg_calib.graph.robust import Weighting, constants, cost
-from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, SolverError, check_number, checked
+from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, Record, SolverError, check_number, checked
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import Robot
 
@@ -63,8 +63,7 @@ COARSE = 1.0
 """Rows are whitened anew once the optimum with the present ones is nearer than this, [sigma]."""
 
 
-@dataclass(frozen=True)
-class SolverOptions:
+class SolverOptions(Record):
     """Settings of the solver.
 
     Attributes:
@@ -80,8 +79,7 @@ class SolverOptions:
         check_number("solver: decrement", self.decrement, least=0.0)
 
 
-@dataclass(frozen=True)
-class Iteration:
+class Iteration(Record):
     """One step of the solver.
 
     Attributes:
@@ -97,8 +95,7 @@ class Iteration:
     decrement: float
 
 
-@dataclass(frozen=True)
-class ToleranceScale:
+class ToleranceScale(Record):
     """A factor on the tolerances specified of a group of parameters, estimated with them.
 
     Attributes:
@@ -271,8 +268,7 @@ def _fit_frames(problem: Problem, options: SolverOptions) -> Floats:
     return np.concatenate([found, problem.start[len(found) :]])
 
 
-@dataclass(frozen=True)
-class _Point:
+class _Point(Record):
     """A problem linearised at a parameter vector.
 
     Attributes:

@@ -23,7 +23,7 @@ pitch and yaw: at a pitch of 90 degrees the angles themselves are no coordinates
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -32,15 +32,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fg_calib.graph.error_states import State
-from fg_calib.inputs import Brief, Floats
+from fg_calib.inputs import Brief, Floats, Record
 from fg_calib.measurements import Landmarks
 from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Robot, build_chain, names_of, yaw_pitch_roll
 
 VariableKind = Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
 
 
-@dataclass(frozen=True)
-class Variable:
+class Variable(Record):
     """One GTSAM variable.
 
     Attributes:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 
-from fg_calib.inputs import Floats, InputError, as_floats
+from fg_calib.inputs import Floats, InputError, Record, as_floats
 
 MOST_PIXELS = 1e6
 """No camera has more, nor a focal length of more, nor a larger coefficient of distortion."""
@@ -15,8 +15,7 @@ NEAREST = 1e-6
 """Depth that a point has at least, [m]: behind the camera there is no image."""
 
 
-@dataclass(frozen=True)
-class Camera:
+class Camera(Record):
     """A pinhole camera with OpenCV's distortion.
 
     Attributes:

@@ -14,12 +14,11 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Booleans, Floats, Integers
+from fg_calib.inputs import Booleans, Floats, Integers, Record
 from fg_calib.robot import nearest_rotation, rotation_angle
 
 LEAST_TURN = 1e-6
@@ -38,8 +37,7 @@ MOST_ROUNDS = 10
 """Times that poses are chosen and left out."""
 
 
-@dataclass(frozen=True)
-class Frame:
+class Frame(Record):
     """A rotation, shape (3, 3), and a translation, shape (3,), [m]."""
 
     rotation: Floats
@@ -53,8 +51,7 @@ Frames = tuple[Frame, Frame]
 """World_T_base and flange_T_tool."""
 
 
-@dataclass(frozen=True)
-class Unknown:
+class Unknown(Record):
     """Parts of the two frames to be found.
 
     Attributes:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from fg_calib.inputs.arguments import check, check_fields, check_names, check_number, check_type, listed
+from fg_calib.inputs.arrays import Record
 from fg_calib.inputs.errors import InputError
 
 POSE_MODELS = {"pose": (True, True), "position": (False, True), "orientation": (True, False)}
@@ -55,8 +56,7 @@ LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 
 
-@dataclass(frozen=True)
-class Pairing:
+class Pairing(Record):
     """How pairs are formed from measured poses.
 
     Attributes:
@@ -86,8 +86,7 @@ LIMITED: dict[str, Literal["m", "rad"]] = {"position": "m", "orientation": "rad"
 """Quantities that `Limits` limits; units."""
 
 
-@dataclass(frozen=True)
-class Limits:
+class Limits(Record):
     """The largest RMS errors at test rows with which the arm is good enough; None where there is no limit.
 
     Attributes:
@@ -111,8 +110,7 @@ class Limits:
                 check_number(f"accept: {name}", limit, above=True)
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(Record):
     """Every choice of a calibration, checked.
 
     Attributes:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fg_calib import inputs
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Pairing, Reader, brief, check_number
 from fg_calib.robot import Robot, rotation_angle
 
@@ -29,8 +30,7 @@ FAR = 0.5
 """Part of a joint's range beyond its limits from which a smaller unit is likelier than limits that are too narrow."""
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(inputs.Record):
     """Measurement noise, 1 sigma; None where it is not specified.
 
     Attributes:

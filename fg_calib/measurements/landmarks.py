@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats, Integers, ProblemError
+from fg_calib.inputs import Floats, Integers, ProblemError, Record
 
 Estimate = tuple[Floats, Floats, tuple[str, ...]]
 """Values as reports show them, their covariance, and their units."""
 
 
-@dataclass(frozen=True)
-class LandmarkKind:
+class LandmarkKind(Record):
     """A kind of landmark; its instrument's file declares it.
 
     Attributes:
@@ -85,8 +84,7 @@ class LandmarkKind:
         return places[:, : self.size] if self.size <= 3 else np.hstack([rotated, places])
 
 
-@dataclass(frozen=True)
-class Landmark:
+class Landmark(Record):
     """A landmark.
 
     Attributes:

@@ -14,7 +14,6 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -23,7 +22,7 @@ from pydantic import computed_field
 from scipy.sparse.csgraph import connected_components
 
 from fg_calib.graph import RANK_TOLERANCE, SIGNAL_FLOOR, SUPPORT_TOLERANCE, determined, first_independent
-from fg_calib.inputs import Figure, Floats, FrozenArrays
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Record
 from fg_calib.robot import Parameter, names_of
 
 IdentifiabilityClass = Literal["independent", "relative", "ineffective"]
@@ -35,8 +34,7 @@ CORRELATED = 0.9
 """Correlations above this are worth a line."""
 
 
-@dataclass(frozen=True)
-class RelativeGroup:
+class RelativeGroup(Record):
     """Parameters of which only combinations are determined.
 
     Attributes:
@@ -74,8 +72,7 @@ class RelativeGroup:
         return found
 
 
-@dataclass(frozen=True)
-class Correlated:
+class Correlated(Record):
     """Two parameters that are strongly correlated.
 
     Attributes:
@@ -87,8 +84,7 @@ class Correlated:
     correlation: Figure
 
 
-@dataclass(frozen=True)
-class WeakDirection:
+class WeakDirection(Record):
     """A direction that the data determine, but badly.
 
     Attributes:

@@ -11,12 +11,12 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Floats, Record
 from fg_calib.robot import CONVENTIONS, Axis, Robot, pose
 
 PARALLEL_RAD = np.deg2rad(3.0)
@@ -34,8 +34,7 @@ UPRIGHT_COSINE = 0.2
 WORDS = {Axis.RX: "a tilt about x", Axis.RY: "a tilt about y", Axis.TY: "a shift along y"}
 
 
-@dataclass(frozen=True)
-class MissingMotion:
+class MissingMotion(Record):
     """A small motion between neighbouring axes that the convention has no parameter for.
 
     Attributes:

@@ -13,13 +13,12 @@ predicts.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 
 from fg_calib.graph import SUPPORT_TOLERANCE, Problem, eliminate, named_triangle, square_root
-from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model
+from fg_calib.inputs import Booleans, Floats, FrameKnowledge, Integers, Model, Record
 from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Instrument
 from fg_calib.observability.indices import Observability
 from fg_calib.observability.predicted import random_problem
@@ -27,8 +26,7 @@ from fg_calib.parallel import single_threaded
 from fg_calib.robot import build_chain, forward, random_readings
 
 
-@dataclass(frozen=True)
-class ObservedQuantities:
+class ObservedQuantities(Record):
     """Quantities of the tool's motion that tables see; custom kinds may see anything, in any frame.
 
     Attributes:
@@ -158,8 +156,7 @@ _NOTHING = 1e-7
 `SUPPORT_TOLERANCE` left out of them may move as much as it could."""
 
 
-@dataclass(frozen=True)
-class LostDirection:
+class LostDirection(Record):
     """A direction that the measurements do not determine.
 
     Attributes:

@@ -15,13 +15,12 @@ derivative of the tool's position in joint j.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from fg_calib.graph import Problem, build_variables
-from fg_calib.inputs import Floats, FrozenArrays, Integers
+from fg_calib.inputs import Floats, FrozenArrays, Integers, Record
 from fg_calib.measurements import Dataset
 from fg_calib.observability import ObservedQuantities
 from fg_calib.robot import Chain, forward, without_rigid_motion
@@ -37,8 +36,7 @@ _AT_ONCE = 2000
 """Configurations at once: derivatives of all would fill the memory."""
 
 
-@dataclass(frozen=True)
-class PoseRms:
+class PoseRms(Record):
     """Expected RMS errors of the tool; None where they depend on what is not determined.
 
     Attributes:
@@ -50,8 +48,7 @@ class PoseRms:
     orientation: float | None
 
 
-@dataclass(frozen=True)
-class ExpectedError:
+class ExpectedError(Record):
     """Expected errors of the tool over some configurations.
 
     Attributes:

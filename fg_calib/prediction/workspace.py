@@ -10,13 +10,12 @@ correlated parameters overlap, so they need not add to 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fg_calib.inputs import Booleans, Floats, FrozenArrays
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, Record
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
 from fg_calib.robot import Robot, pose, random_readings, unit_of
 from fg_calib.statistics import TangentCovariance
@@ -40,8 +39,7 @@ _N_SAMPLED = 1000
 """Configurations that give the radius of the workspace where configurations are given."""
 
 
-@dataclass(frozen=True)
-class Responsible:
+class Responsible(Record):
     """A parameter that an error follows.
 
     Attributes:

@@ -11,7 +11,7 @@ import logging
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -113,8 +113,7 @@ IN_RAD = "angles in rad, two turns at most"
 """Expected size of angles instead."""
 
 
-@dataclass(frozen=True)
-class Parameter:
+class Parameter(inputs.Record):
     """One kinematic parameter.
 
     Attributes:
@@ -170,8 +169,7 @@ BASES: Mapping[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]
 """Functions of a joint's reading and their slopes, for the effects of joints that `RobotBuilder.add_effect` adds."""
 
 
-@dataclass(frozen=True)
-class Basis:
+class Basis(inputs.Record):
     """The function of a joint's reading that an element's coefficient is multiplied by.
 
     Attributes:
@@ -187,8 +185,7 @@ class Basis:
         return np.stack([of(readings[:, self.joint]) for of in BASES[self.function]], axis=1)
 
 
-@dataclass(frozen=True)
-class Element:
+class Element(inputs.Record):
     """One elementary transform of the chain.
 
     Its value is `constant + sign * (parameter + reading)`: the parameter at index `parameter` and the reading of
@@ -207,8 +204,7 @@ class Element:
     basis: Basis | None = None
 
 
-@dataclass(frozen=True)
-class Joint:
+class Joint(inputs.Record):
     """One moving joint: its name, whether it slides, and its limits, [rad] or [m]."""
 
     name: str
@@ -222,8 +218,7 @@ class Joint:
         return "m" if self.prismatic else "rad"
 
 
-@dataclass(frozen=True)
-class UrdfSource:
+class UrdfSource(inputs.Record):
     """The URDF a robot came from, kept whole so that the calibrated one can be written into it."""
 
     text: str
@@ -231,8 +226,7 @@ class UrdfSource:
     tip_link: str
 
 
-@dataclass(frozen=True)
-class Robot:
+class Robot(inputs.Record):
     """A serial arm: base frame to tool frame as one sequence of elementary transforms.
 
     Attributes:
