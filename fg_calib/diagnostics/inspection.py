@@ -4,8 +4,6 @@ Nothing of the arm is estimated. Errors make a calibration not to be trusted, an
 what its reader should know, as in the verdict on a calibration.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields, replace

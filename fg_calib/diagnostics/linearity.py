@@ -12,8 +12,6 @@ on average (see `measurements.moments`). Where that is near the noise, with t by
 lies on a ring about the vector's axis, and the estimate may be opposite it, whatever its sigma.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

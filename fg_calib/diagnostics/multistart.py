@@ -12,8 +12,6 @@ Note:
     Pairs whose sign is ambiguous within the priors are not searched: the verdict names them (see `verdict`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from operator import attrgetter
 

@@ -1,7 +1,5 @@
 """The door to all formats: a calibration or a robot, and the text that others read."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, field, fields
 from hashlib import sha256

@@ -22,8 +22,6 @@ References:
     tesseract-robotics/tesseract, pull request 703; tesseract_common/yaml_utils.h, tesseract_srdf/configs.cpp.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 

@@ -5,8 +5,6 @@ the null-space directions K that zeros, base and tool make alone, which move the
 rank are left at 0. Of the others k the data determine `z_k + G z_l`, with `M_k + G M_l = 0`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Build a problem from a robot and its tables: checks, the start, and what is left out to fix the gauge."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import replace

@@ -9,8 +9,6 @@ GTSAM 4.3 ends the interpreter when a custom factor leaves a Jacobian unset or g
 initial values without a word when it gets the columns wrong. So `CheckedFactor` alone fills its lists, after checks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import chain

@@ -9,8 +9,6 @@ Noise acts on a length or an angle to second order: their rows are `M - measured
 measured, with its slope and variance (see `measurements.moments`): at given parameters a row, scaled and shifted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, replace
 from functools import cached_property

@@ -17,8 +17,6 @@ References:
     Gilmour, Thompson, Cullis (1995), Average information REML. Biometrics 51.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cached_property
 

@@ -28,8 +28,6 @@ References:
     Yang, Antonante, Tzoumas, Carlone (2020), Graduated non-convexity for robust spatial perception. IEEE RA-L 5(2).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from itertools import pairwise

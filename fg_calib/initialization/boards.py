@@ -11,8 +11,6 @@ References:
     Rousseeuw, Leroy (1987), Robust regression and outlier detection, ch. 5: scale from a median.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """A pinhole camera with distortion: images of points, and the directions that pixels look in."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import numpy as np

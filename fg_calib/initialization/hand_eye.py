@@ -11,8 +11,6 @@ References:
     Umeyama (1991), Least-squares estimation of transformation parameters between two point patterns. IEEE PAMI 13(4).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ References:
     Gander (1981), Least squares with a quadratic constraint. Numerische Mathematik 36.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from fg_calib.initialization.hand_eye import Frame, align_points

@@ -1,7 +1,5 @@
 """Start of measurement frames, tool and landmarks, which instruments fill in table by table."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from fg_calib.initialization import hand_eye

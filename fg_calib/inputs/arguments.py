@@ -4,8 +4,6 @@
 Numbers and arrays are checked where they are used.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Arrays from outside, checked, and arrays that stay as they are: those of frozen types are read-only."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass, field, fields

@@ -1,7 +1,5 @@
 """All tables of a calibration together, as estimation takes them; and what a robot predicts that one would measure."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections import Counter

@@ -30,8 +30,6 @@ References:
     Biometrika 61.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -12,8 +12,6 @@ References:
     Sola, Deray, Atchuthan (2018), A micro Lie theory for state estimation in robotics. arXiv:1812.01537.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import field, fields, replace
 

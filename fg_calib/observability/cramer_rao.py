@@ -23,8 +23,6 @@ References:
     Van Trees (1968), Detection, Estimation, and Modulation Theory, Part I. Wiley.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

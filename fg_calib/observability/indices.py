@@ -11,8 +11,6 @@ References:
     (2008), Observability index selection for robot calibration, ICRA.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 

@@ -9,8 +9,6 @@ References:
     Hayati (1983), Robot arm geometric link parameter estimation. 22nd IEEE Conf. on Decision and Control.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Problems of what could be measured: the rows that a robot's own predictions make."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -8,8 +8,6 @@ is kept, and the orientation is brought as near as the remaining freedom allows,
 counts far more.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

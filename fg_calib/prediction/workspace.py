@@ -7,8 +7,6 @@ the share sum_k cov(e_k, p_i)^2 / (var(p_i) sum_k var(e_k)), summed over the coo
 correlated parameters overlap, so they need not add to 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cached_property
 

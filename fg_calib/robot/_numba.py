@@ -1,7 +1,5 @@
 """Compilation of the kernels by numba, cached between processes where a folder can be written."""
 
-from __future__ import annotations
-
 import logging
 import os
 from collections.abc import Callable

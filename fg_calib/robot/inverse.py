@@ -13,8 +13,6 @@ References:
     on Robotics 27(5).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

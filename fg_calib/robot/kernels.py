@@ -15,8 +15,6 @@ All kernels stand in this one file because numba's cache looks at the file of th
 any of them then has all of them compiled anew.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

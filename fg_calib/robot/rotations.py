@@ -4,8 +4,6 @@ References:
     Sola, Deray, Atchuthan (2018), A micro Lie theory for state estimation in robotics, arXiv:1812.01537.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from fg_calib.inputs import Floats

@@ -1,7 +1,5 @@
 """Ball bars, wires, contact with a point: lengths from the tool point to anchors in the room."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Boards in the room as a camera on the tool sees them: camera_T_board."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

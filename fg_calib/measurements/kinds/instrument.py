@@ -1,7 +1,5 @@
 """Description of an instrument: columns, landmarks with their start, what it measures and sees."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple

@@ -1,7 +1,5 @@
 """Distances and angles between configurations, measured or formed from measured poses; contact points."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

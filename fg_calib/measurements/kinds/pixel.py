@@ -1,7 +1,5 @@
 """Corners of boards as a camera sees them: a board in the room from the tool, or one on the tool from the room."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Dial indicators, tool tip on a flat face: distances of the tool point from planes in the room."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Laser trackers, motion capture: poses, positions or orientations of the tool, or positions of targets on it."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
