@@ -263,8 +263,7 @@ def _measured_in_units(setup: Setup) -> _Found:
         if pairs is not None and np.isfinite(pairs.angle).any():
             yield f"angles of pairs are in {unit}", setup.measuring(pairs=replace(pairs, angle=pairs.angle * f))
         if angles is not None:
-            without = _rotated(setup, Rotation.from_euler("xyz", angles * f), angles * f)
-            yield f"roll, pitch, yaw are in {unit}", without
+            yield f"roll, pitch, yaw are in {unit}", _rotated(setup, Rotation.from_euler("xyz", angles * f), angles * f)
         elif m.rotation is not None and setup.instrument.sees_orientation and f > 1.0:
             vector = Rotation.from_matrix(m.rotation.copy()).as_rotvec()
             yield f"rx, ry, rz are in {unit}", _rotated(setup, Rotation.from_rotvec(vector * f))

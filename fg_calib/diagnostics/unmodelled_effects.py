@@ -334,12 +334,9 @@ def _offsets(problem: Problem) -> dict[int, int]:
     """Tables with an offset that is not estimated, by the offset's place among the nuisance coordinates."""
     unknowns, columns = problem.data.landmarks, problem.variables.coordinates
     numbers = [i for i, item in enumerate(unknowns.items) if item.kind.is_one]
-    return {
-        place: s.table
-        for place in np.flatnonzero(np.isin(unknowns.owners, numbers) & (columns < 0)).tolist()
-        for s in problem.data.blocks
-        if np.any(s.nuisances[s.train] == place)
-    }
+    places = np.flatnonzero(np.isin(unknowns.owners, numbers) & (columns < 0)).tolist()
+    each = ((place, s) for place in places for s in problem.data.blocks)
+    return {place: s.table for place, s in each if np.any(s.nuisances[s.train] == place)}
 
 
 def regress(solution: Solution) -> Regression:

@@ -218,7 +218,7 @@ def _rotations(R_F: Floats, R_M: Floats, R_X: Floats, R_T: Floats, unknown: Unkn
     all_X, all_T, reached = _alternate(R_F, R_M, starts, steps=20)
     best = int(np.argmax(np.round(reached, 9)))
     R_X, R_T = all_X[best], all_T[best]
-    axis = _common_axis(R_F)
+    axis = np.linalg.svd(rotation_angle(R_F @ R_F[0].T)[1], full_matrices=False)[2][0]  # in the base frame
     turns = Rotation.from_rotvec(np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)[:, None] * axis).as_matrix()
     return [(R_X @ turn, turn.T @ R_T) for turn in turns]
 
@@ -249,26 +249,21 @@ def _alternate(R_F: Floats, R_M: Floats, R_T: Floats, steps: int) -> tuple[Float
     return R_X, R_T, np.einsum("acbd,kac,kdb->k", K, R_X, R_T, optimize=True) / len(R_F)
 
 
-def _common_axis(R_F: Floats) -> Floats:
-    """The axis that takes the first rotation to the others, in the base frame, shape (3,); any if there is none."""
-    _, axes = rotation_angle(R_F @ R_F[0].T)
-    return np.asarray(np.linalg.svd(axes, full_matrices=False)[2][0])
-
-
 def _frame_rotations(R_F: Floats, p_F: Floats, p_M: Floats, t: Floats, unknown: Unknown) -> list[Floats]:
     """Candidates for the frame's rotation from positions alone."""
     candidates = [align_points(p_M, p_F + R_F @ t)]
     if unknown.tool_translation.any():
         # X^T (p_M - t_X) = p_F + R_F t is linear in X^T, X^T t_X and t.
-        n = len(p_F)
-        A = np.zeros((n, 3, 15))
-        for k in range(3):
-            A[:, k, 3 * k : 3 * k + 3] = p_M
-            A[:, k, 9 + k] = 1.0
-        A[:, :, 12:] = -R_F
+        A = np.concatenate([lifted(p_M), -R_F], axis=2)
         solution: Floats = np.linalg.lstsq(A.reshape(-1, 15), p_F.ravel(), rcond=1e-10)[0].astype(np.float64)
         candidates += [nearest_rotation(solution[:9].reshape(3, 3).T), align_points(p_M, p_F + R_F @ solution[12:])]
     return candidates
+
+
+def lifted(points: Floats) -> Floats:
+    """`X^T (p - t)` of points p as linear in X^T, column by column of X, and -X^T t: shape (n, 3, 12)."""
+    eye = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([(eye[..., None] * points[:, None, None]).reshape(-1, 3, 9), eye], axis=2)
 
 
 def align_points(measured: Floats, predicted: Floats) -> Floats:

@@ -8,7 +8,7 @@ References:
 
 import numpy as np
 
-from fg_calib.initialization.hand_eye import Frame, align_points
+from fg_calib.initialization.hand_eye import Frame, align_points, lifted
 from fg_calib.inputs import Floats, Integers
 from fg_calib.robot import nearest_rotation
 
@@ -44,10 +44,7 @@ def targets_from_positions(
     at = p + np.einsum("nij,nj->ni", R, places[target])  # with the unknown targets at the tool point
     rotations = [np.eye(3)]
     if unknown_frame:
-        lift = np.zeros((n, 3, 12))
-        for k in range(3):
-            lift[:, k, 3 * k : 3 * k + 3], lift[:, k, 9 + k] = measured, 1.0
-        A = np.concatenate([lift, -lever], axis=2).reshape(3 * n, -1)
+        A = np.concatenate([lifted(measured), -lever], axis=2).reshape(3 * n, -1)
         found = np.linalg.lstsq(A, at.ravel(), rcond=1e-10)[0]
         by_lift = at + np.einsum("nij,j->ni", lever, found[12:])
         rotations = [align_points(measured, predicted) for predicted in (at, by_lift)]

@@ -44,14 +44,7 @@ EXAMPLES = {
 _COMPARED = ("fg_calib.", "concurrent.", "numpy.random.", "pathlib")
 """Modules whose classes are compared; choices, switches, text and None are too."""
 
-_WORDS = {
-    str: "text",
-    bool: "True or False",
-    Path: "a path",
-    Mapping: "a mapping",
-    dict: "a mapping",
-    Callable: "a function",
-}
+_WORDS = {str: "text", bool: "True or False", Path: "a path", Callable: "a function"}
 
 
 class Reader:
@@ -156,6 +149,8 @@ def _describe(hint: Any) -> str:
         return f"one of {', '.join(parts)}"
     if kind in (Sequence, tuple):
         return f"a list of {getattr(parts[0], '__name__', 'them')}"
+    if kind in (Mapping, dict):
+        return "a mapping"
     return _WORDS.get(kind) or f"a{'n' * (kind.__name__[0] in 'AEIO')} {kind.__name__}"
 
 

@@ -42,15 +42,10 @@ class InputError(CalibrationError):
     """
 
     def __init__(self, place: str, found: str, expected: str = "", hint: str = "") -> None:
-        self.place = place
-        self.found = found
-        self.expected = expected
-        self.hint = hint
+        self.place, self.found, self.expected, self.hint = place, found, expected, hint
         message = f"{_part(place)}: {_part(found)}"
-        if expected:
-            message += f", expected {_part(expected)}"
-        if hint:
-            message += f"; {_part(hint)}"
+        message += f", expected {_part(expected)}" if expected else ""
+        message += f"; {_part(hint)}" if hint else ""
         super().__init__(message)
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:

@@ -148,12 +148,6 @@ def identifiability_of(
     """Identifiability by the train rows of a problem, without priors, around a parameter vector."""
     floor = STRUCTURAL_FLOOR if kind == "structural" else SIGNAL_FLOOR
     observability = observability_of(problem, parameters, prefer, floor)
-    return Identifiability(
-        robot=problem.robot.name,
-        model=problem.options.model,
-        kind=kind,
-        n_configurations=problem.n_configurations,
-        observability=observability,
-        missing=missing_motions(problem.robot),
-        lost=explain(problem, parameters, observability),
-    )
+    missing, lost = missing_motions(problem.robot), explain(problem, parameters, observability)
+    head = problem.robot.name, problem.options.model, kind, problem.n_configurations
+    return Identifiability(*head, observability, missing=missing, lost=lost)

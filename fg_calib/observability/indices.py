@@ -196,16 +196,12 @@ def observability_indices(singular_values: Floats, n_measurements: int) -> dict[
 
     O1 = (s_1 ... s_L)^(1/L) / sqrt(m); O2 = s_L / s_1; O3 = s_L; O4 = s_L^2 / s_1; O5 = 1 / (1/s_1 + ... + 1/s_L).
     """
-    s = singular_values
+    s, names = singular_values, ("O1", "O2", "O3", "O4", "O5")
     if not len(s):
-        return dict.fromkeys(("O1", "O2", "O3", "O4", "O5"), 0.0)
-    return {
-        "O1": float(np.exp(np.mean(np.log(s))) / np.sqrt(n_measurements)),
-        "O2": float(s[-1] / s[0]),
-        "O3": float(s[-1]),
-        "O4": float(s[-1] ** 2 / s[0]),
-        "O5": float(1.0 / np.sum(1.0 / s)),
-    }
+        return dict.fromkeys(names, 0.0)
+    mean = np.exp(np.mean(np.log(s))) / np.sqrt(n_measurements)
+    figures = mean, s[-1] / s[0], s[-1], s[-1] ** 2 / s[0], 1.0 / np.sum(1.0 / s)
+    return dict(zip(names, map(float, figures), strict=True))
 
 
 def _accuracy(J: Floats, names: Sequence[str], scales: Floats) -> dict[str, Any]:
@@ -224,11 +220,9 @@ def _accuracy(J: Floats, names: Sequence[str], scales: Floats) -> dict[str, Any]
         members = sorted(np.flatnonzero(size > 0.3 * size.max()).tolist(), key=lambda i: -size[i])
         sign = np.sign(direction[members[0]])
         weak.append(WeakDirection(float(value), {names[i]: float(sign * direction[i]) for i in members}))
-    return {
-        "sigma": dict(zip(names, (spread * scales).tolist(), strict=True)),
-        "correlations": tuple(Correlated((names[i], names[j]), float(correlation[i, j])) for i, j in strongest),
-        "weak": tuple(weak),
-    }
+    sigma = dict(zip(names, (spread * scales).tolist(), strict=True))
+    correlations = tuple(Correlated((names[i], names[j]), float(correlation[i, j])) for i, j in strongest)
+    return {"sigma": sigma, "correlations": correlations, "weak": tuple(weak)}
 
 
 def _groups(
@@ -252,13 +246,8 @@ def _groups(
         given_up = {order[dropped[r]] for r in rows}
         rows.sort(key=lambda r: order[dropped[r]])
         physical = _chained(relations[rows]) * scales[order]
-        found.append(
-            RelativeGroup(
-                parameters=tuple(names[i] for i in members),
-                relations=tuple(_relation(direction, order, names) for direction in physical),
-                keep=tuple(names[i] for i in members if i not in given_up),
-            )
-        )
+        own, keep = (tuple(names[i] for i in members if i not in out) for out in ((), given_up))
+        found.append(RelativeGroup(own, tuple(_relation(direction, order, names) for direction in physical), keep))
     return tuple(sorted(found, key=lambda g: names.index(g.parameters[0])))
 
 
