@@ -5,6 +5,7 @@ Lines marked DECIDE hold what only the user knows.
 
 import os
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
@@ -173,13 +174,15 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
 
 
 def _lines_before_header(path: Path) -> int:
-    """Lines of a CSV before the first with as many cells as most have."""
+    """Lines of a CSV before the first with as many cells as most have, and all different: units repeat."""
     if path.suffix.lower() != ".csv":
         return 0
     lines = decoded(read_bytes(path), path.name, "cp1252").rstrip().splitlines() or [""]
     separator = next((one for one in ";\t," if one in lines[len(lines) // 2]), ",")  # commas may be of decimals
-    counts = [line.count(separator) for line in lines]
-    return counts.index(max(counts, key=counts.count))
+    rows = [line.split(separator) for line in lines]
+    usual = Counter(map(len, rows)).most_common(1)[0][0]
+    different = [len(set(row)) * (len(row) == usual) for row in rows]
+    return different.index(max(different))
 
 
 def _known_name(header: str) -> str:
@@ -314,6 +317,8 @@ def _entry(table: _Recognised, cameras: Sequence[Path], units: Mapping[str, str]
     if "camera" in INSTRUMENTS[str(table.model)].options:
         room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
         lines.append(f"camera: {_path(cameras[0], folder)}  # {room}")
+    if "offset" in INSTRUMENTS[str(table.model)].options:
+        lines.append("# offset: estimate  # DECIDE whether the instrument adds a constant to every length")
     if table.skip_lines:
         lines.append(f"skip_lines: {table.skip_lines}")
     if table.columns:

@@ -266,7 +266,7 @@ def as_frame(name: str, given: Any) -> Any | None:
     return frame
 
 
-def check_different(name: str, columns: Iterable[object]) -> None:
+def check_different(name: str, columns: Iterable[object], hint: str = "") -> None:
     """Check that names of columns differ without the blanks around them.
 
     Raises:
@@ -275,7 +275,7 @@ def check_different(name: str, columns: Iterable[object]) -> None:
     for column, n in Counter(str(column).strip() for column in columns).items():
         if n > 1:
             found = f"two columns called {column!r}" if column else "two columns without a name"
-            raise InputError(name, found, "different names")
+            raise InputError(name, found, "different names", hint)
 
 
 NOTHING = ("na", "n/a", "<na>", "nan", "none", "null", "-", "--")

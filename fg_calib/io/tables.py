@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from fg_calib import inputs, measurements, parallel
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked
 from fg_calib.io.atomic import decoded, read_bytes, write_text
-from fg_calib.io.yaml import Number, Schema, Units, number_hint, shown
+from fg_calib.io.yaml import ANGLES, LENGTHS, Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
 from fg_calib.measurements import Column as ColumnSet
 from fg_calib.robot import Robot
@@ -136,7 +136,7 @@ class Table(Record):
         try:
             found = _read_file(Path(table), skip_lines) if is_file else cls(name, (), _as_polars(table, name))
             header = [column.strip() for column in found.columns or found.frame.columns]
-            inputs.check_different(name, header)
+            inputs.check_different(name, header, _SKIP * bool(found.separator))
             names = header if known is None else _understood(name, header, set(known), set(joints), columns or {})
             found.frame.columns = names
         except (InputError, MemoryError):
@@ -246,6 +246,8 @@ class Table(Record):
             cell = self.frame[column][row]
             cell = cell.strip() if isinstance(cell, str) else cell
             found = "an empty cell" if cell in {None, ""} else shown(cell)
+            if not row and str(cell).strip("[]() ").lower() in (*LENGTHS, *ANGLES, "degrees", "°"):
+                hint = "is it a row of units? delete it: units are in the job"
             raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, hint or number_hint(cell))
 
     def place(self, row: int) -> str:
@@ -268,6 +270,9 @@ def _read_file(path: Path, skip_lines: int) -> Table:
         hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
         raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
     return Table(path.name, (), pl.read_parquet(BytesIO(read_bytes(path))))
+
+
+_SKIP = "are there lines before the header? skip_lines in the job leaves them out"
 
 
 def _read_csv(name: str, text: str, skip_lines: int) -> Table:
@@ -298,7 +303,8 @@ def _read_csv(name: str, text: str, skip_lines: int) -> Table:
         place, n = f"{name}:{lines['number'][row]}", n_cells[row]
         if '"' in unquoted[row]:
             raise InputError(place, "a quote that is not closed", "whole cells in quotes, or none")
-        raise InputError(place, f"{n} cell{'s' * (n != 1)}", f"{len(header)} as in the header")
+        found = f"{n} cell{'s' * (n != 1)}"
+        raise InputError(place, found, f"{len(header)} as in the header", _SKIP * (row == 1))
     if lines.height < every.height:
         content = lines["line"].str.join("\n").item().encode()
     numbers = lines["number"].to_numpy()[1:]

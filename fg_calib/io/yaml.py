@@ -120,6 +120,8 @@ def number_hint(found: object) -> str:
     text = str(found).strip()
     if re.fullmatch(r"[-+]?\d*,\d+", text):
         return _DECIMAL_COMMA
+    if re.fullmatch(r"[-+]?\d{1,3}([,.' \u00a0\u202f]\d{3})+([.,]\d*)?", text):
+        return "are its thousands separated? write digits and a decimal point alone"
     return "its minus is another character, a dash; write -" if re.fullmatch(r"[\u2010-\u2015\u2212]\d.*", text) else ""
 
 

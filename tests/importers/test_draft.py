@@ -81,11 +81,11 @@ def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
 
 
 def test_a_protocol_of_an_instrument_is_read_as_it_is(fg_calib, folder):
-    """A preamble, semicolons with decimal commas, other words, bytes of Windows."""
+    """A preamble, a row of units, semicolons with decimal commas, other words, bytes of Windows."""
     folder, write = folder
     text = pl.read_csv(write()).with_row_index("Punkt", 1).with_columns(Reflektor=pl.lit("groß"))
     text = text.write_csv(separator=";", decimal_comma=True)
-    (folder / "poses.csv").write_bytes(f"Gerät 7;,\n2026-11-28;14:05\n\n{text}".encode("cp1252"))
+    (folder / "poses.csv").write_bytes(f"Gerät 7;,\n2026-11-28;14:05\nmm{';mm' * 10}\n{text}".encode("cp1252"))
     given = drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.csv")["measurements"][0]
     assert (given["skip_lines"], given["columns"]) == (3, {"id": "Punkt", "target": "Reflektor"})
     read = read_job(folder / JOB).tables[0].measurements
@@ -118,6 +118,7 @@ def test_several_tables_have_entries_and_units_of_their_own(fg_calib, folder):
     assert (second["table"], second["model"]) == ("tuesday.csv", "anchor")
     assert (second["units"], given["units"]) == ({"length": "m", "angle": "rad"}, {"length": "mm", "angle": "rad"})
     assert set(given["noise"]) == {"position", "distance", "joint", "estimate"}
+    assert (folder / JOB).read_text().count("# offset: estimate  # DECIDE whether the instrument adds a constant") == 1
 
 
 def test_sigmas_in_a_table_need_no_value_of_noise(fg_calib, folder):

@@ -210,6 +210,12 @@ MISTAKES = [
     (changed("0,0.6,0,0.8", "0,0.6,0,0.802"), "poses.csv:4: quaternion of norm 1.0016, expected 1 within 0.001"),
     (changed("p2,", ""), "poses.csv:3: 12 cells, expected 13 as in the header"),
     (changed("0.2,0.3", "0.2,300"), "poses.csv:2: q3 = 300 m is outside [0, 0.5]; is it in mm?"),
+    (changed("note\n", "note\n[deg],deg,m,,m,m,m,,,,,,\n"),
+     "poses.csv:2: q1: found '[deg]', expected a finite number; is it a row of units? delete it: units are in the job"),
+    (changed("1.5,2", '"1,001.5",2'), "poses.csv:3: x: found '1,001.5', expected a finite number; "
+     "are its thousands separated? write digits and a decimal point alone"),
+    (changed("q1", "date\nq1"), "poses.csv:2: 13 cells, expected 1 as in the header; "
+     "are there lines before the header? skip_lines in the job leaves them out"),
 ]  # fmt: skip
 
 
