@@ -12,9 +12,9 @@ from fg_calib.graph.problem import Problem, named_rows, problem_at, start_of, ta
 from fg_calib.graph.variables import Variables
 from fg_calib.inputs import Floats, Options, ProblemError, check_names, checked
 from fg_calib.job import Job
-from fg_calib.measurements import Frames, Table, Tables, build, check_rows, is_ours, missing_values
+from fg_calib.measurements import Table, Tables, build, check_rows, is_ours, missing_values, residuals
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import Robot, forward, names_of
+from fg_calib.robot import Robot, names_of
 
 _log = logging.getLogger(__name__)
 
@@ -149,7 +149,5 @@ def _check_own_kinds(robot: Robot, data: build.Dataset, variables: Variables, st
     """Compare the derivatives of custom kinds with differences at some measurements, where they are started."""
     at = variables.at(start)
     for s in (s for s in data.blocks if not is_ours(s.kind)):
-        table = data.tables[s.table].measurements
-        poses = forward(at.chains[s.table].without_columns(), robot.trig(table.readings), s.ends.ravel())
-        rotation, position = poses.rotation.reshape(*s.ends.shape, 3, 3), poses.position.reshape(*s.ends.shape, 3)
-        check_rows(s.kind, Frames(rotation, position), s.data, at.coordinates[s.nuisances], s.source)
+        frames = residuals.frames_at(at.chains[s.table], data.trigs(robot)[s.table], s.ends)
+        check_rows(s.kind, frames, s.data, at.coordinates[s.nuisances], s.source)

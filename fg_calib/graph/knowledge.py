@@ -189,11 +189,8 @@ class Knowledge(FrozenArrays):
 
     def factor(self, variables: Variables, unknowns: Landmarks) -> CheckedFactor:
         """The rows as a factor on all variables of a problem."""
-
-        def rows(values: gtsam.Values) -> tuple[Floats, Floats]:
-            return self.at_parameters(variables, unknowns, variables.parameters(values))
-
-        return CheckedFactor([*variables.items, *variables.nuisance], self.n, rows)
+        every, vector = [*variables.items, *variables.nuisance], variables.parameters
+        return CheckedFactor(every, self.n, lambda values: self.at_parameters(variables, unknowns, vector(values)))
 
 
 def coordinates_of(variables: Variables, unknowns: Landmarks, name: Name) -> Integers | None:

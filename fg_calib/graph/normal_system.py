@@ -65,8 +65,7 @@ def identifiable_subset(rows: Floats, scales: Floats, ranks: Sequence[int]) -> l
 
 def first_independent(N: Floats, count: int) -> list[int]:
     """The first columns of N, in order, that are clearly linearly independent."""
-    chosen: list[int] = []
-    basis = np.zeros((len(N), 0))
+    chosen, basis = list[int](), np.zeros((len(N), 0))
     for clearly in (1e-2, SUPPORT_TOLERANCE, 0.0):
         for i in range(N.shape[1]):
             if len(chosen) == count:
@@ -111,8 +110,6 @@ def eliminate(A: Floats, b: Floats, n_core: int) -> Eliminated:
     of the landmark columns that nothing determines stay where they are.
     """
     core, landmarks = A[:, :n_core], A[:, n_core:]
-    if landmarks.shape[1] == 0:
-        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_core)), np.zeros((0, 0)), np.zeros(0, dtype=np.bool_))
     Q, inverse, unknown = _basis_of(landmarks)
     explained = Q.T @ core
     left = core - Q @ explained
@@ -128,7 +125,7 @@ def _basis_of(A: Floats) -> tuple[Floats, Floats, Booleans]:
     size[size == 0.0] = 1.0
     Q, R = np.linalg.qr(A / size)
     pivots = np.abs(np.diag(R))
-    if len(Q) >= A.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
+    if len(Q) >= A.shape[1] and pivots.min(initial=np.inf) > RANK_TOLERANCE * pivots.max(initial=0.0):
         return Q, np.linalg.inv(R) / size[:, None], np.zeros(A.shape[1], dtype=np.bool_)
     U, s, Vt = np.linalg.svd(A / size, full_matrices=True)
     kept = np.zeros(len(Vt), dtype=np.bool_)

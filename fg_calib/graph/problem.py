@@ -245,11 +245,10 @@ class Problem(FrozenArrays):
     @property
     def n_excluded(self) -> dict[str, int]:
         """Train pairs that take no part, by reason: once each, whatever was measured of them."""
-        found: dict[str, set[tuple[int, int]]] = {}
+        found = {reason: set[tuple[int, int]]() for s in self.data.blocks for reason in s.excluded}
         for s in self.data.blocks:
             for reason, mask in s.excluded.items():
-                pairs = s.number[mask & ~s.test].tolist()
-                found.setdefault(reason, set()).update((s.table, pair) for pair in pairs)
+                found[reason].update((s.table, pair) for pair in s.number[mask & ~s.test].tolist())
         return {reason: len(pairs) for reason, pairs in found.items()}
 
     @property
@@ -316,9 +315,9 @@ def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> 
         at = replace(at, coordinates=np.where(nowhere, contact_points(data, at.chains, trigs), at.coordinates))
     width = problem.robot.n_joints + POSE_SLOTS * len(data.tables)
     n_errors = width * data.n_configurations
+    each = enumerate(zip(data.tables, data.places, trigs, at.chains, strict=True))
     places = [
-        TableState(table.measurements, k, data.places[k], trigs[k], at.chains[k], at.coordinates, width, n_errors)
-        for k, table in enumerate(data.tables)
+        TableState(t.measurements, k, c, q, chain, at.coordinates, width, n_errors) for k, (t, c, q, chain) in each
     ]
     return tuple(RowNoise(s.fitted if fitted else s, places[s.table], problem.state) for s in data.blocks)
 

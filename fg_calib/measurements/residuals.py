@@ -177,10 +177,14 @@ def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple
 
 def _given(block: Block, chain: Chain, rows: slice) -> tuple[Floats, Floats, Floats]:
     """Residuals and derivatives in frames and nuisances, by the kind's numpy."""
-    ends = block.ends[rows]
-    at = forward(chain.without_columns(), block.trig, ends.ravel())
-    frames = Frames(at.rotation.reshape(*ends.shape, 3, 3), at.position.reshape(*ends.shape, 3))
+    frames = frames_at(chain, block.trig, block.ends[rows])
     return checked_rows(block.kind, frames, block.data[rows], block.nuisances[rows], block.source)
+
+
+def frames_at(chain: Chain, trig: Floats, ends: Integers) -> Frames:
+    """Tool frames of the ends of measurements, as `Block` has them."""
+    at = forward(chain.without_columns(), trig, ends.ravel())
+    return Frames(at.rotation.reshape(*ends.shape, 3, 3), at.position.reshape(*ends.shape, 3))
 
 
 def _turning(block: Block, chain: Chain, ends: Integers) -> Floats:
