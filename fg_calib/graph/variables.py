@@ -351,10 +351,9 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
     tangents = {symbol: v.columns.start for symbol, v in poses.items()}
     for frame in (f"X({table})" for table in range(len(frames))):
         tool, base, at = map(tangents.get, ("T(0)", "B(0)", frame))
-        chain = build_chain(
-            robot, columns, tool_tangent=tool, base_tangent=base, frame_tangent=at, frame=frame in poses
-        )
-        later = poses[frame].parameters[0] - n if frame in poses else -n
+        there = frame in poses
+        chain = build_chain(robot, columns, tool_tangent=tool, base_tangent=base, frame_tangent=at, frame=there)
+        later = poses[frame].parameters[0] - n if there else -n
         source = np.where(chain.source >= n, chain.source + later, chain.source)
         chains.append(replace(chain, source=source, n_columns=len(names)))
     return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
