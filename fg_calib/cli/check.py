@@ -1,18 +1,13 @@
 """`fg-calib check`, `update` and `history`: a calibration and new rows."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from fg_calib.cli.calibrate import show_calibration
 from fg_calib.cli.output import Json, ResultFolder, argument, option, quantity, show_result
-
-if TYPE_CHECKING:
-    from fg_calib.robot import Robot
 
 NewTable = Annotated[Path, argument("TABLE", "New rows: a table like the job's, or a job with several.")]
 Pairs = Annotated[Path | None, option("--pairs", "TABLE", "Table of pairs, if the job has one.")]
@@ -54,17 +49,18 @@ def update(
     as_json: Json = False,
 ) -> None:
     """Add new rows to the information of a calibration: its own rows are not read again."""
-    from fg_calib import calibration, inputs, io
+    from fg_calib import calibration, inputs, io, robot
 
     if out.resolve() == (result.parent if result.is_file() else result).resolve():
         raise inputs.InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
     io.require_writable(out)
     io.require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
     before = calibration.Calibration.load(result)
+    units = {name: p.unit for p in before.robot.parameters for name in (robot.tolerance_kind(p), p.name) if name}
     found = before.update(
         table,
         date=date,
-        growth=_growth(growth or (), before.robot),
+        growth=_growth(growth or (), units),
         changed=changed or (),
         anchors_stay=anchors_stay,
         pairs=pairs,
@@ -74,23 +70,20 @@ def update(
     show_calibration(found, as_json)
 
 
-def _growth(given: Sequence[str], robot: Robot) -> dict[str, float]:
-    """Growth by name or kind, in [m] and [rad].
+def _growth(given: Sequence[str], units: Mapping[str, str]) -> dict[str, float]:
+    """Growth by name or kind, in [m] and [rad], as the units of the parameters say.
 
     Raises:
         InputError: One is not `NAME=FIGURE` with a unit.
     """
-    from fg_calib.inputs import InputError
-    from fg_calib.io import quantity
-    from fg_calib.robot import tolerance_kind
+    from fg_calib import inputs, io
 
-    units = {name: p.unit for p in robot.parameters for name in (tolerance_kind(p), p.name) if name}
     found = {}
     for one in given:
         name, equals, figure = one.partition("=")
         if not equals:
-            raise InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
-        found[name] = quantity(figure, units.get(name, "rad"), None, f"--growth: {name}")
+            raise inputs.InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
+        found[name] = io.quantity(figure, units.get(name, "rad"), None, f"--growth: {name}")
     return found
 
 

@@ -20,7 +20,7 @@ them, nor needs to.
 What to measure next are the random configurations where the two likeliest changes move the tool most differently.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -192,32 +192,29 @@ def named_changes(v: graph.Variables) -> dict[str, Floats]:
     return found | {POSES[i.kind]: np.eye(v.n_columns)[:, i.columns] for i in v.items if i.kind in POSES}
 
 
-def pairs_of_zeros(hypotheses: Sequence[ChangeHypothesis]) -> list[ChangeHypothesis]:
+def pairs_of_zeros(hypotheses: Sequence[ChangeHypothesis]) -> Iterator[ChangeHypothesis]:
     """Two zeros together."""
-    found = []
     for a, b in combinations([one for one in hypotheses if one.kind == "zero"], 2):
         columns, directions = (np.hstack(of) for of in ((a.columns, b.columns), (a.directions, b.directions)))
-        found.append(ChangeHypothesis(a.names + b.names, "zeros", a.units + b.units, columns, directions))
-    return found
+        yield ChangeHypothesis(a.names + b.names, "zeros", a.units + b.units, columns, directions)
 
 
-def gross_errors(rows: Linear) -> list[ChangeHypothesis]:
+def gross_errors(rows: Linear) -> Iterator[ChangeHypothesis]:
     """Errors of any size in the rows of each configuration that at most a third of the rows are of.
 
     None where there are more than `MOST_ROWS`.
     """
     problem = rows.placed.problem
     if len(rows.of_arm) > MOST_ROWS:
-        return []
-    ends, found = ends_of_rows(problem), []
+        return
+    ends = ends_of_rows(problem)
     unit = np.eye(len(ends))
     for k in np.unique(ends[ends >= 0]).tolist():
         mine = np.flatnonzero((ends == k).any(axis=1))
         if 3 * len(mine) <= len(ends):
             columns = problem.rows.states.whiten(unit[:, mine])
             columns, none = columns[:, columns.any(axis=0)], np.zeros((rows.of_arm.shape[1], 0))
-            found.append(ChangeHypothesis((problem.data.names[k],), "row", ("",) * columns.shape[1], columns, none))
-    return found
+            yield ChangeHypothesis((problem.data.names[k],), "row", ("",) * columns.shape[1], columns, none)
 
 
 def fit_changes(rows: Linear) -> list[HypothesisTest]:
@@ -226,7 +223,7 @@ def fit_changes(rows: Linear) -> list[HypothesisTest]:
     found = [f for one in hypotheses if (f := fit_change(one, rows, len(hypotheses))) is not None]
     if not found or max(special.chdtrc(f.dof, f.left) for f in found) >= CERTAIN:
         return found
-    hypotheses += pairs_of_zeros(hypotheses)
+    hypotheses = [*hypotheses, *pairs_of_zeros(hypotheses)]
     return [f for one in hypotheses if (f := fit_change(one, rows, len(hypotheses))) is not None]
 
 

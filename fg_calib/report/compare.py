@@ -156,7 +156,7 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
     return own | more
 
 
-def changes(old: Result, new: Result) -> list[dict[str, Any]]:
+def changes(old: Result, new: Result) -> Iterator[dict[str, Any]]:
     """The parameters that one of two calibrations estimated: old, new, change, its sigma, and both over each other.
 
     Raises:
@@ -164,7 +164,6 @@ def changes(old: Result, new: Result) -> list[dict[str, Any]]:
     """
     if [p.name for p in old.parameters] != [p.name for p in new.parameters]:
         raise inputs.InputError(new.robot, "other parameters", f"those of {old.robot}")
-    rows = []
     for a, b in zip(old.parameters, new.parameters, strict=True):
         if a.identifiability == b.identifiability == "fixed":
             continue
@@ -173,8 +172,7 @@ def changes(old: Result, new: Result) -> list[dict[str, Any]]:
             change -= 2.0 * np.pi * round(change / (2.0 * np.pi))
         sigma = None if a.sigma is None or b.sigma is None else float(np.hypot(a.sigma, b.sigma))
         values = {"old": a.estimate, "new": b.estimate, "change": change, "sigma": sigma}
-        rows.append({"name": b.name, "unit": b.unit, **values, "in_sigma": change / sigma if sigma else None})
-    return rows
+        yield {"name": b.name, "unit": b.unit, **values, "in_sigma": change / sigma if sigma else None}
 
 
 def changes_document(old: Result, new: Result, folders: tuple[Path, Path]) -> dict[str, Any]:
@@ -183,7 +181,7 @@ def changes_document(old: Result, new: Result, folders: tuple[Path, Path]) -> di
     { "schema": "fg-calib/changes/1", "old": folder, "new": folder,
       "parameters": [{"name", "unit", "old", "new", "change", "sigma", "in_sigma"}] }
     """
-    return tables.document_of("changes", old=str(folders[0]), new=str(folders[1]), parameters=changes(old, new))
+    return tables.document_of("changes", old=str(folders[0]), new=str(folders[1]), parameters=list(changes(old, new)))
 
 
 def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -> Group:

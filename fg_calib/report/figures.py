@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -41,9 +41,9 @@ def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
     """All figures of a calibration by name, in the order of the page; none where its tables lack them."""
     space = None if data.result.evaluated_only else data.workspace
     return {
-        "parameters": parameter_whiskers(data),
+        "parameters": list(parameter_whiskers(data)),
         "residuals": residual_charts(data),
-        "joints": error_over_joints(data),
+        "joints": list(error_over_joints(data)),
         "correlations": correlation_matrix(data),
         "workspace": error_slices(space.errors.position, space.expected[:, 0], space.measured) if space else [],
     }
@@ -70,14 +70,13 @@ def draw(data: ReportData, name: str) -> Drawing:
     return Drawing(standalone(charts))
 
 
-def error_over_joints(data: ReportData) -> list[Chart]:
+def error_over_joints(data: ReportData) -> Iterator[Chart]:
     """Residuals of configurations over the reading of each joint."""
     if data.rms is None or data.configurations is None:
-        return []
+        return
     (kind, rms), test, ids = data.rms, data.held_out, data.configurations["id"]
     unit = shown_in(data.result.unit_of(kind)).unit
     worst = [k for k in np.argsort(-np.nan_to_num(rms))[:WORST].tolist() if np.isfinite(rms[k])]
-    found = []
     for joint, readings in zip(data.robot.joints, data.readings.T, strict=True):
         q = readings * shown_in(joint.unit).factor
         names = f"{charts.short(joint.name, 40)} [{shown_in(joint.unit).unit}]", f"{kind} residual [{unit}]"
@@ -86,17 +85,15 @@ def error_over_joints(data: ReportData) -> list[Chart]:
         plot.dots(q[test], rms[test], "b")
         for k in worst:
             plot.ring(q[k], rms[k], f"{ids[k]}: {rms[k]:.3g} {unit}")
-        found.append(plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest"))
-    return found
+        yield plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest")
 
 
 def _colours(test: Booleans) -> str:
     return ", ".join(["blue fitted"] * (not test.all()) + ["orange held out"] * bool(test.any()))
 
 
-def parameter_whiskers(data: ReportData) -> list[Chart]:
+def parameter_whiskers(data: ReportData) -> Iterator[Chart]:
     """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
-    found = []
     for unit in robot.SCALES:
         what = {"m": "Lengths", "rad": "Angles"}.get(unit, "Effects of joints")
         shown = [p for p in data.result.estimated if p.unit == unit]
@@ -113,8 +110,7 @@ def parameter_whiskers(data: ReportData) -> list[Chart]:
             plot.line((value[k] - sigma[k], value[k] + sigma[k]), k, "whisker")
         for known, kind in ((np.isfinite(sigma), "large a"), (np.isnan(sigma), "large b")):
             plot.dots(value[known], row[known], kind)
-        found.append(plot.chart(f"{what}: correction {name}"))
-    return found
+        yield plot.chart(f"{what}: correction {name}")
 
 
 def correlation_matrix(data: ReportData) -> list[Chart]:

@@ -69,7 +69,7 @@ def build_page(data: text.ReportData) -> str:
         arm=arm_scene(data),
         ramp=RAMP,
         verdict=text.verdict_word(result),
-        limits=[] if result.acceptance is None else text.judged(result.acceptance.judgements),
+        limits=[] if result.acceptance is None else list(text.judged(result.acceptance.judgements)),
         tiles=list(_tiles(data)),
         command=_command(result),
         options=list(_options(result)),

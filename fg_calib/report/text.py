@@ -135,16 +135,14 @@ def verdict_word(result: Result) -> str:
     return "DOUBTFUL" if result.findings else "GOOD, with warnings" if result.reservations else "GOOD"
 
 
-def judged(judgements: Iterable[statistics.Judgement]) -> list[str]:
+def judged(judgements: Iterable[statistics.Judgement]) -> Iterator[str]:
     """A line a limit: `PASS: position 0.31 mm (RMS of 30 held-out measurements), limit 0.5 mm`."""
-    lines = []
     for one in judgements:
         unit = inputs.LIMITED[one.kind]
         error = "" if one.error is None else f" {in_words(one.error, unit)} (RMS of {one.n} held-out measurements)"
         reason = f": {one.reason}" if one.reason else ""
         of = f" of {one.table}" if one.table else ""
-        lines.append(f"{one.verdict.upper()}: {one.kind}{of}{error}, limit {in_words(one.limit, unit)}{reason}")
-    return lines
+        yield f"{one.verdict.upper()}: {one.kind}{of}{error}, limit {in_words(one.limit, unit)}{reason}"
 
 
 def _verdict(result: Result) -> Iterator[Content]:

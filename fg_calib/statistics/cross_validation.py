@@ -118,7 +118,7 @@ def cross_validate(
     for table in job.tables:
         if table.own:
             raise InputError("folds", f"custom measurements in {table.measurements.source}", "tables without")
-    tables = _train_tables(job.tables)
+    tables = tuple(_train_tables(job.tables))
     if not tables:
         raise InputError("folds", "test rows alone", "rows to calibrate with, and to hold out")
     whole = replace(job, measurements=tables)
@@ -160,9 +160,8 @@ def _calibrated(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Float
     return solution.parameters[problem.variables.robot_span], held_out, solution.converged
 
 
-def _train_tables(tables: Sequence[Table]) -> tuple[Table, ...]:
+def _train_tables(tables: Sequence[Table]) -> Iterator[Table]:
     """Tables without their test rows; those that have no others are left out."""
-    found = []
     for table in tables:
         m, pairs, groups = table.measurements, table.measurements.pairs, table.measurements.groups
         rows, place = np.flatnonzero(~m.test), np.cumsum(~m.test) - 1
@@ -172,8 +171,7 @@ def _train_tables(tables: Sequence[Table]) -> tuple[Table, ...]:
         if groups is not None:
             groups = replace(groups, index=groups.index[rows], pairs=groups.pairs.select(~groups.pairs.test))
         if len(rows):
-            found.append(replace(table, measurements=replace(m.select(rows), pairs=pairs, groups=groups)))
-    return tuple(found)
+            yield replace(table, measurements=replace(m.select(rows), pairs=pairs, groups=groups))
 
 
 def _without_fold(table: Table, fold: Integers, k: int) -> Table:

@@ -26,6 +26,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -425,7 +426,7 @@ class RowStatistics:
         by_kind: Floats = np.bincount(self.table.group[part.rows], leverage, n_groups).astype(np.float64)
         excess = self.spread.excess * by_kind / max(float(by_kind.sum()), 1e-300)
         known = not self.robust and self.solution.estimated_noise is None
-        return self._fit_kinds(part, excess, known and (part.covariance is not None or not self._shared))
+        return tuple(self._fit_kinds(part, excess, known and (part.covariance is not None or not self._shared)))
 
     def fit_predicted(self) -> PredictedFit | None:
         """The fit of the predicted rows; None without any that can be judged."""
@@ -448,7 +449,7 @@ class RowStatistics:
             chi2, expected, nu = float(np.sum(part.squares)), float(n), part.degrees(chosen)
         of_noise = self._degrees_of_noise(np.arange(len(self.fitted.rows)))
         return PredictedFit(
-            kinds=self._fit_kinds(part, np.zeros(len(table.groups)), known=True),
+            kinds=tuple(self._fit_kinds(part, np.zeros(len(table.groups)), known=True)),
             n_rows=n,
             n=len(chosen),
             n_measurements=n_measurements,
@@ -465,9 +466,9 @@ class RowStatistics:
         estimated = self.solution.estimated_noise is not None and len(fitted)
         return max(1.0, self.fitted.degrees(fitted)) if estimated else np.inf
 
-    def _fit_kinds(self, part: JudgedRows, excess: Floats, known: bool) -> tuple[KindFit, ...]:
+    def _fit_kinds(self, part: JudgedRows, excess: Floats, known: bool) -> Iterator[KindFit]:
         """The fit of each of the table's groups, whose chi-square has a mean lower by `excess`."""
-        table, found = self.table, list[KindFit]()
+        table = self.table
         for code, (number, family) in enumerate(table.groups):
             chosen = part.of_kind(code)
             if not len(chosen):
@@ -493,8 +494,7 @@ class RowStatistics:
                 degrees=degrees,
                 table=number,
             )
-            found.append(replace(fit, n_beyond=int(np.sum(size > fit.level(len(rows))))))
-        return tuple(found)
+            yield replace(fit, n_beyond=int(np.sum(size > fit.level(len(rows)))))
 
     @cached_property
     def _specified_variance(self) -> Floats:
