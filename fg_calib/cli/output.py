@@ -1,7 +1,5 @@
 """Shared by all commands: options, output of reports, JSON and progress, exit codes."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex
@@ -9,14 +7,11 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from fg_calib.inputs import AngleUnit, LengthUnit, printable
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 
 def argument(metavar: str, about: str) -> Any:
@@ -96,7 +91,7 @@ def show_json(document: dict[str, Any]) -> None:
     show(json.dumps(document, allow_nan=False))
 
 
-def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: Callable[[], RenderableType]) -> None:
+def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: Callable[[], Any]) -> None:
     """Print a result as JSON, or as a report as wide as the terminal or `COLUMNS` (`WIDTH` in a pipe).
 
     Args:

@@ -354,30 +354,26 @@ def _joint_values(found: ReportData) -> list[Section]:
     return [*section(title, table_of(columns, rows)), *section("Suspicious joint readings", suspicious)]
 
 
-def _landmarks(result: Result) -> list[Section]:
+def _landmarks(result: Result) -> Iterator[Section]:
     """Estimated contact points, targets, anchors, planes and boards; `result.json` has all of many."""
-    sections: list[Section] = []
     for kind, title in ((kind.name, kind.heading) for kind in measurements.LANDMARKS.values() if kind.heading):
         rows = []
         for p in (p for p in result.groups if p.kind == kind):
             units = ["" if kind == "unknown" else unit for unit in p.units]
             sigma = _vector(p.sigma, *units) if p.sigma.any() else "known"
             rows.append((p.name, p.n, _vector(p.xyz, *units), "±", sigma))
-        sections += section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows, most=8))
-    return sections
+        yield from section(title, table_of(("", "rows|d", "estimate|>", "", "sigma|>"), rows, most=8))
 
 
-def _frames(result: Result) -> list[Section]:
+def _frames(result: Result) -> Iterator[Section]:
     """The estimated measurement frames."""
-    sections: list[Section] = []
     for symbol, frame in result.frames.items():
         which = "" if len(result.tables) == 1 else f" of {result.tables[int(symbol[2:-1])][0]}"
         rows = [("xyz", *frame.xyz, "m"), ("± along its axes", *frame.sigma[3:], "m")]
         rows.append(("± about its axes", *frame.sigma[:3], "rad"))
         quaternion = "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist())
         table = table_of(("", "|q", "|q", "|q", "|unit"), rows)
-        sections += section(f"Measurement frame (world_T_base{which})", table, f"quaternion xyzw: {quaternion}")
-    return sections
+        yield from section(f"Measurement frame (world_T_base{which})", table, f"quaternion xyzw: {quaternion}")
 
 
 def _vector(values: inputs.Floats, *units: str) -> str:
