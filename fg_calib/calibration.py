@@ -680,14 +680,17 @@ def _posterior(robot: Robot, result: io.Result, place: str) -> TangentCovariance
         poses.append(frame_of(gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), frame.xyz)))
     unknown = [int(symbol[2:-1]) for symbol in result.frames]
     variables = build_variables(robot, [t in unknown for t in range(max(unknown, default=0) + 1)], False)
-    saved, n = result.posterior, variables.n_columns
+    saved, n, covariance = result.posterior, variables.n_columns, result.covariance.matrix
     values = np.concatenate([[p.estimate for p in result.parameters], *poses])
     if saved is None and tuple(variables.names) == result.covariance.names:
-        return _posterior_of_names(variables, values, result.covariance.matrix)
+        return _posterior_of_names(variables, values, covariance)
     if saved is None or saved.variables != {v.symbol: tuple(variables.names[v.columns]) for v in variables.items}:
         raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
     matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
-    return TangentCovariance(variables, values, *(matrix.reshape(len(matrix), n) for matrix in matrices))
+    found = TangentCovariance(variables, values, *(matrix.reshape(len(matrix), n) for matrix in matrices))
+    if not np.allclose(np.diag(found.named()), np.diag(covariance), 1e-6, 0.0, equal_nan=True):
+        raise InputError(place, "variances of parameters other than those of covariance", "the same", "was it changed?")
+    return found
 
 
 def _posterior_of_names(variables: Variables, values: Floats, covariance: Floats) -> TangentCovariance:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, dataclass_transform
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator
+from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
 
 from fg_calib.inputs.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
 from fg_calib.inputs.errors import InputError, shown
@@ -44,6 +44,10 @@ Figure = Annotated[
     PlainSerializer(lambda value: float(value) if np.isfinite(value) else None, return_type=float | None),
 ]
 """A number that may be nan, for unknown, or infinite: null in JSON."""
+
+Sigma = Annotated[float, Field(ge=0.0)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+"""Numbers that a typed result holds to their range when it is read back."""
 
 NORM_TOLERANCE = 1e-3
 """How far a quaternion or a rotation matrix may be from length 1: more is not rounding."""

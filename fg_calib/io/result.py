@@ -31,7 +31,7 @@ from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, V
 
 from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
-from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, checked
+from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, Probability, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
@@ -201,7 +201,7 @@ class Run(Section):
     n_residuals: int
     chi2: Figure
     dof: int
-    p_value: float | None
+    p_value: Probability | None
     verdict: Literal["good", "doubtful"]
     parameters: dict[str, tuple[float, float | None, str]]
     inputs: dict[str, str] = {}
@@ -239,11 +239,11 @@ class Result(Section):
     reservations: tuple[str, ...] = of("assessed.verdict.warnings", ())
     notes: tuple[str, ...] = ()
     setup: diagnostics.SetupCheck | None = of("assessed.verdict.setup", None)
-    probability_of_noise: float | None = of("assessed.verdict.noise_like", None)
+    probability_of_noise: Probability | None = of("assessed.verdict.noise_like", None)
     chi2: Figure = of("assessed.fit.chi_square.value")
     dof: int = of("assessed.fit.chi_square.dof")
     reduced_chi2: float | None = of("assessed.fit.chi_square.reduced")
-    chi2_p_value: float | None = of("assessed.fit.chi_square.p_value", None)
+    chi2_p_value: Probability | None = of("assessed.fit.chi_square.p_value", None)
     chi2_expected: Figure = of("assessed.fit.chi_square.expected", np.nan)
     chi2_bounds: tuple[Figure, Figure] = of("assessed.fit.chi_square.bounds", (np.nan, np.nan))
     goodness: dict[str, statistics.KindFit] = {}
@@ -510,14 +510,26 @@ def _upgraded(document: dict[str, Any]) -> dict[str, Any]:
 
 def _shapes(result: Result) -> Iterator[tuple[str, Any, Any]]:
     """Quantities that a result holds twice: the key, the shape or number there, and that by the rest of it."""
-    names, known = result.covariance.names, {p.name for p in result.parameters}
+    names, sigmas = result.covariance.names, {p.name: p.sigma for p in result.parameters}
     matrices = [("covariance", result.covariance.matrix, len(names))]
     if (posterior := result.posterior) is not None:
         matrices.append(("posterior: covariance", posterior.covariance, sum(map(len, posterior.variables.values()))))
     for key, M, n in matrices:
         yield f"{key}: shape", M.shape if M.size else (0, 0), (n, n)
         yield f"{key}: negative variances", int(np.sum(np.diag(M) < 0.0)) if n else 0, 0
-    yield "covariance: names", len(known.intersection(names)), len(names)
+    yield "covariance: names", len(sigmas.keys() & names), len(names)
+    sigma = np.array([sigmas[name] for name in names], dtype=np.float64)
+    M = result.covariance.matrix.reshape(sigma.size, sigma.size)
+    same = np.isclose(np.diag(M), sigma**2, 1e-6, 0.0, equal_nan=True)
+    yield "covariance: variances that are not the squares of sigmas", int(np.sum(~same)), 0
+    seen = result.observability.observability
+    yield "observability: classes", len(seen.classes), len(seen.names)
+    of_groups = {name for one in seen.relative for name in (*one.parameters, *one.keep)}
+    named = of_groups.union(seen.sigma, *seen.lost)
+    yield "observability: unknown names", sorted(named.difference(seen.names)), []
+    yield "observability: directions lost", len(seen.lost), len(seen.names) - seen.rank
+    if result.posterior is not None:  # version 1 did not list them
+        yield "observability: lost", len(result.observability.lost), len(seen.lost)
     knowledge = result.carried.knowledge
     for one in () if knowledge is None else filter(None, (knowledge, knowledge.nominal)):
         arrays, n, m = (one.rows, one.right, one.at), SIZE * len(one.unknowns), one.right.size

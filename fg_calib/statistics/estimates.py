@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib import graph
-from fg_calib.inputs import Floats, FrozenArrays, Integers, Record
+from fg_calib.inputs import Floats, FrozenArrays, Integers, Record, Sigma
 from fg_calib.observability import IdentifiabilityClass, Observability
 from fg_calib.statistics.covariance import Spread, TangentCovariance
 from fg_calib.statistics.residual_table import suspect_level
@@ -43,11 +43,11 @@ class ParameterEstimate(Record):
     nominal: float
     estimate: float
     correction: float
-    sigma: float | None
-    prior_sigma: float | None
+    sigma: Sigma | None
+    prior_sigma: Sigma | None
     identifiability: IdentifiabilityClass | str
     stands_for: dict[str, float] | None = None
-    sigma_of_combination: float | None = None
+    sigma_of_combination: Sigma | None = None
 
 
 class FrameEstimate(FrozenArrays):

@@ -37,7 +37,7 @@ from scipy import special
 
 from fg_calib import measurements, robot
 from fg_calib.graph import NoiseState, Solution, effect, mahalanobis_distances, noises_at
-from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers, Record
+from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers, Probability, Record
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel
@@ -101,7 +101,7 @@ class KindFit(Record):
     observed_over_specified: Figure
     chi2: Figure
     expected: Figure
-    p_value: float | None
+    p_value: Probability | None
     typical: Figure
     degrees: Figure
     table: int = 0
@@ -209,7 +209,7 @@ class PredictedFit(FrozenArrays):
     n_unknown: int
     chi2: Figure
     expected: Figure
-    p_value: Figure
+    p_value: Probability
     configurations: tuple[SuspectConfiguration, ...]
 
 

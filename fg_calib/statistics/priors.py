@@ -52,7 +52,7 @@ import numpy as np
 from scipy import special
 
 from fg_calib import graph, parallel
-from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Record, SharedScale
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Probability, Record, SharedScale
 from fg_calib.robot import Parameter, Robot, tolerance_kind
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.variance_components import settle
@@ -303,7 +303,7 @@ class PriorFit(FrozenArrays):
     sigma: Floats
     chi2: Figure
     expected: Figure
-    p_value: float | None
+    p_value: Probability | None
     beyond: tuple[Beyond, ...]
 
 

@@ -96,6 +96,11 @@ def move(parameter):
     parameter["correction"] += 1e-3
 
 
+def scale(matrix):
+    """Make a covariance 10 000 times as large."""
+    matrix[:] = (1e4 * np.array(matrix, float)).tolist()
+
+
 @pytest.mark.parametrize(("damage", "message"), [
     (lambda f: (f / "result.json").write_text("{"), "result.json: not JSON: .*; was it cut off?"),
     (lambda f: (f / "result.json").write_text('{"n": NaN}'), "result.json: not JSON: NaN is no number"),
@@ -109,6 +114,14 @@ def move(parameter):
     (lambda f: changed(f, lambda d: move(d["parameters"][8])), "robot_calibrated.yaml: other values than in"),
     (lambda f: (f / "robot_calibrated.yaml").unlink(), "neither robot_calibrated.yaml nor robot_calibrated.urdf"),
     (lambda f: changed(f, lambda d: d["posterior"]["variables"].popitem()), "json: posterior: covariance: shape"),
+    (lambda f: changed(f, lambda d: d["observability"]["lost"].pop()), "observability: lost: found 5, expected 6"),
+    (lambda f: changed(f, lambda d: d["observability"].update(rank=3)), "directions lost: found 6, expected 13"),
+    (lambda f: changed(f, lambda d: d["observability"]["sigma"].update(a9=1)), r"unknown names: found \['a9'\]"),
+    (lambda f: changed(f, lambda d: d["observability"]["classes"].pop()), "classes: found 15, expected 16"),
+    (lambda f: changed(f, lambda d: d["parameters"][2].update(sigma=-1)), "3: sigma: found -1, expected a number not"),
+    (lambda f: changed(f, lambda d: d.update(chi2_p_value=7)), "chi2_p_value: found 7, expected a number not above 1"),
+    (lambda f: changed(f, lambda d: scale(d["covariance"]["matrix"])), "not the squares of sigmas: found 16"),
+    (lambda f: changed(f, lambda d: scale(d["posterior"]["covariance"])), "variances of parameters other than those"),
     (lambda f: (f / "residuals.csv").write_text("kind\n"), "residuals.csv: changed, or of another calibration"),
 ])  # fmt: skip
 def test_a_damaged_folder_is_refused_in_a_line(folder, damage, message):
