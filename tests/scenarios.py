@@ -40,12 +40,7 @@ INSTRUMENTS = {
 
 def scenario(*instruments, n=60, **changes):
     """A small arm with one prismatic joint, measured with 1e-4 m, 2e-4 rad and 0.1 px."""
-    given = {
-        "robot": small_arm(tolerance=TOLERANCE),
-        "errors": Errors("normal", {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}),
-        "configurations": RandomReadings(n),
-        "noise": SIGMA,
-        "instruments": instruments,
-        "job": {},
-    }
+    errors = Errors("normal", {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3})
+    given = {"robot": small_arm(tolerance=TOLERANCE), "errors": errors, "configurations": RandomReadings(n)}
+    given |= {"noise": SIGMA, "instruments": instruments, "job": {}}
     return Scenario(**given | changes)

@@ -18,15 +18,9 @@ JOINTS = ["q1", "q2", "q3", "q4"]
 UNITS = {"length": "mm", "angle": "deg"}
 IN_SI = np.array([1e-3 if joint.prismatic else np.pi / 180.0 for joint in ARM.joints])
 
-SCENARIO = {
-    "robot": "robot.yaml",
-    "units": UNITS,
-    "errors": {"normal": "tolerance"},
-    "configurations": {"random": {"count": 20}},
-    "noise": {"position": 0.1, "orientation": 0.01, "joint": 0.001},
-    "frame": "unknown",
-    "job": {"model": "pose"},
-}
+SCENARIO = {"robot": "robot.yaml", "units": UNITS, "frame": "unknown", "job": {"model": "pose"}}
+SCENARIO |= {"errors": {"normal": "tolerance"}, "configurations": {"random": {"count": 20}}}
+SCENARIO |= {"noise": {"position": 0.1, "orientation": 0.01, "joint": 0.001}}
 TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {

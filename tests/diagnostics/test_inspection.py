@@ -115,9 +115,8 @@ def test_limits_that_cannot_be_evaluated_are_reported(arm, n_test):
     found = inspect_job(Job(None, arm, m, Options(model="pose", frame="unknown", accept=limits)))
     lacking, *others = found.findings
     assert lacking == "accept: nothing in this job measures any distance: its limit cannot be evaluated"
-    assert [text.startswith("accept: limits are judged by what is held out, and nothing is") for text in others] == [
-        True
-    ] * (n_test == 0)
+    said = "accept: limits are judged by what is held out, and nothing is"
+    assert [text.startswith(said) for text in others] == [True] * (n_test == 0)
     folds = Options(model="pose", frame="unknown", accept={"position": 1e-3}, folds=5)
     assert not inspect_job(Job(None, arm, m, folds)).findings
 

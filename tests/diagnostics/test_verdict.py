@@ -134,14 +134,11 @@ def test_noise_estimated_as_large_as_the_motions_is_no_noise():
     assert any(text.startswith("the noise estimated of orientation is") for text in found.verdict.errors)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        ([], None),
-        ([3, 4, 5], r"outliers: 3 \([345], [345], [345]\) make the estimated noise \S+ times as large: look at them"),
-        (range(20), "the noise estimated of position is .* times that specified"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "words"), [
+    ([], None),
+    ([3, 4, 5], r"outliers: 3 \([345], [345], [345]\) make the estimated noise \S+ times as large: look at them"),
+    (range(20), "the noise estimated of position is .* times that specified"),
+])  # fmt: skip
 def test_estimated_noise_far_above_the_specified_is_a_warning_that_names_gross_rows(wrong, words):
     rng = np.random.default_rng(0)
     robot = small_arm(tolerance=TOLERANCE)

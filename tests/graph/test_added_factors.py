@@ -237,10 +237,8 @@ def test_what_a_factor_does_while_it_is_solved_is_one_line(of_third):
 
     problem = problem_of()
     custom(error)(problem)
-    said = {
-        "raises": "out of reach",
-        "is nan": "a residual is not finite: the measurements or the robot hold absurd numbers",
-    }[of_third]
+    absurd = "a residual is not finite: the measurements or the robot hold absurd numbers"
+    said = "out of reach" if of_third == "raises" else absurd
     with pytest.raises(SolverError, match=f"^{said}$") as found:
         solve(problem)
     assert isinstance(found.value.__cause__, ValueError) == (of_third == "raises")

@@ -148,15 +148,10 @@ def write_tables(folder, robot, tables, **keys):
     write_robot(folder / "robot.yaml", robot)
     for name, columns in (one for table in tables for one in table_columns(table, robot, Units()).items()):
         write_csv(folder / name, columns)
-    job = {
-        "robot": "robot.yaml",
-        "units": {"length": "m", "angle": "rad"},
-        "noise": {"joint": 5e-4, "position": 1.0},
-        "measurements": [
-            {"table": "tracker.csv", "model": "position", "frame": "unknown", "noise": {"position": SIGMA[0]}},
-            {"table": "bar.csv", "pairs": "lengths.csv", "model": "distance", "noise": {"distance": 2e-4}},
-        ],
-    }
+    tracker = {"table": "tracker.csv", "model": "position", "frame": "unknown", "noise": {"position": SIGMA[0]}}
+    bar = {"table": "bar.csv", "pairs": "lengths.csv", "model": "distance", "noise": {"distance": 2e-4}}
+    job = {"robot": "robot.yaml", "units": {"length": "m", "angle": "rad"}, "measurements": [tracker, bar]}
+    job |= {"noise": {"joint": 5e-4, "position": 1.0}}
     path = folder / "job.yaml"
     path.write_text(yaml.safe_dump(job | keys))
     return path

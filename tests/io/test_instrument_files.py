@@ -44,13 +44,8 @@ def write_files(folder, robot, table, job):
     write_csv(folder / "table.csv", columns)
     write_robot(folder / "robot.yaml", robot)
     (folder / "camera.yaml").write_text(yaml.safe_dump(INTRINSICS))
-    given = {
-        "robot": "robot.yaml",
-        "measurements": "table.csv",
-        "model": table.model,
-        "units": {"length": "mm", "angle": "deg"},
-    }
-    given["noise"] = {"position": 0.1, "distance": 0.1, "pixel": 0.1}
+    given = {"robot": "robot.yaml", "measurements": "table.csv", "model": table.model}
+    given |= {"units": {"length": "mm", "angle": "deg"}, "noise": {"position": 0.1, "distance": 0.1, "pixel": 0.1}}
     (folder / "job.yaml").write_text(yaml.safe_dump(given | job))
     return folder / "job.yaml"
 

@@ -100,12 +100,8 @@ def read_yaml(text, folder, fg_calib):
         (folder / "robot.yaml").write_text(snippets("tutorial")[0][1])
         assert fg_calib("simulate", folder / "file.yaml", "--out", folder / "job").code == 0
     elif "configurations:" in text:
-        robot = (
-            (EXAMPLES / "space-robot" / "robot_nominal.yaml").read_text()
-            if "robot:" in text
-            else snippets("tutorial")[0][1]
-        )
-        (folder / "robot.yaml").write_text(robot)
+        bundled = (EXAMPLES / "space-robot" / "robot_nominal.yaml").read_text()
+        (folder / "robot.yaml").write_text(bundled if "robot:" in text else snippets("tutorial")[0][1])
         (folder / "file.yaml").write_text(text if "robot:" in text else SCENARIO + text)
         assert len(simulate(read_scenario(folder / "file.yaml"), seed=0).measurements.readings) in (50, 552)
     else:
