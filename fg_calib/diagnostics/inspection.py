@@ -22,7 +22,7 @@ from fg_calib.parallel import single_threaded
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot
 from fg_calib.statistics import MAX_OUTLIER_SHARE, judge_fit, spread_of, with_left_out
-from fg_calib.statistics.residual_table import residual_table
+from fg_calib.statistics.residual_table import residual_table, same_readings
 
 FAR, MEDIAN = 10.0, 0.6745
 """Studentised residual over its typical size from which a row disagrees; the median size of what is normal."""
@@ -82,6 +82,7 @@ class TableSurvey(Record):
         copy: Two that are the same; empty without.
         n_repeats: Rows at the readings of an earlier one, with other values: they show the noise.
         n_leaked: Test rows at, or within `NEAR` of, a configuration of train rows.
+        n_renamed: Configurations at the readings of an earlier one of another name.
     """
 
     name: str
@@ -97,6 +98,7 @@ class TableSurvey(Record):
     copy: str
     n_repeats: int
     n_leaked: int
+    n_renamed: int
 
 
 class Disagreement(Record):
@@ -224,11 +226,12 @@ def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
         for name, n in zip(s.kind.names, s.used[s.train].sum(axis=0).tolist(), strict=True):
             n_residuals[name.partition(".")[0]] += int(n)
     labels = {what: len(of.names) for what, of in m.labels.items()}
+    places = np.unique(problem.data.places[number])
     return TableSurvey(
         name=problem.data.labels[number],
         model=table.model,
         n_rows=m.n_configurations,
-        n_configurations=len(np.unique(problem.data.places[number])),
+        n_configurations=len(places),
         n_test=int(m.test.sum()),
         n_pairs=len({k for s in blocks if s.kind.ends == 2 for k in s.number[s.train].tolist()}),
         n_test_pairs=len({k for s in blocks if s.kind.ends == 2 for k in s.number[s.test].tolist()}),
@@ -238,6 +241,7 @@ def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
         copy=copy,
         n_repeats=repeats,
         n_leaked=_n_leaked(m),
+        n_renamed=len(places) - len(np.unique(same_readings(problem.data.readings[places]))),
     )
 
 
@@ -306,6 +310,10 @@ def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
     for t in found.tables:
         text = f"{t.name}: rows that are exact copies of others: {t.n_copies} ({t.copy}); each counts as one more"
         yield Statement("note", f"{text} measurement: remove it", t.n_copies)
+        text = (
+            f"{t.name}: readings repeated under another id: {t.n_renamed}; where the arm stood still, give one id: such"
+        )
+        yield Statement("note", f"{text} rows share their joint errors", t.n_renamed and not t.n_copies)
         text = f"{t.name}: test rows at configurations of train rows, no check of a prediction: {t.n_leaked}"
         yield Statement("note", text, t.n_leaked)
     text = "is to be estimated: sigmas and accuracy here are for what is specified, or 1 mm and 1 mrad"
