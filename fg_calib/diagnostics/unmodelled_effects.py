@@ -422,6 +422,7 @@ def _joint_errors(robot: Robot, readings: Floats) -> Floats:
     Loads along z; how far the tool reaches out; harmonics of one and two periods a turn (of a prismatic joint its
     position and the square of that); loads along x and y.
     """
+    robot = robot.geometry
     at = pose(robot, readings)
     rotations, shifts = np.split(at.jacobian[:, :, len(robot.parameters) :], 2, axis=1)  # (n, 3, n_joints) each
     of_links = np.zeros_like(shifts)

@@ -57,7 +57,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats, InputError, Record, shown
+from fg_calib.inputs import Floats, InputError, Record
 from fg_calib.robot import Axis, Element, Poses, Robot, RobotBuilder, build_chain, forward, model, pose, random_readings
 
 TableConvention = Literal["dh", "mdh", "dh-hayati"]
@@ -286,7 +286,7 @@ def links_of(robot: Robot) -> Links:
     parts: list[list[Element]] = [[], [], []]  # base, what is between joints, tool; more are put before the tool
     for element in robot.elements:
         if element.basis is not None:
-            raise InputError(robot.name, f"a joint whose value is {shown(element.basis.function)}", "plain readings")
+            raise InputError(robot.name, "joints with effects", "plain readings")
         if element.parameter in base:
             parts[0].append(element)
         elif element.parameter in tool:

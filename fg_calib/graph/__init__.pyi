@@ -4,7 +4,16 @@ from .build import (
     problem_of,
     problem_of_tables,
 )
-from .error_states import PRIVATE_SHARE, State, WhitenedBlock, WhitenedRows, all_errors, block_diagonal, whitener_of
+from .error_states import (
+    PRIVATE_SHARE,
+    State,
+    WhitenedBlock,
+    WhitenedRows,
+    all_errors,
+    block_diagonal,
+    curve_columns,
+    whitener_of,
+)
 from .factors import DistanceFactor, RotationAngleFactor
 from .knowledge import SIZE, STAYING, Knowledge, Name, coordinates_of
 from .noise_models import JOINT_NOISE, NoiseName, NoiseState, RowNoise, reach, whitening_of
@@ -87,6 +96,7 @@ __all__ = [
     "coordinates_of",
     "corrections_of",
     "correlation",
+    "curve_columns",
     "determined",
     "directions",
     "effect",

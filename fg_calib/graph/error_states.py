@@ -19,10 +19,10 @@ This matters where pairs are more than the errors, so that second-order terms ar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -104,6 +104,13 @@ class SchurComplement(Record):
         return b - L.T @ solve(L @ b) if of_rows else solve(b)
 
     @cached_property
+    def triangle(self) -> Floats:
+        """U, upper triangular, with U^T U = S."""
+        S = (self.loadings.T @ self.loadings).toarray()
+        U: Floats = scipy.linalg.cholesky(np.eye(self.n_states) + S, overwrite_a=True, check_finite=False)
+        return U
+
+    @cached_property
     def variances(self) -> Floats:
         """Posterior variances of the states, the diagonal of S^-1, shape (n_states,); many take a solution each."""
         out = np.empty(self.n_states)
@@ -157,6 +164,20 @@ def _configuration_graph(L: Sparse, width: int) -> Sparse:
     return Sparse(pattern.T @ pattern)
 
 
+class Curves(NamedTuple):
+    """The error curves that are estimated.
+
+    Attributes:
+        first: First of each curve's coefficients, by the joint's index.
+        values: Their values, shape (n_curves,), [rad].
+        sigma: 1 sigma of each one's prior, shape (n_curves,), [rad].
+    """
+
+    first: Mapping[int, int]
+    values: Floats
+    sigma: Floats
+
+
 class State(Brief):
     """The arm and the nuisance coordinates at some parameters.
 
@@ -166,6 +187,7 @@ class State(Brief):
         columns: Jacobian column of each of them, -1 for those that are not estimated.
         n_columns: Number of columns of the core.
         n_nuisance: Number of columns of the nuisance variables.
+        curves: The error curves that are estimated.
     """
 
     chains: tuple[Chain, ...]
@@ -173,10 +195,42 @@ class State(Brief):
     columns: Integers
     n_columns: int
     n_nuisance: int
+    curves: Curves | None = None
 
     def without_columns(self) -> State:
         """Copy without derivatives."""
-        return replace(self, chains=tuple(chain.without_columns() for chain in self.chains), n_columns=0, n_nuisance=0)
+        chains = tuple(chain.without_columns() for chain in self.chains)
+        return replace(self, chains=chains, n_columns=0, n_nuisance=0, curves=None)
+
+    def without_curves(self) -> State:
+        """Copy without derivatives in error curves, whose columns are the first nuisances'."""
+        n = 0 if self.curves is None else len(self.curves.sigma)
+        return replace(self, columns=self.columns - n, n_nuisance=self.n_nuisance - n, curves=None)
+
+
+class Eliminated(Brief):
+    """A linear system A x = b with its nuisance columns eliminated; below they are called landmarks.
+
+    Attributes:
+        own: Part of the right-hand side that the landmark columns can explain, shape (rank,).
+        A: The core's columns, minus what the landmark columns can explain of them, shape (m, n_core).
+        b: The right-hand side, minus the same, shape (m,).
+        follow: How the landmarks follow the core, shape (n_landmarks, n_core).
+        inverse: S with S S^T the landmarks' covariance at a given core, shape (n_landmarks, rank).
+        unknown: Which landmark columns have a share in a direction that nothing determines, shape (n_landmarks,).
+    """
+
+    own: Floats
+    A: Floats
+    b: Floats
+    follow: Floats
+    inverse: Floats
+    unknown: Booleans
+
+    @property
+    def rank(self) -> int:
+        """Number of directions of the landmarks that the system determines."""
+        return len(self.own)
 
 
 class WhitenedBlock(Brief):
@@ -219,17 +273,40 @@ class WhitenedBlock(Brief):
             for k, places in enumerate(self.nuisances[chunk].T if at.n_nuisance else ()):
                 rows = np.flatnonzero(at.columns[places] >= 0)
                 out[rows, :, at.columns[places[rows]]] = J[rows, :, n + k]
-            yield out.reshape(r.size, -1)
+            flat = out.reshape(r.size, -1)
+            if at.curves is not None:
+                flat[:, n : n + len(at.curves.sigma)] = curve_columns(
+                    residuals.rows_of(block, chunk), chain, at.curves
+                ).toarray()
+            yield flat
 
     def reduce(self, at: State) -> Iterator[Floats]:
         """Rows with the Gram matrix of [J r], few at a time."""
-        if self.nuisances.size:
+        if self.nuisances.size or at.curves is not None:
             yield from self.linearise(at)
             return
         R = residuals.triangle(self.block, at.chains[self.table])
         out = np.zeros((len(R), at.n_columns + at.n_nuisance + 1))
         out[:, : at.n_columns], out[:, -1] = R[:, :-1], R[:, -1]
         yield out
+
+
+def curve_columns(block: Block, chain: Chain, curves: Curves) -> Sparse:
+    """Derivatives of a block in the coefficients of error curves, shape (rows, n_curves): of joints, times splines."""
+    chain, columns, values = chain.without_columns().with_turn_columns(), list[Integers](), list[Floats]()
+    J = residuals.linearise(block, chain)[1]
+    for end, rows in enumerate(block.ends.T):
+        found = chain.splines(block.trig[rows])
+        for joint, first in curves.first.items():
+            knots, weights = found[joint]
+            columns.append(first + knots)
+            values.append(J[:, :, [end * chain.n_joints + joint]] * weights[:, None])
+    data = np.concatenate(values, axis=2)
+    n, h, k = data.shape
+    places = np.repeat(np.hstack(columns), h, axis=0)
+    out = Sparse((data.ravel(), places.ravel(), np.arange(n * h + 1) * k), shape=(n * h, len(curves.sigma)))
+    out.sum_duplicates()  # in place
+    return out
 
 
 class WhitenedRows(Brief):
@@ -270,16 +347,26 @@ class WhitenedRows(Brief):
 
     def square_root(self, at: State) -> Floats:
         """Rows with the Gram matrix of the whitened [J r], at most as many as columns."""
+        n = at.n_columns + at.n_nuisance + 1
         if self.states.n_states:
-            chunks = [self.states.whiten(self.private(at))]
-        else:
-            chunks = (chunk for part in self.parts for chunk in part.reduce(at))  # type: ignore[assignment]
-        R = np.zeros((0, at.n_columns + at.n_nuisance + 1))
-        for chunk in chunks:
-            for start in range(0, len(chunk), 4 * SPAN):
-                R = np.vstack([R, chunk[start : start + 4 * SPAN]])
-                R = R if len(R) <= R.shape[1] else np.linalg.qr(R, mode="r")  # type: ignore[assignment]
-        return R
+            return _reduced(n, [self.states.whiten(self.private(at))])
+        return _reduced(n, (chunk for part in self.parts for chunk in part.reduce(at)))
+
+    def without_curves(self, at: State, curves: Curves) -> Eliminated:
+        """The rows with error curves eliminated, where no errors are shared.
+
+        A curve's coefficients, in units of their sigma, are states like others, but with values to linearise at.
+        """
+        y = self.private(at.without_curves())
+        L = _stacked([curve_columns(part.at(at), at.chains[part.table], curves) for part in self.parts]) * curves.sigma
+        before, states = curves.values / curves.sigma, SchurComplement(Sparse(L))
+        y[:, -1] -= L @ before
+        U = states.triangle
+        Z = scipy.linalg.cho_solve((U, False), L.T @ y, check_finite=False)
+        rows = _reduced(y.shape[1], [np.concatenate([y - L @ Z, Z])])
+        inverse = curves.sigma[:, None] * scipy.linalg.lapack.dtrtri(U)[0]
+        own, follow = -U @ (Z[:, -1] + before), -curves.sigma[:, None] * Z[:, :-1]
+        return Eliminated(own, rows[:, :-1], -rows[:, -1], follow, inverse, np.zeros(len(own), dtype=np.bool_))
 
     def posterior_mean(self, at: State) -> Floats:
         """Posterior mean of the error states, shape (n_configurations, n_slots), [sigma]."""
@@ -326,6 +413,16 @@ def whitened_rows(
         spare=spare,
         counted_as_private=bool(np.any((reached > 1) & ~shared)),
     )
+
+
+def _reduced(n: int, chunks: Iterable[Floats]) -> Floats:
+    """Rows with the Gram matrix of those of some chunks, of n columns, at most as many as these."""
+    R = np.zeros((0, n))
+    for chunk in chunks:
+        for start in range(0, len(chunk), 4 * SPAN):
+            R = np.vstack([R, chunk[start : start + 4 * SPAN]])
+            R = R if len(R) <= R.shape[1] else np.linalg.qr(R, mode="r")  # type: ignore[assignment]
+    return R
 
 
 def _ranks(numbers: Integers) -> tuple[Integers, Integers]:

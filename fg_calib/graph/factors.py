@@ -1,7 +1,7 @@
 """GTSAM factors: one a measurement, as in `problem.graph`.
 
 A pair has one `DistanceFactor` and one `RotationAngleFactor`, any other measurement one factor. What measurements share
-are variables `E(k)`, the errors of configuration k in units of their sigma, each with a prior. Where private noise of a
+are variables `Z(k)`, the errors of configuration k in units of their sigma, each with a prior. Where private noise of a
 pair has a correlation c of distance and angle (errors that count as its own, a robust weight), so is the one error
 `e(i)` of pair i: both follow from it with sqrt(|c|) of their sigma, and what is left is uncorrelated.
 
@@ -75,7 +75,7 @@ class MeasurementFactor(CheckedFactor):
     ) -> None:
         places, h = set(variables.coordinates[part.nuisances[k]].tolist()), part.block.residual_dim
         ours = [*(variables.items if part.block.kind.ends else ())]
-        ours += [v for v in variables.nuisance if places.intersection(v.parameters)]
+        ours += [v for v in variables.nuisance if v.kind == "curve" or places.intersection(v.parameters)]
         chosen = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v in ours)])
         G = np.hstack([np.zeros((h, 0)), *(loading for _, loading in errors)])
         widths = [v.columns.stop - v.columns.start for v in ours] + [loading.shape[1] for _, loading in errors]
@@ -142,7 +142,7 @@ def measurement_factors(
     """
     z, factors, values = rows.posterior_mean(at), list[gtsam.NonlinearFactor](), gtsam.Values()
     private = rows.private(at.without_columns())[:, -1] - rows.states.loadings @ z.ravel()
-    estimates = [(_error("E", k), of_k) for k, of_k in zip(rows.configurations.tolist(), z, strict=True)]
+    estimates = [(_error("Z", k), of_k) for k, of_k in zip(rows.configurations.tolist(), z, strict=True)]
     first, n, measurements = 0, max(len(rows.slots), 1), ((part, k) for part in rows.parts for k in range(part.block.n))
     for number, (part, k) in enumerate(measurements):
         kind, these = part.block.kind, slice(first, first + part.block.residual_dim)

@@ -23,8 +23,8 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse
 
-from fg_calib.graph.error_states import SchurComplement
-from fg_calib.inputs import Booleans, Brief, Floats
+from fg_calib.graph.error_states import Eliminated, SchurComplement
+from fg_calib.inputs import Booleans, Floats
 
 Sparse = scipy.sparse.csr_array
 
@@ -78,31 +78,6 @@ def first_independent(N: Floats, count: int) -> list[int]:
     return chosen
 
 
-class Eliminated(Brief):
-    """A linear system with its landmark columns eliminated by QR.
-
-    Attributes:
-        own: Part of the right-hand side that the landmark columns can explain, shape (rank,).
-        A: The core's columns, minus what the landmark columns can explain of them, shape (m, n_core).
-        b: The right-hand side, minus the same, shape (m,).
-        follow: How the landmarks follow the core, shape (n_landmarks, n_core).
-        inverse: S with S S^T the landmarks' covariance at a given core, shape (n_landmarks, rank).
-        unknown: Which landmark columns have a share in a direction that nothing determines, shape (n_landmarks,).
-    """
-
-    own: Floats
-    A: Floats
-    b: Floats
-    follow: Floats
-    inverse: Floats
-    unknown: Booleans
-
-    @property
-    def rank(self) -> int:
-        """Number of directions of the landmarks that the system determines."""
-        return len(self.own)
-
-
 def eliminate(A: Floats, b: Floats, n_core: int) -> Eliminated:
     """Eliminate all but the first `n_core` columns of a linear system |A x - b|^2.
 
@@ -117,6 +92,27 @@ def eliminate(A: Floats, b: Floats, n_core: int) -> Eliminated:
     left[:, np.linalg.norm(left, axis=0) <= RANK_TOLERANCE * np.linalg.norm(core, axis=0)] = 0.0
     own = Q.T @ b
     return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse, unknown)
+
+
+def eliminate_more(first: Eliminated, rows: Floats, n_core: int) -> Eliminated:
+    """Eliminate all but the first `n_core` of the columns that an elimination left.
+
+    Args:
+        first: The elimination.
+        rows: More rows [A r] in the columns that it left.
+        n_core: Number of columns of the core.
+    """
+    A, b = np.vstack([rows[:, :-1], first.A]), np.concatenate([-rows[:, -1], first.b])
+    then, (of_core, of_others) = eliminate(A, b, n_core), np.split(first.follow, [n_core], axis=1)
+    none = np.zeros((len(then.follow), len(first.own)))
+    return Eliminated(
+        np.concatenate([first.own, then.own]),
+        then.A,
+        then.b,
+        np.vstack([of_core + of_others @ then.follow, then.follow]),
+        np.block([[first.inverse, of_others @ then.inverse], [none, then.inverse]]),
+        np.concatenate([first.unknown, then.unknown]),
+    )
 
 
 def _basis_of(A: Floats) -> tuple[Floats, Floats, Booleans]:
@@ -139,7 +135,7 @@ class NormalSystem:
 
     Args:
         square_root: Rows [A r] of which only the Gram matrix matters, shape (k, n_all + 1): those of measurements,
-            error states eliminated, and of all that is known of landmarks.
+            error states eliminated, and of all that is known of landmarks; or these with landmarks eliminated.
         n_core: Number of columns of the core, the first ones.
         scales: By how much each of them may be off, shape (n_core,): rank is judged in these.
         priors: Rows [K k] of priors on the core alone, shape (q, n_core + 1); none if None.
@@ -161,14 +157,16 @@ class NormalSystem:
 
     def __init__(
         self,
-        square_root: Floats,
+        square_root: Floats | Eliminated,
         n_core: int,
         scales: Floats,
         priors: Floats | None = None,
         states: SchurComplement | None = None,
         rows: Callable[[], Floats] | None = None,
     ) -> None:
-        self.left = left = eliminate(square_root[:, :-1], -square_root[:, -1], n_core)
+        if isinstance(square_root, np.ndarray):
+            square_root = eliminate(square_root[:, :-1], -square_root[:, -1], n_core)
+        self.left = left = square_root
         k = np.zeros((0, n_core + 1)) if priors is None else priors
         A, b = np.vstack([left.A, k[:, :-1]]) * scales, np.concatenate([left.b, -k[:, -1]])
         tall = np.vstack([A, np.zeros((max(n_core - len(A), 0), n_core))])  # so that all directions are found
@@ -181,7 +179,7 @@ class NormalSystem:
         self.weights: Floats = np.concatenate([s[:rank] / s.max(initial=1e-300), np.ones(left.rank)])
         self.step: Floats = self.full_root @ self.coordinates
         self.decrement = float(np.linalg.norm(self.coordinates))
-        self.cost = 0.5 * float(np.sum(square_root[:, -1] ** 2) + np.sum(k[:, -1] ** 2))
+        self.cost = 0.5 * float(sum(np.sum(part**2) for part in (left.own, left.b, k[:, -1])))
         self._gather, self._states = rows, states
 
     @property

@@ -14,11 +14,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fg_calib.graph.error_states import WhitenedRows, correlation_of, whitened_rows
+from fg_calib.graph.error_states import Curves, Eliminated, WhitenedRows, correlation_of, whitened_rows
 from fg_calib.graph.factors import linearize_factors, measurement_factors, prior_factors, with_added
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, POSE_SLOTS, NoiseState, RowNoise, TableState, same_everywhere
-from fg_calib.graph.normal_system import RANK_TOLERANCE, NormalSystem
+from fg_calib.graph.normal_system import RANK_TOLERANCE, NormalSystem, eliminate_more
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
@@ -142,12 +142,27 @@ class Problem(FrozenArrays):
         """
         v, given = self.variables, self.rows  # of the system, which would keep the problem in a cycle
         r, J = prior_rows(v, parameters)
-        rows, priors = square_root(self, parameters, with_loss=with_loss), np.column_stack([J, r])
+        priors, curves = np.column_stack([J, r]), v.at(parameters).curves
+        if curves is None or given.states.n_states or self.has_more:
+            rows: Floats | Eliminated = square_root(self, parameters, with_loss=with_loss)
+        else:
+            rows = self._without_curves(parameters, curves, with_loss)
         with np.errstate(over="ignore"):
-            if not np.isfinite(np.vdot(rows, rows) + np.vdot(priors, priors)):
+            size = rows if isinstance(rows, np.ndarray) else rows.A
+            if not np.isfinite(np.vdot(size, size) + np.vdot(priors, priors)):
                 raise SolverError("a residual is not finite: the measurements or the robot hold absurd numbers")
         gather = lambda: given.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
         return NormalSystem(rows, v.n_columns, v.prior_scales, priors, self.rows.states, gather)
+
+    def _without_curves(self, parameters: Floats, curves: Curves, with_loss: bool) -> Eliminated:
+        """The rows with error curves, then landmarks, eliminated."""
+        v, at = self.variables, self.variables.at(parameters)
+        if with_loss:
+            curves = curves._replace(sigma=curves.sigma / np.sqrt(loss_variance(self)))
+        found, (r, J) = self.rows.without_curves(at, curves), unknown_prior_rows(v, parameters)
+        n, of_curves = v.n_columns, len(curves.sigma)
+        others = np.column_stack([np.delete(J, np.s_[n : n + of_curves], axis=1), r])[of_curves:]
+        return eliminate_more(found, others, n)
 
     @cached_property
     def noises(self) -> tuple[RowNoise, ...]:
@@ -310,7 +325,7 @@ def noises_at(problem: Problem, parameters: Floats, *, fitted: bool = False) -> 
         parameters: The parameter vector.
         fitted: Whether they are the train rows alone; else train and test.
     """
-    data, at, trigs = problem.data, problem.variables.at(parameters), problem.data.trigs(problem.robot)
+    data, at, trigs = problem.data, problem.variables.at(parameters), problem.data.trigs(problem.robot, parameters)
     if (nowhere := np.isnan(data.landmarks.start) & (at.columns < 0)).any():  # points of test rows alone
         at = replace(at, coordinates=np.where(nowhere, contact_points(data, at.chains, trigs), at.coordinates))
     width = problem.robot.n_joints + POSE_SLOTS * len(data.tables)
@@ -344,7 +359,7 @@ def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
     for v in variables.frames:
         if v.number in begun.frames:
             start[v.places] = _coordinates(begun.frames[v.number])
-    if variables.nuisance:
+    if len(variables.coordinates):
         at = variables.at(start)
         places = np.where(np.isnan(begun.places), contact_points(data, at.chains, data.trigs(robot)), begun.places)
         there = variables.coordinates >= 0
@@ -382,6 +397,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
         state: Estimated noise; None for what the problem has.
     """
     same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
+    same = same and not problem.robot.loads
     if (state is None or state is problem.state) and same:
         started = replace(problem, start=parameters)
         started.__dict__["_square_roots"] = problem._square_roots

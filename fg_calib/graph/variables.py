@@ -4,13 +4,15 @@
 |---|---|
 | `K(i)` | estimated parameters of joint i, a vector of just those |
 | `K(0)`, `K(n + 1)` | the same of the base, and of the tool, where not all six of its parameters are estimated |
+| `E(i)` | estimated parameters of the effects of joint i (0: of the base) but for error curves |
+| `S(i)` | coefficients of the error curve (spline) of joint i |
 | `B(0)`, `T(0)` | the base frame, and the tool frame, as a Pose3 where all six are |
 | `X(t)` | world_T_base of table t as a Pose3, where its measurement frame is unknown |
 | `L(g)` | base_p of the physical point that group g touches, a Point3 |
 | `N(i)` | an unknown of a custom kind of measurement, a vector |
 
-The last two, and variables that a user adds to the graph, are *nuisance* variables: they are estimated too, but not
-what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
+Error curves, the last two, and variables that a user adds to the graph, are *nuisance* variables: estimated too, but
+not what a calibration is for. Their columns follow those of the *core* (robot and measurement frame) and are eliminated
 before anything is said of the core.
 
 Pose3's tangent is rotation first, and a step moves the frame in itself (`pose * Exp(step)`).
@@ -31,12 +33,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from fg_calib.graph.error_states import State
+from fg_calib.graph.error_states import Curves, State
 from fg_calib.inputs import Brief, Floats, Record
 from fg_calib.measurements import Landmarks
-from fg_calib.robot import FRAME_KINDS, QUARTER_TURN, Chain, Robot, build_chain, names_of, yaw_pitch_roll
+from fg_calib.robot import EFFECT_KINDS, FRAME_KINDS, QUARTER_TURN, Chain, Robot, build_chain, names_of, yaw_pitch_roll
 
-VariableKind = Literal["vector", "tool", "base", "frame", "unknown", "own", "own pose"]
+VariableKind = Literal["vector", "tool", "base", "frame", "unknown", "curve", "own", "own pose"]
 
 
 class Variable(Record):
@@ -147,8 +149,13 @@ class Variables(Brief):
 
     @property
     def nuisance_span(self) -> slice:
-        """Slice of the nuisance values in the parameter vector."""
-        return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance)
+        """Slice in the parameter vector of the nuisance values that are none of the robot's."""
+        return slice(self.frame_span.stop, self.frame_span.stop + self.n_nuisance - self.n_curves)
+
+    @property
+    def n_curves(self) -> int:
+        """Number of columns of error curves, the first ones of the nuisance variables."""
+        return sum(len(v.parameters) for v in self.nuisance if v.kind == "curve")
 
     @property
     def n_robot_columns(self) -> int:
@@ -259,10 +266,19 @@ class Variables(Brief):
     def at(self, parameters: Floats) -> State:
         """The arm and the measurements' unknowns at a parameter vector."""
         estimated = self.coordinates >= 0
-        columns = np.where(estimated, self.coordinates - self.nuisance_span.start + self.n_columns, -1)
+        first = self.n_columns + self.n_curves - self.nuisance_span.start
+        columns = np.where(estimated, self.coordinates + first, -1)
         values = np.where(estimated, parameters[self.coordinates], self.others)
         chains = tuple(chain.at(parameters) for chain in self.chains)
-        return State(chains, values, columns, self.n_columns, self.n_nuisance)
+        return State(chains, values, columns, self.n_columns, self.n_nuisance, self._curves(parameters))
+
+    def _curves(self, parameters: Floats) -> Curves | None:
+        found = [(v, v.prior) for v in self.nuisance if v.kind == "curve" and v.prior is not None]
+        if not found:
+            return None
+        sigma = np.concatenate([prior[1] for _, prior in found])
+        values = np.concatenate([parameters[v.places] for v, _ in found])
+        return Curves({v.number - 1: v.columns.start - self.n_columns for v, _ in found}, values, sigma)
 
     def with_added(self, keys: Sequence[int], initial: gtsam.Values) -> Variables:
         """The variables with those that a user added, and no others of a user's."""
@@ -342,6 +358,9 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
             add("T", 0, "tool", chosen, of)
         elif chosen:
             add("K", owner, "vector", chosen, of)
+        kinds = set(EFFECT_KINDS) - {"curve"}
+        if more := [i for i, p in enumerate(robot.parameters) if p.owner == owner and p.kind in kinds and p.estimated]:
+            add("E", owner, "vector", more, names_of(robot.parameters[i] for i in more))
     for k, table in enumerate(np.flatnonzero(frames).tolist()):
         prefix = "frame" if sum(frames) == 1 else f"frame{table + 1}"
         add("X", table, "frame", range(n + 6 * k, n + 6 * k + 6), [f"{prefix}.{kind}" for kind in FRAME_KINDS])
@@ -356,7 +375,20 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
         later = poses[frame].parameters[0] - n if there else -n
         source = np.where(chain.source >= n, chain.source + later, chain.source)
         chains.append(replace(chain, source=source, n_columns=len(names)))
-    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors)
+    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors, _curves(robot, len(names)))
+
+
+def _curves(robot: Robot, column: int) -> tuple[Variable, ...]:
+    """A variable for each error curve that is estimated, from a column on."""
+    found = list[Variable]()
+    for curve in build_chain(robot).curves:
+        sigma, n = robot.parameters[curve.source[0]].tolerance or 1.0, len(curve.source)
+        if robot.parameters[curve.source[0]].estimated:
+            key, columns = gtsam.symbol("S", curve.joint + 1), slice(column, column + n)
+            prior = (0.0,) * n, (sigma,) * n
+            found.append(Variable(key, "curve", tuple(curve.source.tolist()), columns, (sigma,) * n, prior))
+            column += n
+    return tuple(found)
 
 
 def _own_kind(initial: gtsam.Values, key: int) -> tuple[VariableKind, int]:

@@ -20,6 +20,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -30,8 +31,9 @@ from pydantic import BeforeValidator, Field
 
 from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
+from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
 from fg_calib.io.yaml import Bound, FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
-from fg_calib.robot import Joint, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
+from fg_calib.robot import Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
     from lxml.etree import _Element as Element
@@ -72,6 +74,7 @@ def read_urdf(
     fixed: Sequence[str] = (),
     estimate: Sequence[str] = (),
     tolerance: Mapping[str, float] | None = None,
+    effects: Mapping[str, Any] | str | None = None,
     place: str | None = None,
 ) -> Robot:
     """The chain from one link of a URDF to another, up and down the tree.
@@ -89,6 +92,7 @@ def read_urdf(
         fixed: See `RobotBuilder.build`.
         estimate: See `RobotBuilder.build`.
         tolerance: See `RobotBuilder.build`, [m] or [rad].
+        effects: As in a robot file.
         place: The file that `fixed`, `estimate` and `tolerance` come from, for messages.
 
     Raises:
@@ -107,20 +111,68 @@ def read_urdf(
         base_link = tree.root() if base_link is None else tree.known(base_link)
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
         zeros = model.ZEROS in listed("estimate", estimate)
-        n_joints = _add_chain(builder, tree.chain(base_link, tip_link), path.name, zeros)
+        chain = tree.chain(base_link, tip_link)
+        n_joints = _add_chain(builder, chain, path.name, zeros)
         if n_joints == 0:
             raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
     except InputError as error:  # elements of xacro may hold what is missing
         hint = _XACRO if any("xacro" in str(element.tag) for element in root.iter()) else error.hint
         raise InputError(error.place, error.found, error.expected, hint) from None
     builder.add_frame("tool", model.frame_values("tool", tool), n_joints + 1, False)
-    return builder.build(
+    return _with_effects(
+        builder,
+        effects or {},
+        _links_of(root, tree, chain, base_link),
         fixed=fixed,
         estimate=estimate,
         tolerance=tolerance,
         urdf=UrdfSource(text, base_link, tip_link),
         place=place or path.name,
     )
+
+
+def _links_of(root: Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base_link: str) -> dict[str, Any]:
+    """What makes a mass on the arm of a mass on each link that hangs on the chain, and the masses of all inertials.
+
+    Links that hang on other joints that move are taken at readings of zero.
+    """
+    on_chain, number, at = {base_link: (0, np.eye(4))}, 0, np.eye(4)
+    for joint, backwards in chain:
+        origin, moves = model.matrix_of_frame(joint.origin), joint.element.get("type") != "fixed"
+        number += moves
+        at = np.eye(4) if moves else at @ (np.linalg.inv(origin) if backwards else origin)
+        on_chain[joint.parent if backwards else joint.child] = number, at
+
+    def maker(link: str) -> Any:
+        place, below = np.eye(4), link
+        while below not in on_chain and (joint := tree.above(below)) is not None:
+            place, below = model.matrix_of_frame(joint.origin) @ place, joint.parent
+        if below not in on_chain:
+            return None
+        owner, first = on_chain[below]
+        T = first @ place
+        return lambda mass, com: Mass(owner, mass, tuple((T[:3, :3] @ np.array(com) + T[:3, 3]).tolist()))
+
+    links = {name: made for link in root.findall("link") if (made := maker(name := link.get("name", "")))}
+    masses = list[Mass]()
+    for link in root.findall("link"):
+        inertial, made = link.find("inertial"), links.get(link.get("name", ""))
+        if made is not None and inertial is not None and (mass := inertial.find("mass")) is not None:
+            com = inertial.find("origin")
+            xyz = _figures("0 0 0" if com is None else com.get("xyz", "0 0 0"))
+            masses += [made(value, xyz) for value in _figures(mass.get("value", "0")) if value > 0.0]
+    return links | {"urdf": masses}
+
+
+def _with_effects(
+    builder: RobotBuilder, given: Mapping[str, Any] | str, links: Mapping[Any, Any], place: str, **choices: Any
+) -> Robot:
+    """The robot of a builder with the effects of a robot file."""
+    given = select_standard(links) if isinstance(given, str) else given
+    where, coefficients = f"{place}: effects", given.get("values", {})
+    robot = builder.build(effects=read_effects(given, where, links, builder.n_joints), place=place, **choices)
+    robot = replace(robot, select_effects=bool(given.get("select", False)))
+    return with_coefficients(robot, coefficients, f"{where}: values")
 
 
 _CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
@@ -365,6 +417,10 @@ class _Tree:
         there, back = [link for link in up if link not in down], [link for link in down if link not in up]
         return [(self._above[link], True) for link in there] + [(self._above[link], False) for link in reversed(back)]
 
+    def above(self, link: str) -> _UrdfJoint | None:
+        """The joint whose child a link is."""
+        return self._above.get(link)
+
     def _up(self, link: str) -> list[str]:
         """`link` and the links above it, up to the root."""
         links = [link]
@@ -430,6 +486,7 @@ class _Robot(Schema):
         estimate: Parameters of base and tool that are estimated, which others are not: tool.x; `zeros`: of the joints
             their zeros alone.
         tolerance: 1 sigma of true minus nominal, by kind (a, theta, tool, ...) or by name: used as priors.
+        effects: What the arm does beyond its geometry: see `io.effects`.
     """
 
     name: str | None = None
@@ -439,6 +496,7 @@ class _Robot(Schema):
     fixed: tuple[str, ...] = ()
     estimate: Names = ()
     tolerance: dict[str, Positive] = Field(default_factory=dict)
+    effects: dict[str, Any] | Literal["select"] = Field(default_factory=dict)
 
     def choices(self, place: str, estimate: Sequence[str]) -> dict[str, Any]:
         """Arguments of `RobotBuilder.build`, [m] and [rad]; `estimate` is estimated too.
@@ -517,6 +575,7 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path, est
     file = validate(_UrdfRobot, dict(mapping), place)
     robot = read_urdf(
         folder / file.urdf,
+        effects=file.effects,
         base_link=file.base_link,
         tip_link=file.tip_link,
         name=file.name,
@@ -549,7 +608,9 @@ def _build_dh(file: _DhRobot, place: str, estimate: Sequence[str]) -> Robot:
         values = {kind: _si(kind, getattr(row, kind), file.units, here) for kind in kinds}
         builder.add_convention_joint(joint, values)
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
-    robot = builder.build(place=place, **file.choices(place, estimate))
+    n = len(names)
+    links = {str(i): partial(Mass, i) for i in range(n + 1)}
+    robot = _with_effects(builder, file.effects, links, place, **file.choices(place, estimate))
     return replace(robot, units=(file.units.length, file.units.angle))
 
 
@@ -605,6 +666,7 @@ def robot_text(
         "estimate": [model.ZEROS] * zeros + [p.name for p in of_frames if p.estimated],
         "tolerance": _tolerances(robot, units),
     }
+    mapping["effects"] = effects_mapping(robot)
     mapping = {key: value for key, value in mapping.items() if value or key == "joints"}
     if robot.urdf is None:
         place = place or robot.name

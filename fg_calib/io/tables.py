@@ -441,7 +441,9 @@ def read_measurements(
     _check_use(table, model)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
-    return measurements_of(table, readings, between, units, noise, model)
+    found = measurements_of(table, readings, between, units, noise, model)
+    context = [effect.context(robot, readings, table.numbers) for effect in robot.effects]
+    return replace(found, context={name: values for one in context for name, values in one.items()})
 
 
 def _check_use(table: Table, model: Model | None) -> None:

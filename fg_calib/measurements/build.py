@@ -46,11 +46,20 @@ class Dataset(Brief):
     names: tuple[str, ...]
     _trigs: dict[Any, tuple[Floats, ...]] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def trigs(self, robot: Robot) -> tuple[Floats, ...]:
-        """Readings of each table for the kernels, remembered, as parameters change nothing of them."""
-        key = (tuple(joint.prismatic for joint in robot.joints), robot.bases)
+    def trigs(self, robot: Robot, values: Floats | None = None) -> tuple[Floats, ...]:
+        """Readings of each table for the kernels, remembered.
+
+        Args:
+            robot: The robot.
+            values: Values of its parameters first, by which joints give way; nominal if None.
+        """
+        loads = (robot.nominal if values is None else values)[list(robot.loads)]
+        key = (tuple(joint.prismatic for joint in robot.joints), robot.effects, loads.tobytes())
         if key not in self._trigs:
-            self._trigs[key] = tuple(robot.trig(table.measurements.readings) for table in self.tables)
+            if robot.loads:
+                self._trigs.clear()
+            each = [table.measurements for table in self.tables]
+            self._trigs[key] = tuple(robot.trig(m.readings, m.context, values) for m in each)
         return self._trigs[key]
 
     @property

@@ -170,6 +170,7 @@ class Measurements(FrozenArrays):
             the row's anchor, or from its plane, [m].
         sigmas: 1 sigma of these, by the same names, and of `point`, a touch, per axis, [m], nan where it is not
             specified; and of `pixel`, along u and v, shape (n_configurations, 2), [px].
+        context: What effects of the arm depend on besides readings, by name, shape (n_configurations, ...) each.
     """
 
     readings: Floats
@@ -191,6 +192,7 @@ class Measurements(FrozenArrays):
     part: Integers | None = None
     columns: Mapping[str, Floats] = field(default_factory=dict)
     sigmas: Mapping[str, Floats] = field(default_factory=dict)
+    context: Mapping[str, Floats] = field(default_factory=dict)
 
     from_arrays, from_frame = Reader("read_arrays"), Reader("read_measurements")
 
@@ -217,7 +219,8 @@ class Measurements(FrozenArrays):
         rows_of: dict[str, Any] = {
             name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "sigma_joint"
         }
-        named: dict[str, Any] = {of: {k: v[rows] for k, v in getattr(self, of).items()} for of in ("columns", "sigmas")}
+        names = "columns", "sigmas", "context"
+        named: dict[str, Any] = {of: {k: v[rows] for k, v in getattr(self, of).items()} for of in names}
         labels = {name: of.of(rows) for name, of in self.labels.items()}
         return replace(self, **rows_of, **named, labels=labels, pairs=None, groups=None)
 

@@ -106,6 +106,7 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
         the chain's columns, then, if the chain has joint columns, in the joints of the measurement's first end, then of
         its second, then in its nuisances.
     """
+    block, chain = _with_curves(block, chain)
     n_all = _n_columns(block, chain) + 1
     out = np.empty((block.n, block.residual_dim, n_all))
 
@@ -119,6 +120,7 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
 
 def triangle(block: Block, chain: Chain) -> Floats:
     """R of a thin QR of [J r], shape (n_columns + 1, n_columns + 1)."""
+    block, chain = _with_curves(block, chain)
     n_all = _n_columns(block, chain) + 1
 
     def run(start: int, stop: int) -> Floats:
@@ -141,6 +143,7 @@ def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
         chain: The chain.
         directions: Of all the columns together, one after the other, shape (n_columns, k).
     """
+    block, chain = _with_curves(block, chain)
     out, along = np.empty((block.n, block.residual_dim)), np.ascontiguousarray(directions.T)
 
     def run(start: int, stop: int) -> None:
@@ -151,6 +154,12 @@ def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
     with one_blas_thread:
         list(over_spans(run, block.n))
     return out
+
+
+def _with_curves(block: Block, chain: Chain) -> tuple[Block, Chain]:
+    """The block with error curves in its readings, and the chain without them."""
+    chain, trig = chain.with_curves_in(block.trig)
+    return (block if trig is block.trig else replace(block, trig=trig)), chain
 
 
 def _n_columns(block: Block, chain: Chain) -> int:

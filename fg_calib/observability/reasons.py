@@ -105,7 +105,7 @@ def find_confounding(problem: Problem, parameters: Floats, directions: Floats) -
         None where nothing is confounded with a direction that is seen, empty where nothing shows it anyway.
     """
     variables, found = problem.variables, list[tuple[str, ...] | None]([()] * directions.shape[1])
-    if not variables.nuisance:
+    if variables.n_nuisance == variables.n_curves:
         return found  # measurement frames alone hide what moves the whole arm as one body, nothing else
     columns = dict[str, list[Integers]]()
     for v in (*variables.frames, *variables.nuisance):

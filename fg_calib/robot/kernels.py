@@ -188,7 +188,7 @@ def _turn_about_by_reading(k, reading, R):  # type: ignore[no-untyped-def]
 
 @part
 def _walk_basis(k, coefficient, sign, trig, row, basis, column, own, reading, R, p, twist):  # type: ignore[no-untyped-def]
-    """An element whose value is a coefficient times a basis function, which `trig` has with its slope."""
+    """An element whose value is a coefficient times a basis function, which `trig` has with its slope in a reading."""
     for target, which in ((column, 0), (own, 1)):
         if target >= 0:
             unit = np.zeros((6, LANES))

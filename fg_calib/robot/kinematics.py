@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,34 @@ from fg_calib.robot.kernels import ChainArrays, walk_all
 from fg_calib.robot.model import FRAME_KINDS, PARAMETER_KINDS, Axis, Element, Robot
 
 T = TypeVar("T")
+
+
+class Curve(NamedTuple):
+    """A joint's error curve: what it turns beyond its reading, a periodic cubic B-spline of it.
+
+    Attributes:
+        joint: Index of the joint.
+        source: Indices of its coefficients in the parameter vector, shape (n_knots,).
+        values: The coefficients, shape (n_knots,), [rad].
+    """
+
+    joint: int
+    source: Integers
+    values: Floats
+
+
+def spline(angle: Floats, n_knots: int) -> tuple[Integers, Floats]:
+    """Numbers of the four periodic cubic B-splines that are not zero at angles, and their values, shape (n, 4) each.
+
+    Args:
+        angle: Shape (n,), [rad].
+        n_knots: Knots a turn, evenly spaced from 0.
+    """
+    u = angle * (n_knots / (2.0 * np.pi))
+    k = np.floor(u)
+    t = u - k
+    pieces = [(1.0 - t) ** 3, 3.0 * t**3 - 6.0 * t**2 + 4.0, -3.0 * t**3 + 3.0 * t**2 + 3.0 * t + 1.0, t**3]
+    return (k.astype(np.int64)[:, None] + np.arange(-1, 3)) % n_knots, np.stack(pieces, axis=1) / 6.0
 
 
 class Chain(Brief):
@@ -51,6 +79,7 @@ class Chain(Brief):
         n_columns: Number of parameter columns.
         n_joints: Number of moving joints.
         joint_columns: Whether derivatives in the joints are wanted too; they follow the parameters' columns.
+        curves: Error curves of joints.
     """
 
     axis: NDArray[np.int8]
@@ -64,13 +93,15 @@ class Chain(Brief):
     n_columns: int
     n_joints: int
     joint_columns: bool = False
+    curves: tuple[Curve, ...] = ()
 
     def at(self, parameters: Floats) -> Chain:
         """Copy with parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
 
         The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
         """
-        there = replace(self, value=self.values(parameters))
+        curves = tuple(c._replace(values=parameters[c.source]) for c in self.curves)
+        there = replace(self, value=self.values(parameters), curves=curves)
         there.__dict__["_turns"] = self._turns  # which values do not change
         return there
 
@@ -85,6 +116,27 @@ class Chain(Brief):
     def with_joint_columns(self) -> Chain:
         """Copy with the derivatives in the joints too."""
         return replace(self, joint_columns=True)
+
+    def with_turn_columns(self) -> Chain:
+        """Copy with derivatives in what each joint turns alone: joint columns without slopes of effects."""
+        return replace(self, joint_columns=True, joint=np.where(self.basis >= 0, -1, self.joint))
+
+    def with_curves_in(self, trig: Floats) -> tuple[Chain, Floats]:
+        """The chain without error curves, and readings with them: q + curve(q)."""
+        if not self.curves:
+            return self, trig
+        trig, found = trig.copy(), self.splines(trig)
+        for curve in self.curves:
+            c, s = trig[:, curve.joint].T
+            knots, weights = found[curve.joint]
+            turn = np.einsum("nk,nk->n", weights, curve.values[knots])
+            cos, sin = np.cos(turn), np.sin(turn)
+            trig[:, curve.joint] = np.stack([cos * c - sin * s, sin * c + cos * s], axis=1)
+        return replace(self, curves=()), trig
+
+    def splines(self, trig: Floats) -> dict[int, tuple[Integers, Floats]]:
+        """Coefficients of each error curve that readings depend on, by joint, and derivatives in them: see `spline`."""
+        return {c.joint: spline(np.arctan2(*trig[:, c.joint].T[::-1]), len(c.values)) for c in self.curves}
 
     @cached_property
     def arrays(self) -> ChainArrays:
@@ -141,7 +193,7 @@ def build_chain(
     columns = dict(columns or {})
     n_parameters = len(robot.parameters)
     base, tool = robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
-    end_of_base = max((i for i, e in enumerate(robot.elements) if e.parameter in base), default=-1)
+    end_of_base = max((i for i, e in enumerate(robot.elements) if e.parameter in base and e.basis is None), default=-1)
     elements: list[tuple[Element, int, int]] = []  # element, source, column
     if frame:
         values = enumerate(FRAME_KINDS, start=n_parameters)
@@ -153,7 +205,6 @@ def build_chain(
         if i == end_of_base:
             elements += _tangent(base_tangent)
     elements += _tangent(tool_tangent)
-    places = {basis: robot.n_joints + i for i, basis in enumerate(robot.bases)}
     n_columns = len(columns) + 6 * sum(t is not None for t in (tool_tangent, base_tangent, frame_tangent))
     chain = Chain(
         axis=np.array([e.axis for e, _, _ in elements], dtype=np.int8),
@@ -162,15 +213,27 @@ def build_chain(
         source=np.array([source for _, source, _ in elements], dtype=np.int64),
         value=np.zeros(len(elements)),
         joint=np.array([_joint_of(e) for e, _, _ in elements], dtype=np.int64),
-        basis=np.array([-1 if e.basis is None else places[e.basis] for e, _, _ in elements], dtype=np.int64),
+        basis=np.array(
+            [-1 if e.basis is None else robot.n_joints + e.basis.term for e, _, _ in elements], dtype=np.int64
+        ),
         column=np.array([column for _, _, column in elements], dtype=np.int64),
         n_columns=n_columns,
         n_joints=robot.n_joints,
+        curves=_curves(robot),
     )
     changing = set(columns) | set(range(n_parameters, n_parameters + 6))
     changing |= set(() if tool_tangent is None else tool) | set(() if base_tangent is None else base)
     chain = replace(chain, value=chain.values(np.concatenate([robot.nominal, np.zeros(6)])))
     return _without_idle(chain, changing)
+
+
+def _curves(robot: Robot) -> tuple[Curve, ...]:
+    """The error curves of a robot at its nominal values."""
+    sources = dict[int, list[int]]()
+    for i, p in enumerate(robot.parameters):
+        if p.kind == "curve":
+            sources.setdefault(p.owner - 1, []).append(i)
+    return tuple(Curve(joint, np.array(each), robot.nominal[each]) for joint, each in sources.items())
 
 
 def _joint_of(element: Element) -> int:
@@ -230,6 +293,7 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
         The derivatives of n configurations take n * 6 * n_columns numbers; for large data use the residuals of
         `residuals`, which reduce them as they come.
     """
+    chain, trig = chain.with_curves_in(trig)
     rows = np.arange(len(trig)) if rows is None else np.asarray(rows, dtype=np.int64)
     n, n_twists = len(rows), chain.n_columns + (chain.n_joints if chain.joint_columns else 0)
     rotation, position, jacobian = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 6, n_twists))

@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import logging
 import re
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from enum import IntEnum
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib import inputs
 from fg_calib.inputs import NEAR, Floats, InputError, as_floats, check_names, checked, escaped, listed, shape_of, shown
-from fg_calib.robot.rotations import yaw_pitch_roll
+from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
 
 MOST_JOINTS = 200
 """The largest number of moving joints: the work grows with its third power."""
@@ -54,6 +55,10 @@ SCALES: Mapping[str, Scale] = {
     "rad": Scale("deg", 180.0 / np.pi, 5),
     "1": Scale("ppm", 1e6, 1),
     "px": Scale("px", 1.0, 3),
+    "rad/(N m)": Scale("urad/(N m)", 1e6, 4, 1e-5),
+    "rad s^2/m": Scale("urad s^2/m", 1e6, 3, 1e-4),
+    "1/K": Scale("ppm/K", 1e6, 3, 1e-4),
+    "rad/K": Scale("urad/K", 1e6, 3, 1e-4),
 }
 """Each SI unit of a parameter or a residual, and how reports show it."""
 
@@ -61,7 +66,7 @@ SCALES: Mapping[str, Scale] = {
 class ParameterKind(NamedTuple):
     """Kind of parameter: its SI unit, a key of `SCALES`, and the elementary transform that it is a value of.
 
-    A joint's effect, such as a gain, acts along the joint's own axis.
+    An effect (see `effects`) says for itself along which axis it acts.
     """
 
     unit: str
@@ -80,8 +85,22 @@ PARAMETER_KINDS: Mapping[str, ParameterKind] = {
     "yaw": ParameterKind("rad", Axis.RZ),
     "pitch": ParameterKind("rad", Axis.RY),
     "roll": ParameterKind("rad", Axis.RX),
+    "compliance": ParameterKind("rad/(N m)"),
+    "bending": ParameterKind("rad/(N m)"),
+    "load": ParameterKind("rad s^2/m"),
+    "gain": ParameterKind("1"),
+    "sin": ParameterKind("rad"),
+    "cos": ParameterKind("rad"),
+    "backlash": ParameterKind("rad"),
+    "coupling": ParameterKind("1"),
+    "expansion": ParameterKind("1/K"),
+    "drift": ParameterKind("rad/K"),
+    "curve": ParameterKind("rad"),
 }
 """The kinds of parameters. Of those that only act together the earlier kind is kept, as in the paper."""
+
+EFFECT_KINDS = tuple(PARAMETER_KINDS)[tuple(PARAMETER_KINDS).index("compliance") :]
+"""Kinds of the parameters of what an arm does beyond its geometry."""
 
 CONVENTIONS: Mapping[str, tuple[str, ...]] = {
     "dh": ("theta", "d", "a", "alpha"),
@@ -93,6 +112,9 @@ CONVENTIONS: Mapping[str, tuple[str, ...]] = {
 
 DH_COLUMNS = ("a", "alpha", "d", "theta", "beta")
 """Order of the figures in a row of `Robot.from_dh`, whatever the convention."""
+
+Context = Mapping[str, Floats]
+"""What else was measured at configurations: the side of approach, a temperature."""
 
 JointType = Literal["revolute", "prismatic"]
 
@@ -159,30 +181,76 @@ class Parameter(inputs.Record):
         return self.tolerance if self.tolerance is not None else SCALES[self.unit].ordinary
 
 
-BASES: Mapping[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]] = {
-    "reading": (lambda q: q, np.ones_like),
-    "sin": (np.sin, np.cos),
-    "cos": (np.cos, lambda q: -np.sin(q)),
-    "sin 2": (lambda q: np.sin(2.0 * q), lambda q: 2.0 * np.cos(2.0 * q)),
-    "cos 2": (lambda q: np.cos(2.0 * q), lambda q: -2.0 * np.sin(2.0 * q)),
-}
-"""Functions of a joint's reading and their slopes, for the effects of joints that `RobotBuilder.add_effect` adds."""
-
-
-class Basis(inputs.Record):
-    """The function of a joint's reading that an element's coefficient is multiplied by.
+class Basis(NamedTuple):
+    """What an element's coefficient is multiplied by: a term of the robot's effects, by its number.
 
     Attributes:
-        function: A key of `BASES`.
-        joint: Index of the joint.
+        term: Number of the term, in the order of `Robot.terms`.
+        joint: Index of the joint in whose reading the term has a slope; -1 for none.
     """
 
-    function: str
+    term: int
     joint: int
 
-    def values(self, readings: Floats) -> Floats:
-        """Values and slopes in the reading, shape (n, 2)."""
-        return np.stack([of(readings[:, self.joint]) for of in BASES[self.function]], axis=1)
+
+class Term(NamedTuple):
+    """One term of an effect: a coefficient times what `Effect.values` gives.
+
+    Attributes:
+        name: Name of the coefficient, `theta2.sin1`; terms of one name share it.
+        sigma: 1 sigma of the coefficient where no tolerance is given, in its unit.
+        owner: Number of the joint that it acts at, 0 for the base.
+        after: Index of the element that it follows, -1 for the start; None for what is no element (an error curve).
+        axis: Axis of the elementary transform.
+        sign: +1 or -1.
+        joint: See `Basis`.
+    """
+
+    name: str
+    sigma: float
+    owner: int
+    after: int | None
+    axis: Axis = Axis.RZ
+    sign: int = 1
+    joint: int = -1
+
+
+class Effect(ABC):
+    """What an arm does beyond its geometry: a sum of terms, each a coefficient times a function of the readings."""
+
+    def __post_init__(self) -> None:
+        """Take lists for tuples: robots are keys of caches."""
+        for name, value in list(vars(self).items()):
+            object.__setattr__(self, name, _as_tuple(value))
+
+    @abstractmethod
+    def terms(self, robot: Robot) -> list[Term]:
+        """The terms for a robot without effects.
+
+        Raises:
+            InputError: The robot has no such joint.
+        """
+
+    @abstractmethod
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        """Value of each term that is an element, and its slope in the reading of its joint, shape (n, n_terms, 2).
+
+        Args:
+            robot: The robot without effects.
+            readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+            context: What else was measured, by name, shape (n,) or (n, n_joints) each.
+            at: Values of the terms' coefficients, shape (n_terms,).
+        """
+
+    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+        """What else the values depend on, for the rows of a table.
+
+        Args:
+            robot: The robot.
+            readings: Joint readings in the rows' order, shape (n, n_joints), [rad] (prismatic: [m]).
+            read: Columns of the table, shape (n, k), by their names.
+        """
+        return {}
 
 
 class Element(inputs.Record):
@@ -237,6 +305,8 @@ class Robot(inputs.Record):
         elements: The chain, base to tool.
         urdf: The file it was read from, for a URDF robot.
         units: Of length and angle in its robot file, in which its calibration is written.
+        effects: What it does beyond its geometry; their terms are among parameters and elements.
+        select_effects: Whether a calibration keeps only those for which there is evidence.
     """
 
     name: str
@@ -246,6 +316,8 @@ class Robot(inputs.Record):
     elements: tuple[Element, ...]
     urdf: UrdfSource | None = field(default=None, repr=False)
     units: tuple[inputs.LengthUnit, inputs.AngleUnit] = field(default=("m", "rad"), repr=False, compare=False)
+    effects: tuple[Effect, ...] = ()
+    select_effects: bool = field(default=False, repr=False)
 
     from_urdf = inputs.Reader("read_urdf")
 
@@ -317,18 +389,30 @@ class Robot(inputs.Record):
         return len(self.joints)
 
     @cached_property
-    def bases(self) -> tuple[Basis, ...]:
-        """Functions that the elements' coefficients are multiplied by, each once."""
-        return tuple(dict.fromkeys(e.basis for e in self.elements if e.basis is not None))
+    def geometry(self) -> Robot:
+        """The robot without effects; parameters keep their places."""
+        return replace(self, elements=tuple(e for e in self.elements if e.basis is None), effects=())
 
-    def trig(self, readings: Floats) -> Floats:
-        """Joint readings as the kernels take them, shape (n, n_joints + n_bases, 2).
+    @cached_property
+    def terms(self) -> tuple[tuple[Term, ...], ...]:
+        """The terms that are elements, effect by effect."""
+        return tuple(tuple(t for t in e.terms(self.geometry) if t.after is not None) for e in self.effects)
+
+    @cached_property
+    def loads(self) -> tuple[int, ...]:
+        """Indices of the parameters by which joints give way: loads depend on them."""
+        return tuple(i for i, p in enumerate(self.parameters) if p.kind in ("compliance", "load"))
+
+    def trig(self, readings: Floats, context: Context | None = None, values: Floats | None = None) -> Floats:
+        """Joint readings as the kernels take them, shape (n, n_joints + n_terms, 2).
 
         Cosine and sine of each revolute reading (value and 0 of a prismatic one), then value and slope of each of the
-        robot's `bases`. Nothing else computes what an element's value takes from a configuration.
+        terms of the robot's effects. Nothing else computes what an element's value takes from a configuration.
 
         Args:
             readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
+            context: What else was measured there, by name: see `effects`.
+            values: Values of the parameters, by which loads are found where joints give way; nominal if None.
 
         Raises:
             InputError: The readings are of more or fewer joints.
@@ -343,9 +427,44 @@ class Robot(inputs.Record):
         np.sin(readings, out=trig[:, :, 1])
         if prismatic.any():
             trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
-        if not self.bases:
-            return trig
-        return np.concatenate([trig, np.stack([b.values(readings) for b in self.bases], axis=1)], axis=1)
+        values, parts, readings = self._nominal if values is None else values, [trig], np.asarray(readings)
+        for effect, terms in zip(self.effects, self.terms, strict=True):
+            if terms:
+                at = values[[self.index(t.name) for t in terms]]
+                parts.append(effect.values(self.geometry, readings, context or {}, at))
+        return np.concatenate(parts, axis=1) if len(parts) > 1 else trig
+
+    def with_effects(self, *effects: Effect) -> Robot:
+        """Copy that does more than its geometry; each effect brings its parameters, of nominal value zero.
+
+        Raises:
+            InputError: A joint that there is not, or two effects with the same parameters.
+        """
+        if self.effects:
+            raise InputError(self.name, "it has effects already", "all of them together")
+        for effect in effects:
+            if not isinstance(effect, Effect):
+                raise InputError("effects", f"found {shown(effect)}", "effects, such as Harmonics([1, 2])")
+        parameters, more = list(self.parameters), dict[int, list[Element]]()
+        places = {p.name: i for i, p in enumerate(parameters)}
+        number = 0
+        for effect in effects:
+            mine = set[str]()
+            for t in effect.terms(self):
+                if t.name in places and t.name not in mine:
+                    raise InputError(self.name, f"two effects with the parameter {t.name}", "one")
+                if t.name not in mine:
+                    mine.add(t.name)
+                    places[t.name] = len(parameters)
+                    parameters.append(Parameter(t.name, kind_of(t.name), t.owner, 0.0, t.sigma))
+                if t.after is not None:
+                    element = Element(t.axis, 0.0, places[t.name], None, t.sign, Basis(number, t.joint))
+                    more.setdefault(t.after, []).append(element)
+                    number += 1
+        elements = list(more.get(-1, []))
+        for i, element in enumerate(self.elements):
+            elements += [element, *more.get(i, [])]
+        return replace(self, parameters=tuple(parameters), elements=tuple(elements), effects=tuple(effects))
 
     @property
     def nominal(self) -> Floats:
@@ -411,9 +530,20 @@ class Robot(inputs.Record):
             raise InputError(self.name, f"no parameter {shown(name)}", inputs.known_names(names), hint)
         return names.index(name)
 
+    def end_of(self, owner: int) -> int:
+        """How many elements come before the end of the link that joint `owner` moves (0: the base)."""
+
+        def of_link(e: Element) -> bool:
+            return e.joint == owner - 1 or (e.parameter is not None and self.parameters[e.parameter].owner == owner)
+
+        end = max((i for i, e in enumerate(self.elements) if of_link(e)), default=-1) + 1
+        if self.convention not in CONVENTIONS and owner and self.elements[end - 1].joint == owner - 1:
+            end += 2  # turns back from the joint's axis
+        return end
+
     def owned_by(self, owner: int) -> list[int]:
-        """Indices of the parameters of joint `owner` (0 is the base, n + 1 the tool)."""
-        return [i for i, p in enumerate(self.parameters) if p.owner == owner]
+        """Indices of the geometric parameters of joint `owner` (0 is the base, n + 1 the tool)."""
+        return [i for i, p in enumerate(self.parameters) if p.owner == owner and p.kind not in EFFECT_KINDS]
 
     @checked
     def with_estimated(self, names: Iterable[str]) -> Robot:
@@ -443,6 +573,12 @@ class Robot(inputs.Record):
         return replace(self, parameters=tuple(p if p.nominal == v else replace(p, nominal=v) for p, v in pairs))
 
 
+def _as_tuple(value: Any) -> Any:
+    if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
+        return value
+    return type(value)(*map(_as_tuple, value)) if hasattr(value, "_fields") else tuple(map(_as_tuple, value))
+
+
 class RobotBuilder:
     """Collects elements and parameters, base to tool, while a reader walks its file."""
 
@@ -453,6 +589,11 @@ class RobotBuilder:
         self._joints: list[Joint] = []
         self._parameters: list[Parameter] = []
         self._elements: list[Element] = []
+
+    @property
+    def n_joints(self) -> int:
+        """Number of moving joints so far."""
+        return len(self._joints)
 
     @checked
     def add_frame(self, prefix: str, values: Mapping[str, float], owner: int, estimated: bool) -> None:
@@ -512,23 +653,6 @@ class RobotBuilder:
             self._elements[start:] = _inverse(self._elements[start:])
 
     @checked
-    def add_effect(self, kind: str, function: str, nominal: float = 0.0) -> None:
-        """Add to the value of the joint added last: a parameter `<joint>.<kind>` times a function of its reading.
-
-        The package calls it nowhere: it is where effects of joints are added (see `docs/architecture.md`).
-
-        Args:
-            kind: A key of `PARAMETER_KINDS`.
-            function: A key of `BASES`.
-            nominal: Nominal value of the parameter, in the kind's unit.
-        """
-        index = len(self._joints) - 1
-        place, moved = next((i, e) for i, e in enumerate(self._elements) if e.joint == index)
-        self._add_parameter(f"{self._joints[index].name}.{kind}", kind, index + 1, nominal, True)
-        effect = replace(self._elements.pop(), axis=moved.axis, sign=moved.sign, basis=Basis(function, index))
-        self._elements.insert(place + 1, effect)
-
-    @checked
     def build(
         self,
         *,
@@ -536,6 +660,7 @@ class RobotBuilder:
         estimate: Sequence[str] = (),
         tolerance: Mapping[str, float] | None = None,
         urdf: UrdfSource | None = None,
+        effects: Sequence[Effect] = (),
         place: str = "robot",
     ) -> Robot:
         """The finished robot.
@@ -547,6 +672,7 @@ class RobotBuilder:
             tolerance: 1-sigma priors by parameter name or by kind, [m] or [rad]; the kinds `base` and `tool`
                 mean the lengths of those frames.
             urdf: The source, for a URDF robot.
+            effects: What the arm does beyond its geometry.
             place: File name for error messages.
 
         Raises:
@@ -563,25 +689,30 @@ class RobotBuilder:
             self.add_frame("tool", {}, behind, False)
         parts = tuple(self._joints), tuple(self._parameters), tuple(self._elements)
         robot = Robot(self._name, self._convention, *parts, urdf)
+        robot = robot.with_effects(*effects) if effects else robot
         fixed, estimate = (robot.own_names(listed(*one)) for one in (("fixed", fixed), ("estimate", estimate)))
         if ZEROS in estimate:
             estimate = tuple(name for name in estimate if name != ZEROS)
             free = {*robot.zero_names, *estimate}
-            fixed += tuple(p.name for p in self._parameters if 1 <= p.owner < behind and p.name not in free)
-        names = {p.name for p in self._parameters}
-        if len(names) < len(self._parameters):
-            twice = next(name for name, n in Counter(names_of(self._parameters)).items() if n > 1).rpartition(".")[0]
+            fixed += tuple(
+                p.name
+                for p in robot.parameters
+                if 1 <= p.owner < behind and p.name not in free and p.kind not in EFFECT_KINDS
+            )
+        names = {p.name for p in robot.parameters}
+        if len(names) < len(robot.parameters):
+            twice = next(name for name, n in Counter(names_of(robot.parameters)).items() if n > 1).rpartition(".")[0]
             hint = "base and tool are the frames before and behind the joints"
             raise InputError(place, f"two frames called {twice!r}", "different names", hint)
         for key, chosen in (("fixed", fixed), ("estimate", estimate)):
-            check_names(f"{place}: {key}", chosen, names_of(self._parameters))
+            check_names(f"{place}: {key}", chosen, names_of(robot.parameters))
         both = sorted(set(fixed) & set(estimate))
         if both:
             raise InputError(f"{place}: estimate", f"{both[0]!r} is under fixed too", "it under one of the two")
-        tolerance, parameters = _checked_tolerance(tolerance or {}, self._parameters, place), list[Parameter]()
-        for p in self._parameters:
+        tolerance, parameters = _checked_tolerance(tolerance or {}, robot.parameters, place), list[Parameter]()
+        for p in robot.parameters:
             estimated = (p.estimated or p.name in estimate) and p.name not in fixed
-            sigma = tolerance.get(p.name, tolerance.get(tolerance_kind(p) or ""))
+            sigma = tolerance.get(p.name, tolerance.get(tolerance_kind(p) or "", p.tolerance))
             parameters.append(replace(p, estimated=estimated, tolerance=sigma))
         return replace(robot, parameters=tuple(parameters))
 
@@ -639,6 +770,14 @@ def frame_of_matrix(matrix: Floats) -> dict[str, float]:
     return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), values.tolist(), strict=True))
 
 
+def matrix_of_frame(values: Mapping[str, float]) -> Floats:
+    """The pose, shape (4, 4), of x, y, z, roll, pitch, yaw by kind, [m] and [rad]; missing ones are 0."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_of(*(values.get(kind, 0.0) for kind in ("yaw", "pitch", "roll")))
+    T[:3, 3] = [values.get(kind, 0.0) for kind in "xyz"]
+    return T
+
+
 def _frame_in_rad(name: str, values: dict[str, float]) -> dict[str, float]:
     for kind in ("roll", "pitch", "yaw"):
         if abs(values.get(kind, 0.0)) > MOST_ANGLE:
@@ -686,10 +825,16 @@ def names_of(parameters: Iterable[Parameter]) -> list[str]:
     return [p.name for p in parameters]
 
 
+def kind_of(name: str) -> str:
+    """The kind in the name of a parameter: `alpha3`, `elbow.yaw`, `theta2.sin1`, `theta2.curve[17]`, `q2.zero`."""
+    kind = re.match("[a-z]+", name.rpartition(".")[2])
+    found = kind.group() if kind else ""
+    return {"zero": "theta"}.get(found, found)
+
+
 def unit_of(name: str) -> str:
-    """The SI unit of a parameter or kind by its name: `alpha3`, `elbow.yaw`; `m` of `base`, `tool`, what is no kind."""
-    kind = name.rpartition(".")[2] if "." in name else name.rstrip("0123456789")
-    kind = "theta" if kind == "zero" else kind
+    """The SI unit of a parameter or kind by its name; `m` of `base`, `tool`, what is no kind."""
+    kind = kind_of(name)
     return PARAMETER_KINDS[kind].unit if kind in PARAMETER_KINDS else "m"
 
 

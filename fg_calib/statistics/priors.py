@@ -335,7 +335,8 @@ def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, .
     problem, variables = solution.problem, solution.problem.variables
     z, P = graph.prior_rows(variables, solution.parameters)
     names = [p.name for p in _prior_parameters(variables)]
-    z_places, P_places = graph.unknown_prior_rows(variables, solution.parameters)
+    places = graph.unknown_prior_rows(variables, solution.parameters)
+    z_places, P_places = (rows[variables.n_curves :] for rows in places)
     own = np.zeros((len(z) + len(z_places), 0))
     if len(z_places):
         # The places' errors follow those of the core, and what is theirs alone comes on top.
@@ -344,7 +345,7 @@ def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, .
         P = np.vstack([P, of_core + of_places @ left.follow])
         own = np.vstack([np.zeros((len(z), left.rank)), of_places @ left.inverse])
         for v in variables.nuisance:
-            if v.prior is not None:
+            if v.prior is not None and v.kind != "curve":
                 item = unknowns.items[v.number]
                 names += [f"{item.kind.name} {item.name}"] * len(v.prior[0])
     A = np.eye(len(own)) - P @ (2.0 * spread.tangent - spread.actual) @ P.T - own @ own.T

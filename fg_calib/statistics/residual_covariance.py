@@ -15,7 +15,7 @@ import scipy.sparse
 from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
-from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, all_errors, loss_variance, reach
+from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, all_errors, curve_columns, loss_variance, reach
 from fg_calib.inputs import Booleans, Floats, Integers, Record
 from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
@@ -196,6 +196,9 @@ class RowModel:
         for k, column in enumerate(at.columns[nuisances].T):
             found = np.flatnonzero(column >= 0)
             P[found, :, column[found]] = J[found, :, at.n_columns + k]
+        if at.curves is not None:
+            columns = curve_columns(noise.rows_at(rows), self.chain(number), at.curves).toarray()
+            P[:, :, at.n_columns : at.n_columns + columns.shape[1]] = columns.reshape(*P.shape[:2], columns.shape[1])
         if not noise.block.kind.is_contact:
             P[self._nowhere[nuisances].any(axis=1)] = np.nan
         return P.reshape(P.shape[0] * P.shape[1], P.shape[2]), noise.errors_at(rows)

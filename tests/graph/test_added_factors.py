@@ -209,7 +209,7 @@ def test_what_is_wrong_with_a_graph_is_said_in_one_line(name):
 
 def test_a_factor_on_an_error_variable_is_refused_with_gtsams_optimizer_as_the_way_out():
     problem = problem_of("distance")
-    keys = [key for key in problem.graph.keyVector() if chr(gtsam.symbolChr(key)) == "E"]
+    keys = [key for key in problem.graph.keyVector() if chr(gtsam.symbolChr(key)) == "Z"]
     graph, mean = problem.graph, problem.initial.atVector(keys[0]) + 0.5
     graph.add(gtsam.PriorFactorVector(keys[0], mean, SIGMA(len(mean), 1e-4)))
     with pytest.raises(ProblemError) as found:

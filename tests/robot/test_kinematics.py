@@ -1,6 +1,6 @@
 """Forward kinematics and its derivatives, against 4x4 products and central differences."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from simulated import planar_robot
 from sparing import diagonal
 from tolerances import rounding
 
-from fg_calib.robot import CONVENTIONS, LANES, SPAN, Axis, Parameter, build_chain, forward, pose
-from fg_calib.robot.model import BASES, Basis, Element, Joint, RobotBuilder
+from fg_calib.robot import CONVENTIONS, LANES, SPAN, Axis, build_chain, forward, pose
+from fg_calib.robot.model import Effect, Element, Joint, RobotBuilder, Term
 
 
 def test_a_planar_arm_reaches_where_one_can_draw_it():
@@ -156,32 +156,44 @@ def test_a_parameter_and_a_joint_of_several_elements_have_the_sum_of_their_deriv
 # --- values that are sums of coefficients times functions of readings ------------------------------------------------
 
 
+FUNCTIONS = {"reading": (lambda q: q, np.ones_like), "sin 2": (lambda q: np.sin(2 * q), lambda q: 2 * np.cos(2 * q))}
+
+
+@dataclass(frozen=True)
+class Coefficients(Effect):
+    """Two further elements behind each, of all axes: a function's name, joint, axis and name of each."""
+
+    items: tuple = ()
+
+    def terms(self, robot):
+        return [Term(name, 1.0, 1, i // 2, axis, -1 if i % 5 == 0 else 1, j)
+                for i, (_, j, axis, name) in enumerate(self.items)]  # fmt: skip
+
+    def values(self, robot, readings, context, at):
+        return np.stack(
+            [np.stack([f(readings[:, j]) for f in FUNCTIONS[f]], axis=1) for f, j, *_ in self.items], axis=1
+        )
+
+
 def with_coefficients(robot, rng):
-    """Two further elements behind each, of all axes and functions: coefficients away from zero, some of them shared."""
-    elements, parameters = [], list(robot.parameters)
-    functions = list(BASES)
-    for i, element in enumerate(robot.elements):
-        elements.append(element)
-        for k in range(2):
-            function = functions[(2 * i + k) % len(functions)]
-            basis = Basis(function, int(rng.integers(robot.n_joints)))
-            axis, shared = Axis(int(rng.integers(6))), k == 1 and i % 4 == 3
-            if not shared:
-                kind = "x" if axis < 3 else "roll"
-                parameters.append(Parameter(f"c{i}{k}.{kind}", kind, 1, rng.uniform(0.1, 0.5)))
-            elements.append(Element(axis, parameter=len(parameters) - 1, sign=-1 if i % 5 == 0 else 1, basis=basis))
-    return replace(robot, elements=tuple(elements), parameters=tuple(parameters))
+    """A robot with such elements, coefficients away from zero, some of them shared."""
+    items, functions = [], list(FUNCTIONS)
+    for i in range(2 * len(robot.elements)):
+        axis, name = Axis(int(rng.integers(6))), items[-1][3] if i % 8 == 7 else ""
+        name = name or f"c{i}.{'x' if axis < 3 else 'roll'}"
+        items.append((functions[i % 2], int(rng.integers(robot.n_joints)), axis, name))
+    n, robot = len(robot.parameters), robot.with_effects(Coefficients(tuple(items)))
+    return robot.with_values([*robot.nominal[:n], *rng.uniform(0.1, 0.5, len(robot.parameters) - n)])
 
 
 def pose_with_coefficients(robot, values, q):
-    """base_T_tool as a product of 4x4 matrices, the functions written out."""
-    T = np.eye(4)
-    of = {"reading": lambda i: q[i], "sin": lambda i: np.sin(q[i]), "cos": lambda i: np.cos(q[i])}
-    of |= {"sin 2": lambda i: np.sin(2 * q[i]), "cos 2": lambda i: np.cos(2 * q[i])}
+    """base_T_tool as a product of 4x4 matrices."""
+    T, items = np.eye(4), robot.effects[0].items
     for e in robot.elements:
         free = 0.0 if e.parameter is None else values[e.parameter]
         if e.basis is not None:
-            free = free * of[e.basis.function](e.basis.joint)
+            function, joint, *_ = items[e.basis.term]
+            free = free * FUNCTIONS[function][0](q[joint])
         value = e.constant + e.sign * (free + (0.0 if e.joint is None else q[e.joint]))
         T = T @ (translation(e.axis, value) if e.axis < 3 else rotation(e.axis - 3, value))
     return T

@@ -1,0 +1,167 @@
+"""The key `effects` of a robot file: what the arm does beyond its geometry.
+
+```yaml
+effects:
+  error_curve: {joints: all, knots: 144}
+  compliance: {joints: [2, 3], masses: {2: {mass: 12.0, com: [0.2, 0, 0.1]}}, payload: {mass: 2.0, com: [0, 0, 0.05]}}
+  harmonics: true                       # defaults of `robot.effects`
+  values: {theta2.compliance: 1.2e-5}   # nominal coefficients in SI units, of a calibrated arm
+```
+"""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BeforeValidator, TypeAdapter, ValidationError
+
+from fg_calib.inputs import InputError, shown
+from fg_calib.io.yaml import Number, Positive, Schema, first_misfit, refuse_unknown_keys, validate, within
+from fg_calib.robot import EFFECT_KINDS, EFFECTS, Effect, Mass, Robot
+
+STANDARD = ("error_curve", "compliance", "harmonics", "gain")
+"""What `select` tries where nothing is listed."""
+
+NO_MASSES = "`masses: free`, or the mass and com of each link"
+
+
+def select_standard(links: Mapping[Any, Any]) -> dict[str, Any]:
+    """What `effects: select` stands for; compliance with known masses, free products without."""
+    compliance: Any = True if links.get("urdf") else {"masses": "free"}
+    return dict.fromkeys(STANDARD, True) | {"compliance": compliance, "select": True}
+
+
+class _Mass(Schema):
+    mass: Positive
+    com: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+
+
+def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any], n_joints: int) -> list[Effect]:
+    """The effects that a mapping lists.
+
+    Args:
+        given: The mapping.
+        place: Its place, for messages.
+        links: What masses may be on, joints' numbers or links of a URDF, and what makes a `Mass` of mass and com there;
+            `urdf` has the masses of its inertials.
+        n_joints: Number of joints: the payload is on the last one's frame.
+
+    Raises:
+        InputError: An effect or option that there is not, or no masses.
+    """
+    _checked(dict[str, Any], (*EFFECTS, "values", "select"), given, place)
+    effects, masses = list[Effect](), None
+    loaded = {key: one for key, one in given.items() if isinstance(one, Mapping) and {"masses", "payload"} & one.keys()}
+    for key, one in loaded.items():
+        masses = masses or _masses(one, f"{place}: {key}", links, n_joints)
+    if not loaded and "urdf" in links:
+        masses = tuple(links["urdf"])
+    for key in (key for key in given if key in EFFECTS and given[key] is not False):
+        of, options, here = EFFECTS[key], given[key], f"{place}: {key}"
+        names = [f.name for f in fields(of)]  # type: ignore[arg-type]
+        options = {} if options is True else options if isinstance(options, Mapping) else {names[0]: options}
+        options = {name: value for name, value in options.items() if name not in ("masses", "payload")}
+        if "masses" in names:
+            free = key == "compliance" and isinstance(given[key], Mapping) and given[key].get("masses") == "free"
+            if not masses and not free and (key != "backlash" or options.get("side") == "load"):
+                raise InputError(here, "no masses", NO_MASSES)
+            options["masses"] = None if free else masses
+        with within(here):
+            effects.append(_checked(of, names, options, here))
+    return effects
+
+
+def _checked(of: Any, keys: Sequence[str], value: object, place: str) -> Any:
+    """A value as of a type, a mapping with none but known keys.
+
+    Raises:
+        InputError: It does not fit.
+    """
+    try:
+        return TypeAdapter(Annotated[of, BeforeValidator(refuse_unknown_keys(*keys))]).validate_python(value)
+    except ValidationError as error:
+        raise first_misfit(error, place) from None
+
+
+def _masses(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any], n_joints: int) -> tuple[Mass, ...]:
+    """The masses of the entry of compliance, its payload among them."""
+    wanted, found = given.get("masses", "urdf" if "urdf" in links else None), list[Mass]()
+    if wanted == "urdf":
+        if "urdf" not in links:
+            raise InputError(f"{place}: masses", "found 'urdf', but there is none", NO_MASSES)
+        found += links["urdf"]
+    elif isinstance(wanted, Mapping):
+        for link, value in wanted.items():
+            here = f"{place}: masses: {link}"
+            if str(link) not in links:
+                raise InputError(here, f"no link {shown(link)}", f"one of {', '.join(map(str, links))}")
+            mass = validate(_Mass, value, here)
+            found.append(links[str(link)](mass.mass, mass.com))
+    elif wanted not in (None, "free"):
+        raise InputError(f"{place}: masses", f"found {shown(wanted)}", "urdf, free, or masses by link")
+    if "payload" in given:
+        payload = validate(_Mass, given["payload"], f"{place}: payload")
+        found.append(Mass(n_joints, payload.mass, payload.com))
+    return tuple(found)
+
+
+def with_coefficients(robot: Robot, given: Mapping[str, Any], place: str) -> Robot:
+    """The robot with nominal coefficients of its effects: a figure each, and a list for an error curve.
+
+    Raises:
+        InputError: A coefficient that there is not, or another number of them.
+    """
+    values = robot.nominal
+    for name, value in given.items():
+        each = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+        names = [f"{name}[{k}]" for k in range(len(each))] if name.endswith(".curve") else [name]
+        figures = _checked(list[float], (), each, f"{place}: {name}")
+        if len(figures) != len(names):
+            raise InputError(f"{place}: {name}", f"{len(figures)} figures", "one")
+        with within(place):
+            values[[robot.index(one) for one in names]] = figures
+    return robot.with_values(values)
+
+
+def effects_mapping(robot: Robot) -> dict[str, Any]:
+    """What a robot file says of the effects of a robot."""
+    keys, out, values = {of: key for key, of in EFFECTS.items()}, dict[str, Any](), dict[str, Any]()
+    for effect in robot.effects:
+        options = {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
+        if "masses" in options:
+            options["masses"] = _mapping_of(options["masses"])
+        if type(effect) not in keys:
+            raise InputError(robot.name, f"an effect {type(effect).__name__}", f"of {', '.join(EFFECTS)}")
+        out[keys[type(effect)]] = _plain(options)
+    curves = defaultdict[str, list[float]](list)
+    for p in robot.parameters:
+        if p.kind == "curve":
+            curves[p.name.partition("[")[0]].append(p.nominal)
+        elif p.kind in EFFECT_KINDS and p.nominal:
+            values[p.name] = p.nominal
+    values |= {name: each for name, each in curves.items() if any(each)}
+    return out | ({"values": values} if values else {})
+
+
+def _mapping_of(masses: Sequence[Mass] | None) -> Any:
+    """Masses by link; those on one link together."""
+    if masses is None:
+        return "free"
+    by_link = defaultdict[int, list[Mass]](list)
+    for one in masses:
+        by_link[one.link].append(one)
+    out = {}
+    for link, each in by_link.items():
+        total = sum(one.mass for one in each)
+        com = np.array([one.mass for one in each]) @ np.array([one.com for one in each]) / total
+        out[link] = {"mass": total, "com": com.tolist()}
+    return out
+
+
+def _plain(value: Any) -> Any:
+    """Tuples as lists: YAML has no others."""
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value

@@ -1,0 +1,399 @@
+r"""What an arm does beyond its geometry, one class an effect: gears, encoders, gravity, temperature.
+
+Joint i turns by q_i plus the sum of its effects; each is a coefficient, a parameter like any other, times a term:
+
+| effect | parameters | term |
+|---|---|---|
+| `Gain` | theta2.gain | q_i |
+| `Harmonics` | theta2.sin1, theta2.cos1 | sin(m q_i), cos(m q_i); an order m may be a gear ratio |
+| `ErrorCurve` | theta2.curve[17] | periodic cubic B-splines of q_i, whose Gaussian prior is part of the model |
+| `Compliance` | theta2.compliance | tau_i = sum of m g . dx/dq_i, the torque of gravity about the joint |
+| | theta2.compliance_x, _y | rotations about x and y just before the joint, by the moments about these axes |
+| | theta2.load3x, load3y | free masses: tau_i of a unit first moment of link 3 along x or y, as its joint turns it |
+| `Bending` | base.bending | rotation of the base by the moment of all masses about its origin |
+| `Backlash` | theta2.backlash | side of approach: -1, 0 or 1 |
+| `Coupling` | theta5.coupling4 | the reading of another joint |
+| `Thermal` | a2.expansion, theta2.drift | length or 1, times temperature minus reference |
+
+A joint of a URDF has its own name in place of `theta2`. Where joints give way, tau is that of the joints as they have
+turned: q + k tau(q), one step of the fixed point, which leaves errors of the third order in k.
+
+References:
+    Jia et al. (2019), section 2, for the geometry. Judd, Knasinski (1990), A technique to calibrate industrial robots
+    with experimental verification. IEEE Trans. Robotics and Automation 6(1): gears. Khalil, Besnard (2002), Geometric
+    calibration of robots with flexible joints and links. J. Intelligent and Robotic Systems 34.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from fg_calib.inputs import Floats, InputError, check_number, shown
+from fg_calib.robot.kinematics import build_chain, forward
+from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Robot, Term
+
+Joints = Literal["all"] | Sequence[int]
+"""Numbers of joints from 1; all that turn, for gains all."""
+
+LEAST_MOVE = 1e-4
+"""Smallest move that takes a gear to its other side, [rad]."""
+
+GRAVITY = (0.0, 0.0, -9.81)
+"""Of a base that stands upright, [m/s^2]."""
+
+
+def _joints(robot: Robot, joints: Joints, what: str, *, sliding: bool = False) -> list[int]:
+    """Indices of the joints: those that turn, or all of them.
+
+    Raises:
+        InputError: One is none of these.
+    """
+    able = [i for i, joint in enumerate(robot.joints) if sliding or not joint.prismatic]
+    if isinstance(joints, str):
+        return able
+    for number in joints:
+        if number - 1 not in able:
+            expected = f"joints{' that turn' * (not sliding)}, of {', '.join(str(i + 1) for i in able)}"
+            raise InputError(f"{what}: joints", f"found {shown(number)}", expected)
+    return [number - 1 for number in joints]
+
+
+def _prefix(robot: Robot, joint: int) -> str:
+    """How the names of a joint's effects begin."""
+    own = "d" if robot.joints[joint].prismatic else "theta"
+    return f"{own}{joint + 1}" if robot.convention in CONVENTIONS else robot.joints[joint].name
+
+
+def _moving(robot: Robot, joint: int) -> tuple[int, Element]:
+    """Index of the element that a joint's reading moves, and the element."""
+    return next((i, e) for i, e in enumerate(robot.elements) if e.joint == joint and e.basis is None)
+
+
+def _own(robot: Robot, joint: int, kind: str, sigma: float, slope: int | None = None) -> Term:
+    """A term that turns a joint about its own axis."""
+    place, e = _moving(robot, joint)
+    of = joint if slope is None else slope
+    return Term(f"{_prefix(robot, joint)}.{kind}", sigma, joint + 1, place, e.axis, e.sign, of)
+
+
+def _with_slopes(values: Floats, slopes: Floats | float = 0.0) -> Floats:
+    return np.stack([values, np.broadcast_to(slopes, values.shape)], axis=2)
+
+
+@dataclass(frozen=True)
+class Gain(Effect):
+    """An encoder or gear ratio that is slightly off: in proportion to the reading."""
+
+    joints: Joints = "all"
+
+    def terms(self, robot: Robot) -> list[Term]:
+        return [_own(robot, i, "gain", 1e-2) for i in _joints(robot, self.joints, "gain", sliding=True)]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        return _with_slopes(readings[:, _joints(robot, self.joints, "gain", sliding=True)], 1.0)
+
+
+@dataclass(frozen=True)
+class Harmonics(Effect):
+    """Eccentric encoders and gears: sine and cosine of multiples of the reading.
+
+    Attributes:
+        orders: Periods a turn; any number above 0, such as a gear ratio.
+        joints: The joints.
+    """
+
+    orders: Sequence[float] = (1, 2)
+    joints: Joints = "all"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for order in self.orders:
+            check_number("harmonics: orders", order, above=True)
+
+    def terms(self, robot: Robot) -> list[Term]:
+        names = [(f"{m:.9g}".replace(".", "_"), f) for m in self.orders for f in ("sin", "cos")]
+        joints = _joints(robot, self.joints, "harmonics")
+        return [_own(robot, i, f"{f}{m}", 3e-3) for i in joints for m, f in names]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        orders = np.array(self.orders, dtype=np.float64)
+        angle = readings[:, _joints(robot, self.joints, "harmonics"), None] * orders
+        sin, cos = np.sin(angle), np.cos(angle)
+        both = np.stack([sin, cos, orders * cos, -orders * sin], axis=3)  # (n, joints, orders, 4)
+        return both.reshape(len(readings), -1, 2, 2).transpose(0, 1, 3, 2).reshape(len(readings), -1, 2)
+
+
+@dataclass(frozen=True)
+class ErrorCurve(Effect):
+    """Whatever repeats each turn of a joint: a periodic cubic B-spline of the reading.
+
+    Attributes:
+        joints: The joints.
+        knots: Coefficients a turn.
+        sigma: 1 sigma of a coefficient, [rad]; estimated, one for all joints, if None.
+    """
+
+    joints: Joints = "all"
+    knots: int = 144
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("error_curve: knots", self.knots, least=4.0, whole=True)
+
+    def terms(self, robot: Robot) -> list[Term]:
+        joints, sigma = _joints(robot, self.joints, "error_curve"), self.sigma or 5e-4
+        names = [(i, f"{_prefix(robot, i)}.curve[{k}]") for i in joints for k in range(self.knots)]
+        return [Term(name, sigma, i + 1, None) for i, name in names]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        return np.zeros((len(readings), 0, 2))
+
+
+class Mass(NamedTuple):
+    """A point mass on the arm.
+
+    Attributes:
+        link: Number of the joint that moves it; 0 for the base.
+        mass: [kg].
+        com: Where it is in the frame behind that joint's figures (a DH frame, a URDF's link), [m].
+    """
+
+    link: int
+    mass: float
+    com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class _Moments:
+    """Moments of gravity about the origins of some joints' frames, in these frames just before they turn."""
+
+    def __init__(self, robot: Robot, readings: Floats, gravity: Floats) -> None:
+        self.robot, self.readings, self.gravity = robot, readings, gravity
+        self._frames: dict[int, tuple[Floats, Floats]] = {}
+
+    def frame(self, n_elements: int) -> tuple[Floats, Floats]:
+        """Rotation (n, 3, 3) and origin (n, 3) behind the first elements of the chain."""
+        if n_elements not in self._frames:
+            part = replace(self.robot, elements=(Element(Axis.TX), *self.robot.elements[:n_elements]))
+            at = forward(replace(build_chain(part), curves=()), part.trig(self.readings))
+            self._frames[n_elements] = at.rotation, at.position
+        return self._frames[n_elements]
+
+    def of_masses(self, place: int, masses: Sequence[Mass]) -> Floats:
+        """Of the masses beyond an element, about the origin of the frame before it, shape (n, 3), [N m]."""
+        R, p = self.frame(place)
+        total = np.zeros(p.shape)
+        for m in masses:
+            end = self.robot.end_of(m.link)
+            if end > place:
+                R_m, p_m = self.frame(end)
+                total += np.cross(p_m + R_m @ np.array(m.com) - p, m.mass * self.gravity)
+        return np.einsum("nji,nj->ni", R, total, dtype=np.float64)
+
+    def of_unit(self, place: int, joint: int, axis: int) -> Floats:
+        """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2]."""
+        R, u = self.frame(place)[0], self.frame(_moving(self.robot, joint)[0] + 1)[0][:, :, axis]
+        return np.einsum("nji,nj->ni", R, np.cross(u, self.gravity), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Compliance(Effect):
+    """Joints that give way to gravity: q + k tau(q), k in [rad/(N m)], positive.
+
+    Attributes:
+        masses: The masses on the arm, a payload among them; None if only products of compliance and first moments of
+            the links' masses can be told: one parameter each.
+        joints: The joints.
+        lateral: Whether joints tilt too, about the two axes across their own.
+        gravity: In the base frame, shape (3,), [m/s^2].
+    """
+
+    masses: Sequence[Mass] | None
+    joints: Joints = "all"
+    lateral: bool = False
+    gravity: Sequence[float] = GRAVITY
+
+    def _loads(self, robot: Robot, joint: int) -> list[tuple[int, int]]:
+        """Free first moments that turn a joint: number of the link from 1, and axis."""
+        return [(i + 1, axis) for i in range(joint, robot.n_joints) for axis in (0, 1)]
+
+    def terms(self, robot: Robot) -> list[Term]:
+        joints = _joints(robot, self.joints, "compliance")
+        if self.masses is None:
+            loads = [(i, link, axis) for i in joints for link, axis in self._loads(robot, i)]
+            return [_own(robot, i, f"load{link}{'xy'[axis]}", 1e-3, -1) for i, link, axis in loads]
+        terms = [_own(robot, i, "compliance", 1e-4, -1) for i in joints]
+        for i in joints if self.lateral else ():
+            place = _moving(robot, i)[0]
+            kinds = (("x", Axis.RX), ("y", Axis.RY))
+            terms += [Term(f"{_prefix(robot, i)}.compliance_{x}", 1e-4, i + 1, place - 1, axis) for x, axis in kinds]
+        return terms
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        joints = _joints(robot, self.joints, "compliance")
+        own = self._torques(robot, readings, joints)
+        if np.any(at):  # as the joints have turned
+            counts = [len(self._loads(robot, i)) if self.masses is None else 1 for i in joints]
+            turned, start = readings.copy(), 0
+            for i, n in zip(joints, counts, strict=True):
+                turned[:, i] += own[:, start : start + n] @ at[start : start + n]
+                start += n
+            readings = turned
+            own = self._torques(robot, readings, joints)
+        if not self.lateral or self.masses is None:
+            return _with_slopes(own)
+        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
+        across = [moments.of_masses(_moving(robot, i)[0], self.masses)[:, :2] for i in joints]
+        return _with_slopes(np.hstack([own, *across]))
+
+    def _torques(self, robot: Robot, readings: Floats, joints: Sequence[int]) -> Floats:
+        """Torque in each joint's own sense, of each load, shape (n, n_own), [N m] or [m/s^2]."""
+        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
+        columns = []
+        for i in joints:
+            place, e = _moving(robot, i)
+            if self.masses is not None:
+                each = [moments.of_masses(place, self.masses)]
+            else:
+                each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
+            columns += [e.sign * m[:, 2] for m in each]
+        return np.stack(columns, axis=1)
+
+
+@dataclass(frozen=True)
+class Bending(Effect):
+    """A base or column that bends: it turns by the moment of all masses about its origin.
+
+    Attributes:
+        masses: The masses on the arm.
+        gravity: In the base frame, shape (3,), [m/s^2].
+    """
+
+    masses: Sequence[Mass]
+    gravity: Sequence[float] = GRAVITY
+
+    def terms(self, robot: Robot) -> list[Term]:
+        place = robot.end_of(0) - 1
+        return [Term("base.bending", 1e-5, 0, place, axis) for axis in (Axis.RX, Axis.RY)]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
+        return _with_slopes(moments.of_masses(robot.end_of(0), self.masses)[:, :2])
+
+
+@dataclass(frozen=True)
+class Backlash(Effect):
+    """Half the dead zone of a gear, times the side that it lies on.
+
+    Attributes:
+        joints: The joints.
+        side: `moves`: sign of the last move, by the order of rows, 0 before the first; `load`: sign of the torque of
+            gravity by `masses`; else how the columns of the table begin: side for side1, side2, ...
+        masses: The masses on the arm, for `load`.
+    """
+
+    joints: Joints = "all"
+    side: str = "moves"
+    masses: Sequence[Mass] = ()
+
+    def terms(self, robot: Robot) -> list[Term]:
+        return [_own(robot, i, "backlash", 1e-3, -1) for i in _joints(robot, self.joints, "backlash")]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        joints = _joints(robot, self.joints, "backlash")
+        if self.side == "load":
+            return _with_slopes(np.sign(Compliance(self.masses)._torques(robot, readings, joints)))
+        return _with_slopes(context.get(self.side, np.zeros(readings.shape))[:, joints])
+
+    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+        if self.side == "load":
+            return {}
+        if self.side != "moves":
+            return {self.side: read([f"{self.side}{i + 1}" for i in range(robot.n_joints)])}
+        sides, moves = np.zeros(readings.shape), np.diff(readings, axis=0)
+        for k, move in enumerate(moves):
+            sides[k + 1] = np.where(np.abs(move) < LEAST_MOVE, sides[k], np.sign(move))
+        return {self.side: sides}
+
+
+@dataclass(frozen=True)
+class Coupling(Effect):
+    """A joint that turns with another one, as in wrists whose gears pass through each other.
+
+    Attributes:
+        pairs: Driving joint and joint that turns with it, numbers from 1: [(4, 5)] for theta5.coupling4.
+    """
+
+    pairs: Sequence[tuple[int, int]]
+
+    def _places(self, robot: Robot) -> list[list[int]]:
+        return [_joints(robot, pair, "coupling", sliding=True) for pair in self.pairs]
+
+    def terms(self, robot: Robot) -> list[Term]:
+        return [_own(robot, j, f"coupling{i + 1}", 1e-2, i) for i, j in self._places(robot)]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        return _with_slopes(readings[:, [i for i, _ in self._places(robot)]], 1.0)
+
+
+@dataclass(frozen=True)
+class Thermal(Effect):
+    """Links that grow and zeros that drift with a temperature.
+
+    Attributes:
+        reference: Temperature at which nominal values hold, in the unit of the column.
+        lengths: Whether lengths grow: value (1 + expansion (T - reference)).
+        zeros: Whether joint zeros drift.
+        column: The column of the temperature.
+    """
+
+    reference: float = 20.0
+    lengths: bool = True
+    zeros: bool = False
+    column: str = "temperature"
+
+    def _lengths(self, robot: Robot) -> list[tuple[int, int]]:
+        """Element and parameter of each length of the joints that is not zero."""
+        found = []
+        for i, e in enumerate(robot.elements):
+            if self.lengths and e.axis < Axis.RX and e.parameter is not None:
+                p = robot.parameters[e.parameter]
+                if 1 <= p.owner <= robot.n_joints and p.nominal != 0.0:
+                    found.append((i, e.parameter))
+        return found
+
+    def terms(self, robot: Robot) -> list[Term]:
+        terms = []
+        for i, k in self._lengths(robot):
+            p, e = robot.parameters[k], robot.elements[i]
+            frame, _, kind = p.name.rpartition(".")
+            name = f"{frame}.expansion_{kind}" if frame else f"{kind}.expansion"
+            terms.append(Term(name, 1e-4, p.owner, i, e.axis, e.sign))
+        joints = _joints(robot, "all", "thermal") if self.zeros else []
+        return terms + [_own(robot, i, "drift", 1e-4, -1) for i in joints]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        warmer = np.nan_to_num(context.get(self.column, np.full(len(readings), self.reference)) - self.reference)
+        lengths = [robot.parameters[k].nominal for _, k in self._lengths(robot)]
+        zeros = [1.0] * len(_joints(robot, "all", "thermal")) if self.zeros else []
+        return _with_slopes(warmer[:, None] * np.array([*lengths, *zeros]))
+
+    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+        return {self.column: read([self.column])[:, 0]}
+
+
+EFFECTS: Mapping[str, type[Effect]] = {
+    "error_curve": ErrorCurve,
+    "compliance": Compliance,
+    "base_bending": Bending,
+    "harmonics": Harmonics,
+    "gain": Gain,
+    "backlash": Backlash,
+    "coupling": Coupling,
+    "thermal": Thermal,
+}
+"""The effects by their keys in a robot file, in the order in which `select` tries them."""

@@ -1,0 +1,79 @@
+"""Error curves in the graph: eliminated as sparse states they give what a dense system, and GTSAM, give."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from fg_calib import Measurements, Options, Robot, build_problem, solve
+from fg_calib.graph import NormalSystem, prior_rows
+from fg_calib.graph.problem import square_root
+from fg_calib.robot import Compliance, ErrorCurve, Mass, build_chain, forward
+
+ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
+EFFECTS = (ErrorCurve([2, 3], knots=8, sigma=1e-3), Compliance([Mass(3, 10.0, (0.2, 0.0, 0.1))], [2, 3]))
+
+
+def problem_of(model="position", n=40, seed=0):
+    """An arm with error curves and compliance, measured."""
+    rng = np.random.default_rng(seed)
+    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE).with_effects(*EFFECTS)
+    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
+    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    q = rng.uniform(-2.5, 2.5, (n, 4))
+    p = forward(build_chain(true), true.trig(q)).position + 1e-4 * rng.normal(size=(n, 3))
+    data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
+    return build_problem(robot, data, Options(model=model, gauge="prior")), true
+
+
+def dense(problem, x):
+    """The normal system without the sparse elimination."""
+    v = problem.variables
+    r, J = prior_rows(v, x)
+    return NormalSystem(square_root(problem, x), v.n_columns, v.prior_scales, np.column_stack([J, r]))
+
+
+def test_sparse_elimination_gives_the_dense_system():
+    problem, _ = problem_of()
+    x = problem.start.copy()
+    x[: len(problem.robot.parameters)] += 1e-4 * np.random.default_rng(1).normal(size=len(problem.robot.parameters))
+    found, expected = problem.linearize(x), dense(problem, x)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-9)
+    assert found.decrement == pytest.approx(expected.decrement, rel=1e-9)
+    sigma = np.linalg.norm(expected.full_root, axis=1)
+    assert found.step / sigma == pytest.approx(expected.step / sigma, abs=1e-6)  # [sigma]
+    C, D = (s.full_root @ s.full_root.T / np.outer(sigma, sigma) for s in (found, expected))
+    assert pytest.approx(D, abs=1e-8) == C
+    assert np.array_equal(found.left.follow.shape, expected.left.follow.shape)
+
+
+@pytest.mark.parametrize("model", ["position", "distance"])
+def test_gtsam_agrees_on_optimum_and_covariance_of_curves(model):
+    problem, _ = problem_of(model)
+    solution = solve(problem)
+    problem = solution.problem
+    values = gtsam.LevenbergMarquardtOptimizer(problem.graph, solution.values).optimize()
+    marginals = gtsam.Marginals(problem.graph.linearize(values), values)
+    root = solution.system.full_root
+    curves = [v for v in problem.variables.nuisance if v.kind == "curve"]
+    assert [v.symbol for v in curves] == ["S(2)", "S(3)"]
+    assert {v.symbol for v in problem.variables.items} >= {"E(2)", "E(3)"}
+    for v in [*curves, *(v for v in problem.variables.items if v.letter == "E")]:
+        sigma = np.linalg.norm(root[v.columns], axis=1)
+        found, C = values.atVector(v.key), marginals.marginalCovariance(v.key)
+        assert solution.parameters[v.places] / sigma == pytest.approx(found / sigma, abs=2e-3)  # of GTSAM's stop
+        assert np.sqrt(np.diag(C)) == pytest.approx(sigma, rel=1e-4)
+
+
+def test_curves_and_compliance_are_within_their_sigmas():
+    squares = []
+    for seed in range(6):
+        problem, true = problem_of(seed=seed)
+        solution = solve(problem)
+        v = solution.problem.variables
+        columns = np.concatenate([np.r_[one.columns] for one in (*v.items, *v.nuisance)])
+        places = np.concatenate([one.places for one in (*v.items, *v.nuisance)])
+        e = solution.parameters[places] - true.nominal[places]
+        root = solution.system.full_root[columns]
+        squares.append(e @ np.linalg.pinv(root @ root.T, rcond=1e-12) @ e / root.shape[1])
+    assert np.mean(squares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (6 * root.shape[1])))  # 4 sigma of the mean
