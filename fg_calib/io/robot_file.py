@@ -99,36 +99,30 @@ def read_urdf(
         InputError: There is no such file, it is not a URDF, or the chain is not one of revolute, continuous,
             prismatic and fixed joints.
     """
-    if str(path).lstrip().startswith("<"):
-        raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
-    path = Path(path)
+    path = _checked_path(path)
     text, root = _parse(read_bytes(path), path.name)
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", model.frame_values("base", base), 0, False)
     try:
-        links = [link.get("name", "") for link in root.findall("link")]
-        tree = _Tree(_read_joints(root, path.name), links, path.name)
+        names = [link.get("name", "") for link in root.findall("link")]
+        tree = _Tree(_read_joints(root, path.name), names, path.name)
         base_link = tree.root() if base_link is None else tree.known(base_link)
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
-        zeros = model.ZEROS in listed("estimate", estimate)
         chain = tree.chain(base_link, tip_link)
-        n_joints = _add_chain(builder, chain, path.name, zeros)
+        n_joints = _add_chain(builder, chain, path.name, model.ZEROS in listed("estimate", estimate))
         if n_joints == 0:
             raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
     except InputError as error:  # elements of xacro may hold what is missing
         hint = _XACRO if any("xacro" in str(element.tag) for element in root.iter()) else error.hint
         raise InputError(error.place, error.found, error.expected, hint) from None
     builder.add_frame("tool", model.frame_values("tool", tool), n_joints + 1, False)
-    return _with_effects(
-        builder,
-        effects or {},
-        _links_of(root, tree, chain, base_link),
-        fixed=fixed,
-        estimate=estimate,
-        tolerance=tolerance,
-        urdf=UrdfSource(text, base_link, tip_link),
-        place=place or path.name,
-    )
+    choices = {
+        "fixed": fixed,
+        "estimate": estimate,
+        "tolerance": tolerance,
+        "urdf": UrdfSource(text, base_link, tip_link),
+    }
+    return _with_effects(builder, effects or {}, _links_of(root, tree, chain, base_link), place or path.name, **choices)
 
 
 def _links_of(root: Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base_link: str) -> dict[str, Any]:
@@ -173,6 +167,12 @@ def _with_effects(
     robot = builder.build(effects=read_effects(given, where, links, builder.n_joints), place=place, **choices)
     robot = replace(robot, select_effects=bool(given.get("select", False)))
     return with_coefficients(robot, coefficients, f"{where}: values")
+
+
+def _checked_path(path: Path | str) -> Path:
+    if str(path).lstrip().startswith("<"):
+        raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
+    return Path(path)
 
 
 _CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")

@@ -678,12 +678,7 @@ class RobotBuilder:
         Raises:
             InputError: A name that is neither a parameter nor, for tolerances, a kind.
         """
-        if len(self._joints) > MOST_JOINTS:
-            raise InputError(place, f"{len(self._joints)} joints", f"at most {MOST_JOINTS}")
-        for joint in self._joints:
-            if not joint.prismatic and np.isfinite([joint.lower, joint.upper]).all() and joint.upper > MOST_LIMIT:
-                limits = f"{joint.lower:g} to {joint.upper:g} rad"
-                _log.warning("%s: joint %s has limits of %s; are they in deg?", place, escaped(joint.name), limits)
+        self._check_joints(place)
         behind = len(self._joints) + 1
         if self._convention in CONVENTIONS and all(p.owner != behind for p in self._parameters):
             self.add_frame("tool", {}, behind, False)
@@ -694,11 +689,8 @@ class RobotBuilder:
         if ZEROS in estimate:
             estimate = tuple(name for name in estimate if name != ZEROS)
             free = {*robot.zero_names, *estimate}
-            fixed += tuple(
-                p.name
-                for p in robot.parameters
-                if 1 <= p.owner < behind and p.name not in free and p.kind not in EFFECT_KINDS
-            )
+            of_joints = names_of(robot.parameters[i] for owner in range(1, behind) for i in robot.owned_by(owner))
+            fixed += tuple(name for name in of_joints if name not in free)
         names = {p.name for p in robot.parameters}
         if len(names) < len(robot.parameters):
             twice = next(name for name, n in Counter(names_of(robot.parameters)).items() if n > 1).rpartition(".")[0]
@@ -715,6 +707,14 @@ class RobotBuilder:
             sigma = tolerance.get(p.name, tolerance.get(tolerance_kind(p) or "", p.tolerance))
             parameters.append(replace(p, estimated=estimated, tolerance=sigma))
         return replace(robot, parameters=tuple(parameters))
+
+    def _check_joints(self, place: str) -> None:
+        if len(self._joints) > MOST_JOINTS:
+            raise InputError(place, f"{len(self._joints)} joints", f"at most {MOST_JOINTS}")
+        for joint in self._joints:
+            if not joint.prismatic and np.isfinite([joint.lower, joint.upper]).all() and joint.upper > MOST_LIMIT:
+                limits = f"{joint.lower:g} to {joint.upper:g} rad"
+                _log.warning("%s: joint %s has limits of %s; are they in deg?", place, escaped(joint.name), limits)
 
     def _add_parameter(
         self, name: str, kind: str, owner: int, nominal: float, estimated: bool, joint: int | None = None
