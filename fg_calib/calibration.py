@@ -262,14 +262,7 @@ class Calibration(Record, repr=False, eq=False):
             known = _knowledge(nominal.with_values(values), result.carried.knowledge)
         estimated = set(result.noise_factors or ()).difference((*result.noise_kept, "joint"))
         degrees = sum(result.goodness[kind].expected for kind in sorted(estimated))
-        return Calibrated(
-            robot=nominal,
-            values=values,
-            knowledge=known,
-            options=result.options,
-            noise=result.carried.noise,
-            noise_degrees=degrees or None,
-        )
+        return Calibrated(nominal, values, known, result.options, result.carried.noise, degrees or None)
 
     @checked
     def check(

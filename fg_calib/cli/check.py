@@ -57,14 +57,9 @@ def update(
     io.require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
     before = calibration.Calibration.load(result)
     units = {name: p.unit for p in before.robot.parameters for name in (robot.tolerance_kind(p), p.name) if name}
+    drift, new = _growth(growth or (), units), changed or ()
     found = before.update(
-        table,
-        date=date,
-        growth=_growth(growth or (), units),
-        changed=changed or (),
-        anchors_stay=anchors_stay,
-        pairs=pairs,
-        like=like,
+        table, date=date, growth=drift, changed=new, anchors_stay=anchors_stay, pairs=pairs, like=like
     )
     found.save(out)
     show_calibration(found, as_json)

@@ -318,10 +318,5 @@ def _nominal(scenario: Scenario, readings: Mapping[str, Floats]) -> Scenario:
         elif "board" in INSTRUMENTS[i.model].labels and not (i.boards or i.fixed) and isinstance(views, BoardViews):
             changes["boards"] = {"board": views.board}
         instruments.append(replace(i, **changes))
-    return replace(
-        scenario,
-        errors=Errors("values", {}),
-        validation=None,
-        configurations=GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))),
-        instruments=tuple(instruments),
-    )
+    at, none = GivenReadings(readings.get("", np.zeros((0, scenario.robot.n_joints)))), Errors("values", {})
+    return replace(scenario, errors=none, validation=None, configurations=at, instruments=tuple(instruments))

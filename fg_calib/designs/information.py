@@ -196,13 +196,9 @@ def build_system(poses: PoseRows, given: Floats, task: Floats) -> System:
     # Functions of the arm that no undetermined direction has a share in.
     U, s, _ = np.linalg.svd(lost[:n_arm], full_matrices=True) if lost.shape[1] else (np.eye(n_arm), np.zeros(0), None)
     determined = U[:, int(np.sum(s > _UNDETERMINED_SHARE)) :]
-    return System(
-        rows=rows @ Q,
-        known=(before @ Q).T @ (before @ Q) + np.diag(weak),
-        task=Q[:n].T @ W @ Q[:n],
-        core=determined.T @ Q[:n_arm],
-        unknown=float(np.trace(lost.T @ W @ lost)) / total if total > 0.0 else 0.0,
-    )
+    known = (before @ Q).T @ (before @ Q) + np.diag(weak)
+    unknown = float(np.trace(lost.T @ W @ lost)) / total if total > 0.0 else 0.0
+    return System(rows @ Q, known, Q[:n].T @ W @ Q[:n], determined.T @ Q[:n_arm], unknown)
 
 
 # --- the task, and what is known after measuring ---
@@ -266,12 +262,9 @@ class Posterior(Brief):
         """Observability of the arm by the rows, without priors."""
         p, v = self.problem, self.problem.variables
         left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_robot_columns)
-        return observability_of_rows(
-            left.A @ v.tangent_derivative(p.start)[: v.n_robot_columns, : v.n_robot_columns],
-            p.estimated,
-            scales=np.array([p.robot.scale_of(one.unit) for one in p.estimated]),
-            n_measurements=self.n_measurements,
-        )
+        A = left.A @ v.tangent_derivative(p.start)[: v.n_robot_columns, : v.n_robot_columns]
+        scales = np.array([p.robot.scale_of(one.unit) for one in p.estimated])
+        return observability_of_rows(A, p.estimated, scales=scales, n_measurements=self.n_measurements)
 
 
 def count_measurements(problem: Problem) -> int:

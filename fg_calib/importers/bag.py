@@ -273,17 +273,10 @@ def average_stops(
         raise InputError(f"topic {poses.source.topic}", f"no stop of {len(spans)} can be used", hint=hint)
     means, residuals = ({kind: [stops[k][kind][part] for k in good] for kind in stops[good[0]]} for part in (0, 1))
     scatter, sigmas = _scatter(residuals)
-    return Stops(
-        ids=tuple(f"stop{k + 1}" for k in good),
-        interval=np.array([spans[k] for k in good]),
-        samples=np.array([float(len(one)) for one in residuals["position"]]),
-        means={kind: np.array(each) for kind, each in means.items()},
-        sigmas=sigmas,
-        skipped=skipped,
-        offset=estimate,
-        applied=applied,
-        scatter=scatter,
-    )
+    ids, interval = tuple(f"stop{k + 1}" for k in good), np.array([spans[k] for k in good])
+    samples = np.array([float(len(one)) for one in residuals["position"]])
+    mean = {kind: np.array(each) for kind, each in means.items()}
+    return Stops(ids, interval, samples, mean, sigmas, skipped, estimate, applied, scatter)
 
 
 def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tuple[float, float]]:

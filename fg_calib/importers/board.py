@@ -487,14 +487,10 @@ def _camera_sigmas(
 def _view(one: Corners, fit: _Fit, of_all: float, taken: float) -> View:
     """The board in an image, by its own variance with the weight of some residuals of all images'."""
     variance = (fit.squares + PRIOR_RESIDUALS * of_all) / (len(fit.J) - taken + PRIOR_RESIDUALS)
-    return View(
-        *one,
-        *fit.pose,
-        rms=float(np.sqrt(fit.squares / len(fit.J))),
-        sigma=float(np.sqrt(variance)),
-        covariance=np.asarray(variance * np.linalg.inv(fit.J.T @ fit.J), dtype=np.float64),
-        ambiguous=fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance,
-    )
+    rms, sigma = float(np.sqrt(fit.squares / len(fit.J))), float(np.sqrt(variance))
+    covariance = np.asarray(variance * np.linalg.inv(fit.J.T @ fit.J), dtype=np.float64)
+    ambiguous = fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance
+    return View(*one, *fit.pose, rms, sigma, covariance, ambiguous)
 
 
 def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:

@@ -109,14 +109,8 @@ class _JobKeys(_TableKeys):
         """
         choices = {key: getattr(self, key) for key in (*_CHOICES, "frame") if key in self.model_fields_set}
         inputs.check_names("prefer", choices.get("prefer", ()), names_of(robot.parameters))
-        return Options.of(
-            **choices,
-            model=model,
-            estimate_noise=estimate_noise,
-            estimate_tolerance=self.tolerance.estimate,
-            pairing=pairing_of(self.pairing),
-            accept=_limits(self.accept, self.units),
-        )
+        choices |= {"pairing": pairing_of(self.pairing), "accept": _limits(self.accept, self.units), "model": model}
+        return Options.of(**choices, estimate_noise=estimate_noise, estimate_tolerance=self.tolerance.estimate)
 
 
 _CHECKED_LATER: dict[str, Any] = dict.fromkeys(_CHOICES, (Any, None))

@@ -53,13 +53,8 @@ def _flat(found: Identifiability, handler: Any) -> dict[str, Any]:
     document = handler(found)
     o = found.observability
     classes = {name: o.named(name) for name in ("independent", "ineffective")} | {"kept": o.kept}
-    return {
-        "schema": OBSERVABILITY_SCHEMA,
-        "n_parameters": len(o.names),
-        **classes,
-        **document.pop("observability"),
-        **document,
-    }
+    head = {"schema": OBSERVABILITY_SCHEMA, "n_parameters": len(o.names)}
+    return {**head, **classes, **document.pop("observability"), **document}
 
 
 Observability = Annotated[

@@ -204,14 +204,9 @@ def linearise_new_data(at: Placed) -> Linear:
     fitted = diagnostics.basis_of(np.vstack([J @ directions, of_known, J_priors @ directions]))
     r = np.concatenate([r, np.zeros(len(information)), r_priors])
     n_given = len(information) + len(r_priors)
-    return Linear(
-        placed=at,
-        left=r - fitted @ (fitted.T @ r),
-        fitted=fitted,
-        of_arm=J[:, : v.n_robot_columns],
-        dof=problem.n_independent + n_given - fitted.shape[1],
-        n_free=fitted.shape[1] - n_given,
-    )
+    n_free = fitted.shape[1] - n_given
+    left, dof = r - fitted @ (fitted.T @ r), problem.n_independent - n_free
+    return Linear(at, left, fitted, J[:, : v.n_robot_columns], dof, n_free)
 
 
 def ends_of_rows(problem: graph.Problem) -> Integers:

@@ -393,12 +393,9 @@ class Measuring:
         image, seen = project(i.camera, points)
         k, which, corner = np.nonzero(seen & faced[:, :, None])
         self._require_seen(k)
-        m = self.rows(
-            k,
-            labels={} if i.fixed else {"board": Labels(tuple(boards), which)},
-            image=np.hstack([image[k, which, corner] + self.noise("pixel", len(k), 2), i.corners[corner]]),
-            sigmas={"pixel": self.sigma("pixel", len(k), 2)},
-        )
+        labels = {} if i.fixed else {"board": Labels(tuple(boards), which)}
+        uv = np.hstack([image[k, which, corner] + self.noise("pixel", len(k), 2), i.corners[corner]])
+        m = self.rows(k, labels=labels, image=uv, sigmas={"pixel": self.sigma("pixel", len(k), 2)})
         frame: FrameKnowledge = "unknown" if i.fixed else "known"
         table = Table(m, "pixels", frame=frame, camera=i.camera, fixed_camera=i.fixed)
         return table, {"frames" if i.fixed else "boards": boards}

@@ -141,15 +141,10 @@ def cross_validate(
         parts.setdefault((one.table, one.kind), []).append(one)
     by_table = tuple(pooled(some, table) for (table, _), some in parts.items())
     jackknife = np.sqrt((n - 1) * np.var(estimates, axis=0)).tolist()
-    return CrossValidation(
-        n=n,
-        fold=fold,
-        by_table=by_table,
-        kinds={kind: pooled([one for one in by_table if one.kind == kind]) for _, kind in parts},
-        of_pairs=any(table.uses_pairs for table in data.tables),
-        spread={p.name: s for p, s in zip(job.robot.parameters, jackknife, strict=True)},
-        not_converged=n - sum(converged),
-    )
+    kinds = {kind: pooled([one for one in by_table if one.kind == kind]) for _, kind in parts}
+    of_pairs = any(table.uses_pairs for table in data.tables)
+    spread = {p.name: s for p, s in zip(job.robot.parameters, jackknife, strict=True)}
+    return CrossValidation(n, fold, by_table, kinds, of_pairs, spread, n - sum(converged))
 
 
 def _calibrated(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Floats, tuple[HeldOut, ...], bool]:

@@ -270,13 +270,6 @@ def _joint_errors(solution: graph.Solution) -> JointErrors | None:
         studentised = np.where(share > LEAST_SHARE, error / (sigma * np.sqrt(share)), np.nan)
     size = np.nan_to_num(np.abs(studentised))
     worst = np.argsort(-size, axis=None)[: int(np.sum(size > suspect_level(studentised.size)))]
-    return JointErrors(
-        configurations=rows,
-        joints=joints,
-        names=tuple(problem.robot.joints[j].name for j in joints),
-        reading=data.readings[np.ix_(rows, joints)],
-        error=error,
-        sigma=sigma,
-        studentised=studentised,
-        suspects=tuple((int(i), int(k)) for i, k in zip(*np.unravel_index(worst, size.shape), strict=True)),
-    )
+    suspects = tuple((int(i), int(k)) for i, k in zip(*np.unravel_index(worst, size.shape), strict=True))
+    names, reading = tuple(problem.robot.joints[j].name for j in joints), data.readings[np.ix_(rows, joints)]
+    return JointErrors(rows, joints, names, reading, error, sigma, studentised, suspects)

@@ -319,15 +319,10 @@ def judge_priors(solution: graph.Solution, spread: Spread) -> PriorFit | None:
         return None
     chi2, expected, square = float(z @ z), float(np.trace(A)), float(np.sum(A * A))
     nu = expected**2 / square if expected > 1e-9 else 0.0
-    return PriorFit(
-        names=names,
-        z=z,
-        sigma=np.sqrt(np.maximum(np.diag(A), 0.0)),
-        chi2=chi2,
-        expected=max(expected, 0.0),
-        p_value=float(special.gammaincc(nu / 2.0, nu / 2.0 * chi2 / expected)) if nu else None,
-        beyond=tuple(_beyond(names, z, A, len(_prior_parameters(solution.problem.variables)))),
-    )
+    sigma = np.sqrt(np.maximum(np.diag(A), 0.0))
+    p_value = float(special.gammaincc(nu / 2.0, nu / 2.0 * chi2 / expected)) if nu else None
+    beyond = tuple(_beyond(names, z, A, len(_prior_parameters(solution.problem.variables))))
+    return PriorFit(names, z, sigma, chi2, max(expected, 0.0), p_value, beyond)
 
 
 def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats]:
