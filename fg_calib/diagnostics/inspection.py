@@ -310,10 +310,10 @@ def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
     for t in found.tables:
         text = f"{t.name}: rows that are exact copies of others: {t.n_copies} ({t.copy}); each counts as one more"
         yield Statement("note", f"{text} measurement: remove it", t.n_copies)
-        text = (
-            f"{t.name}: readings repeated under another id: {t.n_renamed}; where the arm stood still, give one id: such"
-        )
-        yield Statement("note", f"{text} rows share their joint errors", t.n_renamed and not t.n_copies)
+        shares = t.model == "pixels" or set(t.labels).difference(["station", "contact point"])
+        text = f"{t.name}: readings repeated under another id: {t.n_renamed}; their joint errors count as independent:"
+        text += f" where the arm stood still, {'give one id' if shares else 'average the rows'}"
+        yield Statement("note", text, t.n_renamed and not t.n_copies)
         text = f"{t.name}: test rows at configurations of train rows, no check of a prediction: {t.n_leaked}"
         yield Statement("note", text, t.n_leaked)
     text = "is to be estimated: sigmas and accuracy here are for what is specified, or 1 mm and 1 mrad"

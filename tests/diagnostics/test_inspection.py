@@ -165,8 +165,8 @@ def test_copies_of_rows_are_distinguished_from_repeats(arm):
     assert caution.startswith(f"measurements: {copies}")
     assert (found.tables[0].n_copies, found.tables[0].n_repeats) == (1, 0)
     repeated = inspected(arm, replace(again, position=plus(again.position, [50], 1e-5)))
-    text = "readings repeated under another id: 1; where the arm stood still, give one id: such rows share their joint"
-    assert text in said(repeated)[0]
+    text = "measurements: readings repeated under another id: 1; their joint errors count as independent: where the arm"
+    assert said(repeated) == (f"{text} stood still, average the rows",)
     assert (repeated.tables[0].n_copies, repeated.tables[0].n_repeats) == (0, 1)
 
 
