@@ -53,6 +53,7 @@ class Design(FrozenArrays, repr=False):
         group: The one instrument that measures at each; "" for all that share their configurations.
         expected: Expected errors of the tool over the task, with these and what was given.
         after_fit: Expected errors after the best rigid fit, where `expected` is in the base frame; else None.
+        known_tool: Expected errors if the tool were known.
         before: Expected errors with what was given alone; None without it.
         random: Median of the expected position errors of as many random poses, [m].
         curve: Expected errors by the number of poses.
@@ -74,6 +75,7 @@ class Design(FrozenArrays, repr=False):
     group: NDArray[np.str_]
     expected: prediction.PoseRms
     after_fit: prediction.PoseRms | None
+    known_tool: prediction.PoseRms
     before: prediction.PoseRms | None
     random: float
     curve: tuple[CurvePoint, ...]
@@ -254,6 +256,7 @@ def design_from_pool(
         group=pool.groups_of(configurations),
         expected=expected,
         after_fit=None if task.fitted else posterior.error(replace(task, fitted=True)),
+        known_tool=posterior.with_known_tool().error(task),
         before=before,
         random=curve[-1].random[1],
         curve=(*curve[:-1], replace(curve[-1], designed=error)),

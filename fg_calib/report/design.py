@@ -30,7 +30,7 @@ def design_document(design: Design) -> dict[str, Any]:
     return report.tables.document_of(
         "design",
         design,
-        "criterion n target reached expected before random travel",
+        "criterion n target reached expected known_tool before random travel",
         robot=design.pool.robot.name,
         n_given=len(design.pool.given),
         fitted=design.task.fitted,
@@ -108,6 +108,9 @@ def _notes(design: Design) -> Iterator[str]:
         yield "more poses (--n, --candidates), lower noise, other measurements or a wider range of poses would reach it"
     if design.asked is not None and design.n < design.asked:
         yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
+    if (design.known_tool.position or math.inf) < 0.5 * (design.expected.position or math.inf):
+        remedy = "measure its own point (leave `target` empty), or specify a smaller prior sigma"
+        yield f"most of it is the tool: were it known, {_pose(design.known_tool)}; {remedy}"
     if design.after_fit is not None and (design.after_fit.position or math.inf) < 0.5 * (design.expected.position or 0):
         best_fit = f"after the best rigid fit {_pose(design.after_fit)}"
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"

@@ -25,7 +25,7 @@ TABLE = {"normal": [0.0, 0.0, 1.0], "distance": -100.0}
 
 DOCUMENT = {
     "schema", "version", "robot", "criterion", "n", "n_given", "target", "reached", "fitted", "expected", "before",
-    "random", "undetermined_share", "curve", "candidates", "stops", "undetermined", "travel",
+    "known_tool", "random", "undetermined_share", "curve", "candidates", "stops", "undetermined", "travel",
     "travel_unordered",
 }  # fmt: skip
 FEW = ("--candidates", 25)

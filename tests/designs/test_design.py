@@ -14,6 +14,8 @@ from fg_calib.designs.information import Posterior
 from fg_calib.graph import square_root
 from fg_calib.measurements import Noise
 from fg_calib.prediction import errors_at
+from fg_calib.report.design import build_design_report
+from fg_calib.report.tables import plain_text
 from fg_calib.robot import pose
 from fg_calib.simulation.obstacles import enters
 from fg_calib.simulation.scenario import Box, Errors, GivenReadings, Instrument, Plane, RandomReadings, Spot
@@ -62,6 +64,18 @@ def test_expected_errors_are_those_of_a_calibration_of_the_poses(kind):
 
 
 # --- given, targets, what is undetermined -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("targets", "words"), [(3, "most of it is the tool: were it known, 2."), (None, "")])
+def test_a_tool_that_no_pose_determines_is_named_with_the_error_were_it_known(targets, words):
+    instrument, of_tool = Instrument(model="position", name="it", targets=targets), ["tool.x", "tool.y", "tool.z"]
+    robot, without = small_arm(tolerance=TOLERANCE, estimate=of_tool), small_arm(tolerance=TOLERANCE)
+    plan = design(scenario(instrument, n=20, noise=NOISE, robot=robot), n=12, n_candidates=40, fitted=True)
+    known = error_of(without, plan.tables, plan.task)
+    assert plan.known_tool.position == pytest.approx(known.position, rel=1e-4)
+    said = plain_text(build_design_report(plan), 1000)
+    assert words in said
+    assert ("most of it is the tool" in said) == bool(words)
 
 
 def test_given_poses_count_and_are_not_to_be_measured_again():
