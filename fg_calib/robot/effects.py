@@ -112,7 +112,7 @@ class Harmonics(Effect):
     def __post_init__(self) -> None:
         super().__post_init__()
         for order in self.orders:
-            check_number("harmonics: orders", order, above=True)
+            check_number("orders", order, above=True)
 
     def terms(self, robot: Robot) -> list[Term]:
         names = [(f"{m:.9g}".replace(".", "_"), f) for m in self.orders for f in ("sin", "cos")]
@@ -143,7 +143,7 @@ class ErrorCurve(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_number("error_curve: knots", self.knots, least=4.0, whole=True)
+        check_number("knots", self.knots, least=4.0, whole=True)
 
     def terms(self, robot: Robot) -> list[Term]:
         joints, sigma = _joints(robot, self.joints, "error_curve"), self.sigma or 5e-4

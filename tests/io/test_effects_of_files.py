@@ -1,0 +1,122 @@
+"""The key `effects` of robot files: read, written and read back, masses of URDFs in their places."""
+
+import numpy as np
+import pytest
+
+from fg_calib import InputError
+from fg_calib.io import read_robot, write_robot
+from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass
+
+HEAD = """\
+name: arm
+convention: dh
+units: {length: mm, angle: deg}
+joints:
+  - {a: 100, alpha: 90, d: 300, theta: 0}
+  - {a: 500, alpha: 20, d: 0, theta: 0}
+  - {a: 300, alpha: 70, d: 100, theta: 30}
+tool: {z: 100}
+"""
+EFFECTS = """\
+effects:
+  compliance:
+    joints: [2, 3]
+    masses: {2: {mass: 12.0, com: [0.3, 0, 0.1]}, 3: {mass: 4.0}}
+    payload: {mass: 2.0, com: [0, 0, 0.06]}
+  harmonics: {orders: [1, 2.5]}
+  gain: true
+  error_curve: {knots: 8, joints: [2]}
+  backlash: {side: moves}
+  coupling: [[2, 3]]
+  thermal: {reference: 21, zeros: true}
+  base_bending: true
+  values: {theta2.compliance: 1.5e-5, theta2.curve: [1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4, 7e-4, 8e-4]}
+"""
+LINK = '<link name="{name}"><inertial><origin xyz="{com}"/><mass value="{mass}"/></inertial></link>'
+ENDS = '<parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
+JOINT = f'<joint name="{{name}}" type="{{kind}}">{ENDS}</joint>'
+
+
+@pytest.fixture
+def read(tmp_path):
+    def of(text):
+        (tmp_path / "robot.yaml").write_text(text)
+        return read_robot(tmp_path / "robot.yaml")
+
+    return of
+
+
+def test_effects_are_read_with_their_options(read):
+    robot = read(HEAD + EFFECTS)
+    compliance, harmonics = robot.effects[:2]
+    assert compliance == Compliance([Mass(2, 12.0, (0.3, 0.0, 0.1)), Mass(3, 4.0), Mass(3, 2.0, (0, 0, 0.06))], [2, 3])
+    assert harmonics == Harmonics([1, 2.5])
+    assert robot.effects[3] == ErrorCurve([2], knots=8)
+    values = {p.name: p.nominal for p in robot.parameters}
+    assert (values["theta2.compliance"], values["theta2.curve[6]"], values["theta3.sin2_5"]) == (1.5e-5, 7e-4, 0.0)
+
+
+def test_a_robot_with_effects_is_written_and_read_back(read, tmp_path):
+    robot = read(HEAD + EFFECTS)
+    write_robot(tmp_path / "again.yaml", robot)
+    again = read_robot(tmp_path / "again.yaml")
+    q = np.random.default_rng(0).uniform(-2, 2, (5, 3))
+    assert again.nominal == pytest.approx(robot.nominal, abs=1e-15)
+    assert again.trig(q) == pytest.approx(robot.trig(q), abs=1e-12)  # masses on one link are one
+
+
+def test_select_stands_for_the_standard_effects(read):
+    robot = read(HEAD + "effects: select\n")
+    assert robot.select_effects
+    assert [type(e).__name__ for e in robot.effects] == ["ErrorCurve", "Compliance", "Harmonics", "Gain"]
+
+
+def test_masses_of_a_urdf_are_where_its_links_are(tmp_path):
+    """A mass behind a fixed joint, and axes that are not z: torques by the potential of all links."""
+    from yourdfpy import URDF
+
+    com = {"base": "0 0 0.1", "upper": "0.1 0.02 0.3", "bracket": "0.01 0 0.05", "fore": "0.2 0.1 0"}
+    mass = {"base": 9.0, "upper": 5.0, "bracket": 0.7, "fore": 2.0}
+    joints = [
+        ("shoulder", "revolute", "base", "upper", "0 0 0.4", "0.3 0.2 0.1", "0 1 0"),
+        ("mount", "fixed", "upper", "bracket", "0.1 0.2 0.3", "0.5 0.1 -0.4", "1 0 0"),
+        ("elbow", "revolute", "upper", "fore", "0.5 0 0.1", "-0.2 0.7 0.1", "0.6 0 0.8"),
+    ]
+    names = ("name", "kind", "parent", "child", "xyz", "rpy", "axis")
+    text = "".join(LINK.format(name=n, com=com[n], mass=mass[n]) for n in com)
+    text += "".join(JOINT.format(**dict(zip(names, joint, strict=True))) for joint in joints)
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
+    (tmp_path / "robot.yaml").write_text("urdf: arm.urdf\ntip_link: fore\neffects: {compliance: true}\n")
+    robot, q = read_robot(tmp_path / "robot.yaml"), np.array([[0.4, -0.9], [1.0, 0.3]])
+    assert [p.name for p in robot.parameters if p.kind == "compliance"] == ["shoulder.compliance", "elbow.compliance"]
+    urdf = URDF.load(str(tmp_path / "arm.urdf"), load_meshes=False, build_scene_graph=True)
+
+    def potential(readings):
+        urdf.update_cfg(dict(zip(("shoulder", "elbow"), readings, strict=True)))
+        points = {n: urdf.get_transform(n, "base") @ [*map(float, com[n].split()), 1.0] for n in com}
+        return -9.81 * sum(mass[n] * points[n][2] for n in com)
+
+    found = robot.effects[0].values(robot.geometry, q, {}, np.zeros(2))[:, :, 0]
+    for row, torque in zip(q, found, strict=True):
+        expected = [(potential(row + h) - potential(row - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
+        assert torque == pytest.approx(expected, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("effects", "said"),
+    [
+        ("{gain: true, harmonic: true}", "effects: unknown key 'harmonic'"),
+        ("{compliance: true}", "effects: compliance: no masses, expected `masses: free`, or the mass and com"),
+        ("{compliance: {masses: {7: {mass: 1}}}}", "masses: 7: no link '7', expected one of 0, 1, 2, 3"),
+        ("{compliance: {masses: {2: {mass: -1}}}}", "effects: compliance: masses: 2: mass: found -1"),
+        ("{harmonics: {joints: [4]}}", "harmonics: joints: found 4, expected joints that turn, of 1, 2, 3"),
+        ("{harmonics: {order: [1]}}", "effects: harmonics: unknown key 'order', expected one of orders, joints"),
+        ("{error_curve: {knots: 2}}", "effects: error_curve: knots: found 2"),
+        ("{gain: true, values: {theta9.gain: 1}}", "effects: values: arm: no parameter 'theta9.gain'"),
+        ("{gain: true, values: {theta1.gain: [1, 2]}}", "effects: values: theta1.gain: 2 figures, expected one"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_effects_is_said_in_one_line(read, effects, said):
+    with pytest.raises(InputError) as found:
+        read(f"{HEAD}effects: {effects}\n")
+    assert said in str(found.value)
