@@ -188,7 +188,8 @@ def draw_groups(scenario: Scenario, n: int, generator: np.random.Generator) -> d
     found = {name: draw(robot, of, generator, n, "candidates") for name, of in groups.items()}
     for one in found.values():
         if not len(one.readings):
-            raise InputError("candidates", f"none in {one.reasons()}", "some that the arm can take")
+            hint = "is the base itself in a box of keep_out?" * (one.rejected.get("in keep_out") == one.asked)
+            raise InputError("candidates", f"none in {one.reasons()}", "some that the arm can take", hint)
     return found
 
 

@@ -400,8 +400,10 @@ def _fit(problem: Problem, options: SolverOptions) -> Solution:
             )
     if not message:
         converged = here.system.decrement <= NEAR_ENOUGH
-        spent = f"{options.max_iterations} iterations, {here.system.decrement:.1e} sigma left to go"
-        message = f"{'converged' if converged else 'not converged'}: {spent}"
+        most = f"{options.max_iterations} iterations, the most allowed"
+        left_to_go = f"{here.system.decrement:.1e} sigma"
+        message = f"not converged: {most}, and {left_to_go} left to go"
+        message = f"converged: {left_to_go} from the optimum after {most}" if converged else message
     if converged and here.rounding > NEAR_ENOUGH:
         hidden = f"rounding hides the optimum, by {here.rounding:.0e} sigma"
         converged, message = False, f"not converged: {hidden}: noise, tolerances or lengths are out of all proportion"

@@ -47,9 +47,23 @@ class _Point(Schema):
     tolerance: Positive | None = None
 
 
+FAR_AWAY = 1e9
+"""Where nothing is, in any unit of length."""
+
+
+def corners_of(given: Any) -> Any:
+    """A box as `{lower: [x, y, z], upper: [x, y, z]}`, where it is `{box: [lower, upper]}` or `{below: z}`."""
+    match given:
+        case {"below": z, **others} if not others:
+            return {"lower": [-FAR_AWAY] * 3, "upper": [FAR_AWAY, FAR_AWAY, z]}
+        case {"box": [lower, upper], **others} if not others:
+            return {"lower": lower, "upper": upper}
+    return given
+
+
 class _KeepOut(Schema):
-    below: Number | None = None
-    box: tuple[tuple[Number, Number, Number], tuple[Number, Number, Number]] | None = None
+    lower: tuple[Number, Number, Number]
+    upper: tuple[Number, Number, Number]
 
 
 class _Tolerances(Schema):
@@ -81,9 +95,6 @@ class _Entry(_TableKeys):
 _CHOICES = ("prior", "gauge", "prefer", "pair_errors", "encoder", "loss", "max_iterations", "folds")
 """Keys of a job that `Options` checks as they stand."""
 
-FAR_AWAY = 1e9
-"""Where nothing is, in any unit of length."""
-
 _OF_THE_ROBOT = ("robot", "estimate", "truth", "prior", "gauge", "prefer", "folds")
 """Keys of a job that say nothing of how a table is read."""
 
@@ -96,7 +107,7 @@ class _JobKeys(_TableKeys):
     truth: FilePath | None = None
     targets: Mapping[str, _Point] = Field(default_factory=dict)
     anchors: Mapping[str, _Point] = Field(default_factory=dict)
-    keep_out: tuple[_KeepOut, ...] = ()
+    keep_out: tuple[Annotated[_KeepOut, BeforeValidator(corners_of)], ...] = ()
     tolerance: Annotated[
         _Tolerances, BeforeValidator(lambda one: {"estimate": "kind"} if one == "estimate" else one or {})
     ] = _Tolerances()
@@ -164,9 +175,9 @@ def _read_job(path: Path) -> Job:
 
 def _box(given: _KeepOut, units: Units, place: str) -> Floats:
     """Lower and upper corner of a box, shape (2, 3), [m]."""
-    corners = np.array([[-FAR_AWAY] * 3, [FAR_AWAY, FAR_AWAY, given.below]] if given.box is None else given.box, float)
-    if (given.below is None) == (given.box is None) or not np.all(corners[0] < corners[1]):
-        found = yaml.shown(given.model_dump(exclude_none=True))
+    corners = np.array([given.lower, given.upper])
+    if not np.all(corners[0] < corners[1]):
+        found = yaml.shown(given.model_dump())
         raise InputError(place, f"found {found}", "{below: z}, or {box: [lower, upper]} of x, y and z each")
     return corners * units.factor("m")
 

@@ -286,7 +286,9 @@ class Conditions:
             as its share of the arm's reach. None: any.
     """
 
-    keep_out: tuple[Box, ...] = Field(default=(), kw_only=True)
+    keep_out: tuple[Annotated[Box, _in_file(lambda given, _: io.corners_of(given))], ...] = Field(
+        default=(), kw_only=True
+    )
     apart: PositiveAngle | None = Field(default=None, kw_only=True)
 
 

@@ -24,7 +24,7 @@ Draw = Callable[[int, int], tuple[Floats, Words]]
 """Draws n configurations after m others, shape (n, n_joints), with why each is rejected, "" where it is not."""
 
 REASONS = (
-    *("outside the joint limits", "not seen", "out of range", "outside the region", "out of reach", "in a box"),
+    *("outside the joint limits", "not seen", "out of range", "outside the region", "out of reach", "in keep_out"),
     "near another",
 )
 """Why a configuration, or a pose, is rejected; of several reasons the first."""
@@ -62,7 +62,7 @@ class Candidates(FrozenArrays):
     rejected: Mapping[str, int]
 
     def reasons(self) -> str:
-        """Reasons of rejection, of all that were drawn: `1000 drawn: 83 % out of reach, 9.1 % in a box`."""
+        """Reasons of rejection, of all that were drawn: `1000 drawn: 83 % out of reach, 9.1 % in keep_out`."""
         shares = (f"{float(f'{100.0 * n / self.asked:.2g}'):g} % {reason}" for reason, n in self.rejected.items())
         return f"{self.asked} drawn: {', '.join(shares) or 'none rejected'}"
 
@@ -102,7 +102,7 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
         k = int(1.1 * (n - len(taken)) / share) + 10 if asked else min(n, MAX_DRAWN_IN_VAIN)
         readings, reason = draw(min(k, MAX_DRAWN_AT_ONCE, most - asked), asked)
         good = np.flatnonzero(reason == "")
-        reason[good[enters(robot, readings[good], of.keep_out)]] = "in a box"
+        reason[good[enters(robot, readings[good], of.keep_out)]] = "in keep_out"
         good = np.flatnonzero(reason == "")
         reason[good[_near(taken / unit, readings[good] / unit, of.apart)]] = "near another"
         good = np.flatnonzero(reason == "")[: n - len(taken)]

@@ -90,6 +90,13 @@ def test_a_full_job_is_converted_to_si(folder):
     assert job.inputs["pairs.csv"] == sha256(folder / "pairs.csv")
 
 
+def test_boxes_to_keep_out_of_are_read_in_every_form(folder):
+    forms = "{lower: [0, 0, 0], upper: [1, 1, 2]}, {box: [[0, 0, 0], [1, 1, 2]]}, {below: 3}"
+    boxes = read(folder, f"{JOB}units: {{length: mm}}\nkeep_out: [{forms}]\n").keep_out
+    both, below = [[[0, 0, 0], [1e-3, 1e-3, 2e-3]]] * 2, [[-1e6] * 3, [1e6, 1e6, 3e-3]]
+    assert [box.tolist() for box in boxes] == [*both, below]
+
+
 def test_tables_have_columns_of_their_own_names(folder):
     """For all tables at the top, or in a table's own entry; figures are in the table's units after their scale."""
     (folder / "robots" / "robot.yaml").write_text(ROBOT.replace("joints", "units: {angle: deg}\njoints"))

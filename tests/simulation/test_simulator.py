@@ -129,7 +129,7 @@ def test_configurations_that_are_not_to_be_had_are_reported(shipped):
     hint = "ask for fewer, or relax their conditions"
     for of, message in (
         (replace(shipped, configurations=RandomReadings(2, keep_out=everywhere)),
-         f"configurations: 0 of 2 found in 40 drawn: 100 % in a box; {hint}"),
+         f"configurations: 0 of 2 found in 40 drawn: 100 % in keep_out; {hint}"),
         (near, f"validation: 1 of 2 found in 2 drawn: 50 % near another; {hint}"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"^space-robot: {message}$"):
