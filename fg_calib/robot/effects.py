@@ -40,7 +40,7 @@ Joints = Literal["all"] | Sequence[int]
 """Numbers of joints from 1; all that turn, for gains all."""
 
 LEAST_MOVE = 1e-4
-"""Smallest move that takes a gear to its other side, [rad]."""
+"""Smallest move that takes a gear to its opposite flank, [rad]."""
 
 GRAVITY = (0.0, 0.0, -9.81)
 """Of a base that stands upright, [m/s^2]."""
@@ -266,7 +266,7 @@ class Compliance(Effect):
 
 @dataclass(frozen=True)
 class Bending(Effect):
-    """A base or column that bends: it turns by the moment of all masses about its origin.
+    """Bending of a base or column: it turns by the moment of all masses about its origin.
 
     Attributes:
         masses: The masses on the arm.

@@ -1,7 +1,6 @@
 """`docs/architecture.md` adds an instrument and an effect of joints: applied to a copy, they work from end to end."""
 
 import json
-import math
 import os
 import re
 import shutil
@@ -14,7 +13,6 @@ import yaml
 
 import fg_calib
 
-DEG = math.pi / 180.0
 PAGE = Path(__file__).resolve().parents[2] / "docs/architecture.md"
 
 ROBOT = """\
@@ -23,9 +21,10 @@ convention: dh
 units: {length: m, angle: deg}
 joints:
   - {a: 0.02, alpha: 90, d: 0.3, theta: 0, limits: [-170, 170]}
-  - {a: 0.40, alpha: 20, d: 0.0, theta: 0, limits: [-170, 170], gain: 0, wave: 0}
-  - {a: 0.30, alpha: 70, d: 0.1, theta: 30, limits: [-170, 170], gain: 0, wave: 0.2}
-tolerance: {a: 0.001, d: 0.001, alpha: 0.5, theta: 0.5, gain: 0.002, wave: 0.1}
+  - {a: 0.40, alpha: 20, d: 0.0, theta: 0, limits: [-170, 170]}
+  - {a: 0.30, alpha: 70, d: 0.1, theta: 30, limits: [-170, 170]}
+tolerance: {a: 0.001, d: 0.001, alpha: 0.5, theta: 0.5, gain: 0.002, square: 0.001}
+effects: {gain: {joints: [2, 3]}, square: {joints: [2, 3]}, harmonics: {joints: [3]}}
 """
 
 SCENARIO = """\
@@ -41,7 +40,7 @@ instruments:
 
 
 def extend(root):
-    """A package with what the page adds to it, and an effect like its gain whose unit is rad: a wave."""
+    """A package with what the page adds to it."""
     text = PAGE.read_text()
     name, module = re.search(r"^```python\n# (\S+)\n(.*?)^```$", text, flags=re.S | re.M).groups()
     (root / name).write_text(module)
@@ -50,8 +49,6 @@ def extend(root):
             source = (root / name).read_text()
             assert source.count(before) == 1, f"{name}: {before}"
             added = re.sub(r"^\+", "", more, flags=re.M)
-            if "gain" in added:
-                added += added.replace("gain", "wave").replace('"1"', '"rad"').replace('"reading"', '"sin"')
             (root / name).write_text(source.replace(before, before + added))
 
 
@@ -83,18 +80,20 @@ def test_a_new_instrument_and_a_new_effect_are_calibrated_and_reported(run):
     assert result["residual_rms"]["test"]["inclination"]["after"] < 2.5e-4  # 0.01 deg are 1.75e-4 rad
     assert result["residual_rms"]["test"]["inclination"]["before"] > 1e-3
     found = {p["name"]: p for p in result["parameters"]}
-    true = yaml.safe_load((folder / "simulated/robot_true.yaml").read_text())["joints"]
-    calibrated = yaml.safe_load((folder / "result/robot_calibrated.yaml").read_text())["joints"]
-    for joint, kind, unit, factor in ((j, *of) for j in (2, 3) for of in (("gain", "1", 1.0), ("wave", "rad", DEG))):
-        one = found[f"q{joint}.{kind}"]
+    true, calibrated = (
+        yaml.safe_load((folder / name).read_text())["effects"]["values"]
+        for name in ("simulated/robot_true.yaml", "result/robot_calibrated.yaml")
+    )
+    for name, unit in ((f"theta{j}.{kind}", "1") for j in (2, 3) for kind in ("gain", "square")):
+        one = found[name]
         assert one["unit"] == unit
         assert one["sigma"] < 0.3 * one["prior_sigma"]
-        assert abs(one["estimate"] - factor * true[joint - 1][kind]) < 3.0 * one["sigma"]
-        assert one["estimate"] == pytest.approx(factor * calibrated[joint - 1][kind], rel=0.0, abs=5.1e-9)
-    assert found["q3.wave"]["nominal"] == pytest.approx(0.2 * DEG, rel=1e-12)
+        assert abs(one["estimate"] - true[name]) < 3.0 * one["sigma"]
+        assert one["estimate"] == pytest.approx(calibrated[name], rel=0.0, abs=5.1e-9)
+    assert found["theta3.sin1"]["unit"] == "rad"
     for words in (text, (folder / "result/report.html").read_text()):
         assert "inclination" in words
-        assert "q2.gain" in words
+        assert "theta2.square" in words
         assert "ppm" in words
 
 
@@ -102,7 +101,7 @@ def test_a_new_instrument_and_a_new_effect_are_calibrated_and_reported(run):
 def test_what_a_new_instrument_can_identify_follows_from_its_kind(run):
     text, _ = run("observe", "robot.yaml", "--model", "inclination", "--json")
     found = json.loads(text)
-    assert {"q2.gain", "q3.gain", "q2.wave", "q3.wave"} <= set(found["independent"])
+    assert {"theta2.gain", "theta3.gain", "theta2.square", "theta3.square"} <= set(found["independent"])
     assert set(found["ineffective"]) >= {"a1", "d1", "a2", "d2", "a3", "d3", "theta1"}
 
 

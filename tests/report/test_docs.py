@@ -92,7 +92,10 @@ def read_yaml(text, folder, fg_calib):
     for name, content in FILES.items():
         (folder / name).write_text(content)
     (folder / "file.yaml").write_text(text)
-    if "joints:" in text:
+    if text.startswith("effects:"):
+        (folder / "file.yaml").write_text(text.replace("joints: [2, 3, 4]", "joints: [2]") + snippets("README")[3][1])
+        assert read_robot(folder / "file.yaml").effects
+    elif "joints:" in text:
         assert read_robot(folder / "file.yaml").n_joints == 3
     elif "square" in text:
         read_calibration_board(folder / "file.yaml")
