@@ -171,7 +171,7 @@ def _yaml(document: Mapping[str, Any]) -> str:
 
 def joint_noise(sigma: inputs.Floats, robot: Robot, units: Units) -> float | list[float]:
     """Sigma of the joint readings as a job specifies it: one value, or one a joint."""
-    values = [units.from_si(s, joint.unit) for s, joint in zip(sigma, robot.joints, strict=True)]
+    values = [_rounded(units.from_si(s, joint.unit)) for s, joint in zip(sigma, robot.joints, strict=True)]
     return values[0] if len(set(values)) == 1 else values
 
 
@@ -214,7 +214,12 @@ def _noise(m: Measurements, units: Units) -> dict[str, float]:
         sigmas |= {"distance": between[0].sigma_distance, "angle": between[0].sigma_angle}
     specified = {kind: float(s.flat[0]) for kind, s in sigmas.items() if s is not None and np.isfinite(s).any()}
     of_unit = {kind: (sigma, NOISE_UNITS[kind]) for kind, sigma in specified.items()}
-    return {kind: units.from_si(s, unit) if unit in ("m", "rad") else s for kind, (s, unit) in of_unit.items()}
+    return {kind: _rounded(units.from_si(s, unit)) for kind, (s, unit) in of_unit.items()}
+
+
+def _rounded(sigma: float) -> float:
+    """A sigma with the digits that a person writes: 0.03 of 0.029999999999999995."""
+    return float(f"{sigma:.12g}")
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------

@@ -12,11 +12,13 @@ from fg_calib.designs.design import design
 from fg_calib.designs.from_job import solve_for_design
 from fg_calib.designs.information import Posterior
 from fg_calib.graph import square_root
+from fg_calib.io import Units
 from fg_calib.measurements import Noise
 from fg_calib.prediction import errors_at
 from fg_calib.report.design import build_design_report
 from fg_calib.report.tables import plain_text
 from fg_calib.robot import pose
+from fg_calib.simulation import job_text
 from fg_calib.simulation.obstacles import enters
 from fg_calib.simulation.scenario import Box, Errors, GivenReadings, Instrument, Plane, RandomReadings, Spot
 from fg_calib.statistics import spread_of
@@ -289,3 +291,12 @@ def test_what_prior_sigmas_alone_determine_is_not_lost_at_tiny_noise(criterion):
         assert plan.unknown == 0.0
         expected.append(plan.expected.position)
     assert expected[0] == pytest.approx(expected[1], rel=1e-4)
+
+
+def test_noise_is_written_with_the_digits_of_a_person():
+    made = simulate(
+        scenario(INSTRUMENTS["pose"], n=3, noise=Noise(2.9999999999999995e-05, 2e-4, 9.999999999999999e-05))
+    )
+    text = job_text("", {}, made.tables, made.robot, Units("mm", "rad"))
+    assert "joint: [0.0001, 0.0001, 0.1, 0.0001]\n" in text
+    assert "noise: {position: 0.03, orientation: 0.0002}" in text
