@@ -9,6 +9,7 @@ Joint i turns by q_i plus the sum of its effects; each is a coefficient, a param
 | `ErrorCurve` | theta2.curve[17] | periodic cubic B-splines of q_i, whose Gaussian prior is part of the model |
 | `Compliance` | theta2.compliance | tau_i = sum of m g . dx/dq_i, the torque of gravity about the joint |
 | | theta2.compliance_x, _y | rotations about x and y just before the joint, by the moments about these axes |
+| | base.tilt_x, base.tilt_y | small angles of gravity about the base's axes |
 | | theta2.load3x, load3y | free masses: tau_i of a unit first moment of link 3 along x or y, as its joint turns it |
 | `Bending` | base.bending | rotation of the base by the moment of all masses about its origin |
 | `Backlash` | theta2.backlash | side of approach: -1, 0 or 1 |
@@ -209,13 +210,19 @@ class Compliance(Effect):
             the links' masses can be told: one parameter each.
         joints: The joints.
         lateral: Whether joints tilt too, about the two axes across their own.
-        gravity: In the base frame, shape (3,), [m/s^2].
+        gravity: In the base frame, shape (3,), [m/s^2]; or `estimate`: that of a base that stands upright but for two
+            small angles, base.tilt_x and base.tilt_y.
     """
 
     masses: Sequence[Mass] | None
     joints: Joints = "all"
     lateral: bool = False
-    gravity: Sequence[float] = GRAVITY
+    gravity: Sequence[float] | Literal["estimate"] = GRAVITY
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.masses is None and self.gravity == "estimate":
+            raise InputError("gravity", "found 'estimate' with free masses", "masses", "free masses tell no tilt")
 
     def _loads(self, robot: Robot, joint: int) -> list[tuple[int, int]]:
         """Free first moments that turn a joint: number of the link from 1, and axis."""
@@ -231,29 +238,36 @@ class Compliance(Effect):
             place = _moving(robot, i)[0]
             kinds = (("x", Axis.RX), ("y", Axis.RY))
             terms += [Term(f"{_prefix(robot, i)}.compliance_{x}", 1e-4, i + 1, place - 1, axis) for x, axis in kinds]
+        if self.gravity == "estimate":
+            names = ("base.tilt_x", "base.tilt_y", "")
+            terms += [_own(robot, i, "", 2e-2, -1)._replace(name=name, owner=0) for name in names for i in joints]
         return terms
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         joints = _joints(robot, self.joints, "compliance")
-        own = self._torques(robot, readings, joints)
-        if np.any(at):  # as the joints have turned
+        gravity, n, tilts = np.array(GRAVITY if self.gravity == "estimate" else self.gravity), len(joints), np.zeros(2)
+        if self.gravity == "estimate":
+            tilts = at[[-3 * n, -2 * n]]
+        along = gravity + np.cross([*tilts, 0.0], gravity)
+        own = self._torques(robot, readings, joints, along)
+        if np.any(at[: own.shape[1]]):  # as the joints have turned
             counts = [len(self._loads(robot, i)) if self.masses is None else 1 for i in joints]
-            turned, start = readings.copy(), 0
-            for i, n in zip(joints, counts, strict=True):
-                turned[:, i] += own[:, start : start + n] @ at[start : start + n]
-                start += n
+            turned = readings.copy()
+            turned[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
             readings = turned
-            own = self._torques(robot, readings, joints)
-        if not self.lateral or self.masses is None:
-            return _with_slopes(own)
-        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
-        across = [moments.of_masses(_moving(robot, i)[0], self.masses)[:, :2] for i in joints]
-        return _with_slopes(np.hstack([own, *across]))
+            own = self._torques(robot, readings, joints, along)
+        parts = [own]
+        if self.lateral and self.masses is not None:
+            moments = _Moments(robot, readings, along)
+            parts += [moments.of_masses(_moving(robot, i)[0], self.masses)[:, :2] for i in joints]
+        if self.gravity == "estimate":  # tau is linear in gravity, so k tau is in either of both
+            moved = [at[:n] * self._torques(robot, readings, joints, np.cross(e, gravity)) for e in np.eye(3)[:2]]
+            parts += [*moved, -(tilts[0] * moved[0] + tilts[1] * moved[1])]
+        return _with_slopes(np.hstack(parts))
 
-    def _torques(self, robot: Robot, readings: Floats, joints: Sequence[int]) -> Floats:
+    def _torques(self, robot: Robot, readings: Floats, joints: Sequence[int], gravity: Floats) -> Floats:
         """Torque in each joint's own sense, of each load, shape (n, n_own), [N m] or [m/s^2]."""
-        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
-        columns = []
+        moments, columns = _Moments(robot, readings, gravity), list[Floats]()
         for i in joints:
             place, e = _moving(robot, i)
             if self.masses is not None:
@@ -306,7 +320,7 @@ class Backlash(Effect):
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         joints = _joints(robot, self.joints, "backlash")
         if self.side == "load":
-            return _with_slopes(np.sign(Compliance(self.masses)._torques(robot, readings, joints)))
+            return _with_slopes(np.sign(Compliance(self.masses)._torques(robot, readings, joints, np.array(GRAVITY))))
         return _with_slopes(context.get(self.side, np.zeros(readings.shape))[:, joints])
 
     def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:

@@ -87,6 +87,7 @@ PARAMETER_KINDS: Mapping[str, ParameterKind] = {
     "roll": ParameterKind("rad", Axis.RX),
     "compliance": ParameterKind("rad/(N m)"),
     "bending": ParameterKind("rad/(N m)"),
+    "tilt": ParameterKind("rad"),
     "load": ParameterKind("rad s^2/m"),
     "gain": ParameterKind("1"),
     "sin": ParameterKind("rad"),
@@ -197,7 +198,7 @@ class Term(NamedTuple):
     """One term of an effect: a coefficient times what `Effect.values` gives.
 
     Attributes:
-        name: Name of the coefficient, `theta2.sin1`; terms of one name share it.
+        name: Name of the coefficient, `theta2.sin1`; terms of one name share it; without one it is 1.
         sigma: 1 sigma of the coefficient where no tolerance is given, in its unit.
         owner: Number of the joint that it acts at, 0 for the base.
         after: Index of the element that it follows, -1 for the start; None for what is no element (an error curve).
@@ -401,7 +402,7 @@ class Robot(inputs.Record):
     @cached_property
     def loads(self) -> tuple[int, ...]:
         """Indices of the parameters by which joints give way: loads depend on them."""
-        return tuple(i for i, p in enumerate(self.parameters) if p.kind in ("compliance", "load"))
+        return tuple(i for i, p in enumerate(self.parameters) if p.kind in ("compliance", "load", "tilt"))
 
     def trig(self, readings: Floats, context: Context | None = None, values: Floats | None = None) -> Floats:
         """Joint readings as the kernels take them, shape (n, n_joints + n_terms, 2).
@@ -430,7 +431,7 @@ class Robot(inputs.Record):
         values, parts, readings = self._nominal if values is None else values, [trig], np.asarray(readings)
         for effect, terms in zip(self.effects, self.terms, strict=True):
             if terms:
-                at = values[[self.index(t.name) for t in terms]]
+                at = np.array([values[self.index(t.name)] if t.name else 1.0 for t in terms])
                 parts.append(effect.values(self.geometry, readings, context or {}, at))
         return np.concatenate(parts, axis=1) if len(parts) > 1 else trig
 
@@ -453,12 +454,13 @@ class Robot(inputs.Record):
             for t in effect.terms(self):
                 if t.name in places and t.name not in mine:
                     raise InputError(self.name, f"two effects with the parameter {t.name}", "one")
-                if t.name not in mine:
+                if t.name and t.name not in mine:
                     mine.add(t.name)
                     places[t.name] = len(parameters)
                     parameters.append(Parameter(t.name, kind_of(t.name), t.owner, 0.0, t.sigma))
                 if t.after is not None:
-                    element = Element(t.axis, 0.0, places[t.name], None, t.sign, Basis(number, t.joint))
+                    constant = 0.0 if t.name else float(t.sign)
+                    element = Element(t.axis, constant, places.get(t.name), None, t.sign, Basis(number, t.joint))
                     more.setdefault(t.after, []).append(element)
                     number += 1
         elements = list(more.get(-1, []))

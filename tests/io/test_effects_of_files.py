@@ -65,6 +65,11 @@ def test_a_robot_with_effects_is_written_and_read_back(read, tmp_path):
     assert again.trig(q) == pytest.approx(robot.trig(q), abs=1e-12)  # masses on one link are one
 
 
+def test_gravity_is_estimated_by_two_angles(read):
+    robot = read(f"{HEAD}effects: {{compliance: {{masses: {{2: {{mass: 5}}}}, gravity: estimate}}}}\n")
+    assert [p.name for p in robot.parameters if p.kind == "tilt"] == ["base.tilt_x", "base.tilt_y"]
+
+
 def test_select_stands_for_the_standard_effects(read):
     robot = read(HEAD + "effects: select\n")
     assert robot.select_effects

@@ -33,6 +33,7 @@ EFFECTS = {
     "harmonics": Harmonics([1, 2.5]),
     "curve": ErrorCurve([2, 3], knots=9),
     "compliance": Compliance(MASSES, lateral=True),
+    "tilt": Compliance(MASSES, [2, 3, 4], gravity="estimate"),
     "loads": Compliance(None, [2, 3]),
     "bending": Bending(MASSES),
     "backlash": Backlash(),
@@ -101,6 +102,24 @@ def test_joints_give_way_to_equilibrium(arm):
     largest = np.abs(once - turned).max()
     assert largest > 1e-6
     assert np.abs(found - turned).max() < 0.02 * largest  # third order in k
+
+
+def test_a_tilt_of_gravity_is_that_of_the_base(arm):
+    k, tilts = np.array([1e-5, 2e-5, 3e-5, 4e-5]), [0.02, -0.03]
+    gravity = np.array([0.0, 0.0, -9.81])
+    tilted = Compliance(MASSES, gravity=gravity + np.cross([*tilts, 0.0], gravity))
+    estimated = arm.with_effects(Compliance(MASSES, gravity="estimate"))
+    estimated = estimated.with_values([*arm.nominal, *k, *tilts])
+    expected = arm.with_effects(tilted).with_values([*arm.nominal, *k])
+    found = forward(build_chain(estimated), estimated.trig(Q)).position
+    assert found == pytest.approx(forward(build_chain(expected), expected.trig(Q)).position, abs=1e-14)
+    assert np.abs(found - forward(build_chain(arm), arm.trig(Q)).position).max() > 1e-4
+    J = forward(build_chain(estimated, {estimated.index("base.tilt_x"): 0}), estimated.trig(Q)).jacobian[:, 3:, 0]
+    h = np.zeros(len(estimated.parameters))
+    h[estimated.index("base.tilt_x")] = 1e-4
+    ends = [estimated.with_values(estimated.nominal + d) for d in (h, -h)]
+    a, b = (forward(build_chain(r), r.trig(Q)).position for r in ends)  # the load as tilted too
+    assert J == pytest.approx((a - b) / 2e-4, rel=2e-2, abs=1e-7)  # joints as they have turned: k times as much
 
 
 def test_free_loads_are_the_torques_of_first_moments(arm):
