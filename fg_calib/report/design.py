@@ -176,7 +176,8 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
     for t in measured:
         for name, columns in simulation.table_columns(t, robot, units).items():
             rounded = _rounded(t.measurements.readings, robot, units) if "q1" in columns else {}
-            left = simulation.to_fill_in({**columns, **rounded}, touched=_is_touched(t))
+            unknown = dict.fromkeys(name for name, v in t.measurements.context.items() if v.ndim == 1)
+            left = simulation.to_fill_in({**columns, **rounded, **unknown}, touched=_is_touched(t))
             files[name] = partial(write_csv, columns=left)
     if scenario is not None:
         urdf = None if robot.urdf is None else "robot.urdf"

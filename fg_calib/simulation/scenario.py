@@ -34,6 +34,8 @@ configurations:                       # where the calibration measures; one of
                                       #   the arm may be inside: its joints, the lines between them, the tool point
   apart: 5                            #   and by how much some joint must differ between two; default: nothing
 noise: {position: 0.001, orientation: 0.01, joint: 0.005}   # 1 sigma; joint noise moves the arm, not the table
+temperature: [15, 30]                 # drawn evenly for each configuration where an effect of the robot has a column
+                                      #   of temperatures; so are sides of approach, -1 or 1, where it has such columns
 frame: unknown                        # world_T_base: base, unknown (default, drawn), or x y z roll pitch yaw
 validation: {random: {count: 500}}    # the same choice as configurations, for test rows; default: none
 job: {model: distance-rotation, pairing: star}   # keys of calibration.yaml; noise: {...} specifies another noise there
@@ -663,6 +665,7 @@ class Scenario:
         name: Its name.
         source: The file's name, or that of a shipped scenario; for messages.
         instruments: Instruments, each with a table of its own; poses of the tool are measured if empty.
+        temperature: Lowest and highest, in the unit of an effect's column of temperatures.
     """
 
     robot: InstanceOf[Robot]
@@ -678,12 +681,15 @@ class Scenario:
     name: str = "scenario"
     source: str = "scenario"
     instruments: tuple[Instrument, ...] = ()
+    temperature: tuple[io.Number, io.Number] = (15.0, 30.0)
 
     def __repr__(self) -> str:
         return inputs.brief(self, (f.name for f in fields(cast("Any", self))))
 
     def __post_init__(self) -> None:
         files: set[str] = set()
+        cold, warm = self.temperature
+        _require(cold <= warm, "temperature", f"found {io.shown([cold, warm])}", "the lower one first")
         for number, i in enumerate(self.instruments, start=1):
             place, own = f"instrument {number}", {i.name.lower(), f"{i.name}_pairs".lower()}
             _require(not own & files, f"{place}: name", f"{i.name} is there already", "another one")
@@ -708,6 +714,7 @@ class _ScenarioInFile(io.Schema):
     validation: Any = None
     job: dict[str, Any] | None = None
     instruments: list[dict[str, Any]] | None = Field(None, min_length=1)
+    temperature: Any = (15.0, 30.0)
 
 
 @inputs.checked
@@ -733,7 +740,7 @@ def read_scenario(path: Path | str) -> Scenario:
     job, specified = _read_job(file, source, context)
     given = {
         **{key: getattr(file, key) for key in ("errors", "configurations", "noise", "frame", "validation")},
-        **{"robot": robot, "job": job, "specified_noise": specified, "source": source},
+        **{"robot": robot, "job": job, "specified_noise": specified, "source": source, "temperature": file.temperature},
         **{"length_unit": file.units.length, "angle_unit": file.units.angle, "name": file.name or Path(source).stem},
         "instruments": _complete(file.instruments or (), source, path.parent),
     }

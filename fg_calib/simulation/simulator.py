@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib import initialization, inputs, io, measurements, parallel
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Brief, Floats, FrameKnowledge, InputError, Integers
 from fg_calib.measurements import INSTRUMENTS, Groups, KnownPoint, Labels, Measurements, Noise, Pairs, Table
-from fg_calib.robot import N_STARTS, Poses, Robot, pose, solve_inverse
+from fg_calib.robot import N_STARTS, Poses, Robot, Thermal, build_chain, forward, pose, solve_inverse
 from fg_calib.simulation.scenario import BoardViews, Configurations, Instrument, Placement, Plane, Scenario, Spot
 from fg_calib.simulation.views import find_readings
 
@@ -120,6 +120,8 @@ class Measuring:
 
     def __post_init__(self) -> None:
         self.name, self.model, self.n = self.instrument.name, self.instrument.model, len(self.visits.ids)
+        each = (effect.context(self.true_robot, self.visits.readings, self.read) for effect in self.true_robot.effects)
+        self.context = {name: values for one in each for name, values in one.items()}
         self.place = f"{self.scenario.source}: instruments: {self.name}"
         self.places = self.generator("places")
         self.noises = override_noise(self.scenario.noise, self.instrument.noise)
@@ -137,7 +139,11 @@ class Measuring:
             return self.pairs()
         methods = dict.fromkeys((*POSE_MODELS, *PAIR_MODELS), self.poses)
         methods |= {"anchor": self.lengths, "plane": self.distances, "board": self.boards, "pixels": self.pixels}
-        return methods.get(self.model, self.plain)()
+        table, truth = methods.get(self.model, self.plain)()
+        kept = np.isin(self.visits.ids, table.measurements.ids)
+        if self.context and not kept.all():  # sides of approach are by the rows of the table
+            return replace(self, visits=self.visits.select(kept)).measure()
+        return table, truth
 
     # --- for all instruments ---
 
@@ -147,7 +153,14 @@ class Measuring:
 
     def at(self) -> Poses:
         """True poses of the tool."""
-        return pose(self.true_robot, self.visits.true_readings)
+        return forward(build_chain(self.true_robot), self.true_robot.trig(self.visits.true_readings, self.context))
+
+    def read(self, names: Sequence[str]) -> Floats:
+        """Columns that effects depend on, shape (n, k): temperatures, or sides of approach; by configuration."""
+        thermal = {effect.column for effect in self.true_robot.effects if isinstance(effect, Thermal)}
+        each = [[generator_of(self.seed, i, name).uniform() for name in names] for i in self.visits.ids.tolist()]
+        drawn, (cold, warm) = np.reshape(each, (self.n, len(names))), self.scenario.temperature
+        return cold + (warm - cold) * drawn if names[0] in thermal else np.sign(drawn - 0.5)
 
     def noise(self, kind: str, *shape: int) -> Floats:
         """Noise of a kind: standard normal numbers times sigma, so that another sigma scales the same noise."""
@@ -182,6 +195,7 @@ class Measuring:
             sigma_joint=joint_sigma(self.scenario.specified_noise or self.scenario.noise, self.scenario.robot),
             source=f"{self.name}.csv",
             named=True,
+            context={name: values if k is None else values[k] for name, values in self.context.items()},
             **measured,
         )
 
@@ -235,8 +249,10 @@ class Measuring:
         then stand.
 
         Raises:
-            InputError: None is reached.
+            InputError: None is reached, or effects depend on more than readings.
         """
+        if self.context:
+            raise InputError(self.place, f"contact, with effects by {', '.join(self.context)}", "none of these effects")
         v, generator = self.visits, self.generator("touch")
         found = solve_inverse(self.true_robot, points, near=v.true_readings, generator=generator, n_starts=n_starts)
         if not found.reached[~v.test].any():

@@ -113,6 +113,9 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
     if m.rotation is not None:
         quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
         columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    columns |= {name: values for name, values in m.context.items() if values.ndim == 1}
+    sides = {name: values for name, values in m.context.items() if values.ndim == 2 and name != "moves"}
+    columns |= {f"{name}{i + 1}": v for name, values in sides.items() for i, v in enumerate(values.T)}
     columns |= {name: values / units.factor(GENERIC_COLUMNS[name].si) for name, values in m.columns.items()}
     if m.image is not None:
         columns |= dict(zip("uv", m.image.T[:2], strict=True))

@@ -1,0 +1,87 @@
+"""Simulated effects of an arm: true data follow what the table says, and a model without the effects misfits them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from oracle import tool_poses
+from scenarios import SIGMA, TOLERANCE, WALL
+from scipy.spatial.transform import Rotation
+
+from fg_calib import InputError, Pairing, Robot, assess, build_problem, design, read_job, simulate, solve
+from fg_calib.robot import Backlash, Compliance, Coupling, ErrorCurve, Gain, Harmonics, Mass, Thermal
+from fg_calib.simulation import Errors, Instrument, RandomReadings, Scenario, write_simulation
+
+ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
+MASSES = (Mass(2, 12.0, (0.2, 0.0, 0.1)), Mass(4, 5.0, (0.0, 0.0, 0.1)))
+BOARD = Instrument(model="board", name="board", boards=WALL | {"again": WALL["wall"]})
+PAIRS = Instrument(model="distance-rotation", name="pairs", pairs=Pairing("random", 200))
+
+
+def scenario(*effects, **changes):
+    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0.0, 0.2], tolerance=TOLERANCE).with_effects(*effects)
+    errors = Errors("normal", {p.name: p.tolerance for p in robot.parameters if p.tolerance})
+    given = {"configurations": RandomReadings(60), "noise": SIGMA, "job": {"model": "pose"}, "temperature": (12, 21)}
+    return Scenario(robot, errors, **given | changes)
+
+
+@pytest.mark.parametrize("side", ["moves", "side"])
+@pytest.mark.parametrize("instruments", [(), (BOARD,)])
+def test_true_data_follow_the_columns_and_the_order_of_the_table(side, instruments, tmp_path):
+    """The board is not seen from all configurations: sides are by those that are in the table."""
+    effects, n = (Backlash([1, 2], side=side), Thermal(lengths=False, zeros=True)), 60
+    of = scenario(*effects, instruments=instruments, frame="base", job={} if instruments else {"model": "pose"})
+    s = simulate(replace(of, validation=RandomReadings(9)), 1, exact=True)
+    write_simulation(tmp_path, s)
+    m = read_job(tmp_path / "calibration.yaml").tables[0].measurements
+    first = np.sort(np.unique(m.ids, return_index=True)[1])
+    assert (len(first) < n) == bool(instruments)
+    true, T, b = s.true_robot, m.context["temperature"], m.context[side][:, :2]
+    drift, backlash = ([true.nominal[true.index(f"theta{i}.{kind}")] for i in of] for kind, of in
+                       (("drift", (1, 2, 3, 4)), ("backlash", (1, 2))))  # fmt: skip
+    stood = m.readings + np.outer(T - 20.0, drift)
+    stood[:, :2] += b * backlash
+    if side == "moves":
+        q = m.readings[first, :2]
+        assert b[first] == pytest.approx(np.sign(np.diff(q, axis=0, prepend=q[:1])))
+    assert set(b[len(m.ids) // len(first) :].ravel()) == {-1.0, 1.0}
+    assert abs(b.mean()) < 0.5
+    assert T.min() == pytest.approx(12.5, abs=0.5)
+    assert T.max() == pytest.approx(20.5, abs=0.5)
+    tool = tool_poses(true.geometry, stood)
+    rotation, wall = tool[:, :3, :3], WALL["wall"]
+    p = np.einsum("nji,nj->ni", rotation, wall.position - tool[:, :3, 3]) if instruments else tool[:, :3, 3]
+    R = np.swapaxes(rotation, 1, 2) @ wall.rotation if instruments else rotation
+    assert m.position == pytest.approx(p, abs=1e-12)  # rounding of a file of 17 digits
+    assert Rotation.from_matrix(np.swapaxes(R, 1, 2) @ m.rotation).magnitude().max() < 1e-7
+
+
+CURVE = ErrorCurve(knots=9, sigma=2e-3)
+EACH = (Gain(), Harmonics(), CURVE, Compliance(MASSES), Backlash(), Coupling([(3, 4)]), Thermal(zeros=True))
+
+
+@pytest.mark.parametrize("effect", EACH, ids=lambda effect: type(effect).__name__)
+def test_a_model_without_its_effect_misfits(effect):
+    s = simulate(scenario(effect, instruments=(PAIRS,), job={}), 3)
+    found, plain = (assess(solve(build_problem(robot, s.tables))).fit for robot in (s.robot, scenario().robot))
+    n = found.chi_square.dof
+    assert found.chi_square.value == pytest.approx(n, abs=4.0 * np.sqrt(2.0 * n))  # 4 sigma
+    assert plain.chi_square.value > n + 20.0 * np.sqrt(2.0 * n)
+
+
+def test_what_cannot_be_simulated_is_refused():
+    with pytest.raises(InputError, match=r"temperature: found \[10.0, 5.0\], expected the lower one first"):
+        scenario(temperature=(10, 5))
+    touching = Instrument(model="plane", name="faces", contact=True)
+    message = "instruments: faces: contact, with effects by temperature, expected none of these effects"
+    with pytest.raises(InputError, match=message):
+        simulate(scenario(Thermal(), instruments=(touching,), job={}))
+
+
+def test_a_design_for_compliance_takes_poses_with_torque():
+    effect = Compliance(MASSES)
+    of = scenario(effect, frame="base", errors=None)
+    plan = design(replace(of, robot=of.robot.with_estimated(["theta2.compliance", "theta3.compliance"])), n=4)
+    chosen, pool = (effect.values(of.robot.geometry, q, {}, np.zeros(4))[:, 1:3, 0] for q in
+                    (plan.readings, plan.pool.readings))  # fmt: skip
+    assert (np.sqrt(np.mean(chosen**2, axis=0)) > 1.3 * np.sqrt(np.mean(pool**2, axis=0))).all()
