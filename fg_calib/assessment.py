@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,7 @@ from fg_calib.job import Job
 from fg_calib.observability import Identifiability, Observability, identifiability_of
 from fg_calib.prediction import ExpectedError, expected_error
 from fg_calib.robot import Robot
+from fg_calib.selection import estimate_curve_sigma
 from fg_calib.statistics.residual_table import residual_table
 
 
@@ -163,7 +165,7 @@ def solve_job(job: Job, problem: graph.Problem | None = None) -> graph.Solution:
     problem = problem or graph.problem_of(job)
     try:
         solve_with = statistics.estimate_noise if job.options.estimate_noise else graph.solve
-        solution = statistics.estimate_tolerances(problem, solve_with)
+        solution = statistics.estimate_tolerances(problem, partial(estimate_curve_sigma, solve_with=solve_with))
     except SolverError as error:
         for table in job.tables:
             if table.model is not None:

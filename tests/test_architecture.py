@@ -17,8 +17,8 @@ import fg_calib
 PACKAGE = Path(fg_calib.__file__).parent
 FOLDERS = (
     "inputs", "parallel", "robot", "initialization", "measurements", "job", "graph", "observability", "statistics",
-    "prediction", "diagnostics", "monitoring", "assessment", "baseline", "io", "simulation", "designs", "importers",
-    "report", "calibration", "batch", "exports", "cli"
+    "prediction", "diagnostics", "monitoring", "selection", "assessment", "baseline", "io", "simulation", "designs",
+    "importers", "report", "calibration", "batch", "exports", "cli"
 )  # fmt: skip
 """From the ground up: a folder (or module of the package itself) imports from those before it."""
 

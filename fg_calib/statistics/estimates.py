@@ -200,7 +200,7 @@ def _parameters(
             estimate=float(solution.parameters[i]),
             correction=float(corrections[i]),
             sigma=finite(sigmas.get(p.name, 0.0)),
-            prior_sigma=p.tolerance if p.estimated and problem.options.has_priors else None,
+            prior_sigma=p.tolerance if p.estimated and (problem.options.has_priors or p.kind == "curve") else None,
             identifiability=classes.get(p.name, "fixed"),
             stands_for=combinations.get(p.name),
             sigma_of_combination=finite(of_combinations[p.name]) if p.name in combinations else None,
