@@ -256,8 +256,8 @@ class Calibration(Record, repr=False, eq=False):
         """The arm's prior information for new rows."""
         result = self.result
         nominal = _with_priors(self.posterior.variables.robot, result)
-        values = np.array([p.estimate for p in result.parameters])
-        known = None
+        values, known = np.array([p.estimate for p in result.parameters]), None
+        nominal = nominal.with_curves_held(values)  # few new rows say little of them
         if result.carried.knowledge is not None and not result.evaluated_only:
             known = _knowledge(nominal.with_values(values), result.carried.knowledge)
         estimated = set(result.noise_factors or ()).difference((*result.noise_kept, "joint"))

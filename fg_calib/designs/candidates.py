@@ -166,7 +166,7 @@ def _columns_by_name(variables: Variables, unknowns: Landmarks) -> dict[tuple[st
     for letter, name in unknowns.keys:
         place = coordinates_of(variables, unknowns, (letter, name))
         if place is not None:
-            found[letter, name] = place - variables.nuisance_span.start + variables.n_columns
+            found[letter, name] = variables.columns_at(place)
     return found
 
 

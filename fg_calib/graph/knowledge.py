@@ -175,7 +175,7 @@ class Knowledge(FrozenArrays):
             if place is not None:
                 rows = n + SIZE * i + np.arange(SIZE)
                 s[rows] = parameters[place] - self.at[SIZE * i + np.arange(SIZE)]
-                D[rows, place - variables.nuisance_span.start + variables.n_columns] = 1.0
+                D[rows, variables.columns_at(place)] = 1.0
         return s, D
 
     def seen_by(self, variables: Variables, unknowns: Landmarks) -> Knowledge:

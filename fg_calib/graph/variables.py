@@ -157,6 +157,10 @@ class Variables(Brief):
         """Number of columns of error curves, the first ones of the nuisance variables."""
         return sum(len(v.parameters) for v in self.nuisance if v.kind == "curve")
 
+    def columns_at(self, places: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Columns of nuisance values that are none of the robot's, by their places in the parameter vector."""
+        return places - self.nuisance_span.start + self.n_columns + self.n_curves
+
     @property
     def n_robot_columns(self) -> int:
         """Number of columns without the measurement frames', which come last."""
@@ -266,8 +270,7 @@ class Variables(Brief):
     def at(self, parameters: Floats) -> State:
         """The arm and the measurements' unknowns at a parameter vector."""
         estimated = self.coordinates >= 0
-        first = self.n_columns + self.n_curves - self.nuisance_span.start
-        columns = np.where(estimated, self.coordinates + first, -1)
+        columns = np.where(estimated, self.columns_at(self.coordinates), -1)
         values = np.where(estimated, parameters[self.coordinates], self.others)
         chains = tuple(chain.at(parameters) for chain in self.chains)
         return State(chains, values, columns, self.n_columns, self.n_nuisance, self._curves(parameters))

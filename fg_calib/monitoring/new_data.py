@@ -191,7 +191,7 @@ def linearise_new_data(at: Placed) -> Linear:
     J, r = every[:, :wide], every[:, wide]
     r_priors, J_priors = graph.unknown_prior_rows(v, problem.start)
     places = [graph.coordinates_of(v, problem.data.landmarks, name) for name in at.pinned]
-    pinned = np.array(places, dtype=np.int64).ravel() - v.nuisance_span.start + v.n_columns
+    pinned = v.columns_at(np.array(places, dtype=np.int64).ravel())
     unit, known, information = np.eye(wide), np.zeros((wide, 0)), np.zeros((0, 0))
     if calibrated.information is not None:
         knowledge = calibrated.information.about(at.pinned)

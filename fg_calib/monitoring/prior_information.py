@@ -143,7 +143,7 @@ def _known_at(problem: graph.Problem, x: inputs.Floats, *, with_loss: bool) -> g
         rows.append(np.column_stack([known.rows @ D, *own, known.right + known.rows @ s]))
         at += [known.place(name) for name in unseen]
     A, b = np.split(np.vstack(rows), [-1], axis=1)
-    columns = [place - v.nuisance_span.start + v.n_columns for place in places.values()]
+    columns = [v.columns_at(place) for place in places.values()]
     wide = np.arange(A.shape[1])
     kept = np.concatenate([wide[: v.n_robot_columns], *columns, wide[v.n_columns + v.n_nuisance :]])
     left = graph.eliminate(A[:, np.concatenate([kept, np.setdiff1d(wide, kept)])], b[:, 0], len(kept))

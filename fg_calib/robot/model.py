@@ -547,6 +547,12 @@ class Robot(inputs.Record):
         """Indices of the geometric parameters of joint `owner` (0 is the base, n + 1 the tool)."""
         return [i for i, p in enumerate(self.parameters) if p.owner == owner and p.kind not in EFFECT_KINDS]
 
+    def with_curves_held(self, values: Floats) -> Robot:
+        """Copy whose error curves are what they are in values of all parameters, and are not estimated."""
+        pairs = zip(self.parameters, values.tolist(), strict=True)
+        held = [replace(p, nominal=v, estimated=False) if p.kind == "curve" else p for p, v in pairs]
+        return replace(self, parameters=tuple(held))
+
     @checked
     def with_estimated(self, names: Iterable[str]) -> Robot:
         """Copy with just the parameters called `names` estimated.

@@ -1,0 +1,51 @@
+"""An arm with effects a month later: a stiffness that changed is named, and error curves stay as they were."""
+
+import numpy as np
+import pytest
+
+from fg_calib import Measurements, Robot, calibrate
+from fg_calib.robot import Compliance, ErrorCurve, Mass, build_chain, forward
+
+ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
+SIGMA = 5e-5
+EFFECTS = (ErrorCurve([2, 3], knots=12, sigma=1e-3), Compliance([Mass(3, 20.0, (0.2, 0.0, 0.1))], [2, 3]))
+
+
+def measured(robot, n, rng):
+    q = rng.uniform(-2.5, 2.5, (n, 4))
+    at = forward(build_chain(robot), robot.trig(q))
+    return Measurements.from_arrays(q, position=at.position + SIGMA * rng.normal(size=(n, 3)), sigma_position=SIGMA)
+
+
+@pytest.fixture(scope="module")
+def month():
+    """The calibration, the arm with joint 3 softer by 50 urad/(N m), and its measurements."""
+    rng = np.random.default_rng(3)
+    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE).with_effects(*EFFECTS)
+    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
+    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    calibration = calibrate(robot, measured(true, 80, rng), model="position", gauge="prior")
+    values = true.nominal
+    values[true.index("theta3.compliance")] += 5e-5
+    return calibration, true, true.with_values(values), rng
+
+
+def test_a_stiffness_that_changed_is_named(month):
+    calibration, true, softer, rng = month
+    assert calibration.check(measured(true, 25, rng)).verdict == "pass"
+    check = calibration.check(measured(softer, 25, rng))
+    first = check.explanations[0]
+    assert (check.verdict, first.parameters) == ("fail", ("theta3.compliance",))
+    assert first.change[0] == pytest.approx(5e-5, abs=4.0 * first.sigma[0])
+
+
+def test_an_update_keeps_error_curves_and_finds_the_stiffness(month):
+    calibration, _, softer, rng = month
+    updated = calibration.update(measured(softer, 40, rng), changed=["theta3.compliance"])
+    assert updated.trustworthy
+    found, before = updated.parameters, calibration.parameters
+    curves = [p.name for p in before.values() if ".curve[" in p.name]
+    assert [found[name].estimate for name in curves] == [before[name].estimate for name in curves]
+    true = softer.nominal[softer.index("theta3.compliance")]
+    assert found["theta3.compliance"].estimate == pytest.approx(true, abs=4.0 * found["theta3.compliance"].sigma)
