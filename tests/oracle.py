@@ -57,6 +57,8 @@ def random_robot(convention: str, n_joints: int, rng: np.random.Generator) -> Ro
         if convention == "urdf":
             axis = rng.normal(size=3)
             builder.add_urdf_joint(joint, _random_frame(rng), axis / np.linalg.norm(axis))
+        elif convention == "poe":
+            builder.add_screw_joint(joint, rng.normal(size=3), rng.uniform(-1, 1, 3), _random_frame(rng))
         else:
             values = {
                 k: rng.uniform(-3, 3) if k in ("alpha", "theta", "beta") else rng.uniform(-1, 1)

@@ -8,6 +8,9 @@ joints:                                units: {length: mm, angle: deg}
   - {a: 0, alpha: 0, d: 340, theta: 0, limits: [-170, 170]}
   - {a: 0, alpha: -90, d: 0, theta: 0, type: prismatic, name: slide}
 ```
+Rows of `convention: poe` are axes at zero readings, `{axis: [0, 0, 1], point: [0, 0, 340]}`, and `tool` the tool's pose
+there; x, y, pitch and roll are how far a calibrated axis is from there, and `sigma` is for people alone.
+
 Both take `name`, `base`, `tool`, `fixed`, `estimate` and `tolerance` too. Rows without `name` are called q1 to qn.
 
 A URDF's chain is that between any two links. Of each joint its type, parent, child, origin, axis, limit and mimic are
@@ -32,7 +35,19 @@ from pydantic import BeforeValidator, Field
 from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
-from fg_calib.io.yaml import Bound, FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
+from fg_calib.io.yaml import (
+    Bound,
+    FilePath,
+    Loader,
+    Number,
+    Positive,
+    Schema,
+    Units,
+    UnitsOfFile,
+    read_yaml,
+    validate,
+    within,
+)
 from fg_calib.robot import Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
@@ -509,20 +524,38 @@ class _Robot(Schema):
         return {"fixed": self.fixed, "estimate": (*self.estimate, *estimate), "tolerance": tolerance}
 
 
-class _Row(Schema):
+class _JointRow(Schema):
     type: Literal["revolute", "prismatic"] = "revolute"
     name: str | None = None
+    limits: tuple[Bound, Bound] = (-math.inf, math.inf)
+
+
+class _Row(_JointRow):
     a: Number | None = None
     alpha: Number | None = None
     d: Number | None = None
     theta: Number | None = None
     beta: Number = 0.0
-    limits: tuple[Bound, Bound] = (-math.inf, math.inf)
+
+
+class _ScrewRow(_JointRow):
+    axis: tuple[Number, Number, Number]
+    point: tuple[Number, Number, Number] | None = None
+    x: Number = 0.0
+    y: Number = 0.0
+    pitch: Number = 0.0
+    roll: Number = 0.0
+    sigma: dict[str, Any] = Field(default_factory=dict)
 
 
 class _DhRobot(_Robot):
-    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati"]
+    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati", "poe"]
     joints: Annotated[list[_Row], Field(min_length=1)]
+
+
+class _PoeRobot(_Robot):
+    convention: Literal["poe"]
+    joints: Annotated[list[_ScrewRow], Field(min_length=1)]
 
 
 class _UrdfRobot(_Robot):
@@ -571,7 +604,8 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path, est
         InputError: The mapping does not describe a robot.
     """
     if "urdf" not in mapping:
-        return _build_dh(validate(_DhRobot, dict(mapping), place), place, estimate)
+        of: type[_DhRobot | _PoeRobot] = _PoeRobot if mapping.get("convention") == model.POE else _DhRobot
+        return _build_rows(validate(of, dict(mapping), place), place, estimate)
     file = validate(_UrdfRobot, dict(mapping), place)
     robot = read_urdf(
         folder / file.urdf,
@@ -587,31 +621,51 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path, est
     return replace(robot, units=(file.units.length, file.units.angle))
 
 
-def _build_dh(file: _DhRobot, place: str, estimate: Sequence[str]) -> Robot:
+def _build_rows(file: _DhRobot | _PoeRobot, place: str, estimate: Sequence[str]) -> Robot:
     builder = RobotBuilder(file.name or "robot", file.convention)
     builder.add_frame("base", file.base.si(file.units, f"{place}: base"), 0, False)
-    names = [row.name or f"q{i}" for i, row in enumerate(file.joints, start=1)]
-    for i, (row, name) in enumerate(zip(file.joints, names, strict=True)):
-        here, kinds = f"{place}: joint {i + 1}", model.CONVENTIONS[file.convention]
+    rows: Sequence[_Row | _ScrewRow] = file.joints
+    names = [row.name or f"q{i}" for i, row in enumerate(rows, start=1)]
+    for i, (row, name) in enumerate(zip(rows, names, strict=True)):
+        here = f"{place}: joint {i + 1}"
         if name in names[:i]:
             raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
-        if row.beta and "beta" not in kinds:
-            found, expected = f"found {row.beta!r}", f"none: the convention {file.convention} has no beta"
-            raise InputError(f"{here}: beta", found, expected, f"{file.convention}-hayati has")
-        if missing := [kind for kind in kinds if getattr(row, kind) is None]:
-            raise InputError(here, f"missing key {missing[0]!r}")
         lower, upper = row.limits
         if not lower < upper:
             raise InputError(f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
         factor = file.units.factor("m" if row.type == "prismatic" else "rad")
         joint = Joint(name, row.type == "prismatic", lower * factor, upper * factor)
-        values = {kind: _si(kind, getattr(row, kind), file.units, here) for kind in kinds}
-        builder.add_convention_joint(joint, values)
+        if isinstance(row, _ScrewRow):
+            _add_screw(builder, joint, row, file.units, here)
+        else:
+            builder.add_convention_joint(joint, _values(row, file.convention, file.units, here))
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
     n = len(names)
     links = {str(i): partial(Mass, i) for i in range(n + 1)}
     robot = _with_effects(builder, file.effects, links, place, **file.choices(place, estimate))
     return replace(robot, units=(file.units.length, file.units.angle))
+
+
+def _values(row: _Row, convention: str, units: Units, place: str) -> dict[str, float]:
+    """The values of a row by kind, [m] and [rad]."""
+    kinds = model.CONVENTIONS[convention]
+    if row.beta and "beta" not in kinds:
+        found, expected = f"found {row.beta!r}", f"none: the convention {convention} has no beta"
+        raise InputError(f"{place}: beta", found, expected, f"{convention}-hayati has")
+    if missing := [kind for kind in kinds if getattr(row, kind) is None]:
+        raise InputError(place, f"missing key {missing[0]!r}")
+    return {kind: _si(kind, getattr(row, kind), units, place) for kind in kinds}
+
+
+def _add_screw(builder: RobotBuilder, joint: Joint, row: _ScrewRow, units: Units, place: str) -> None:
+    if row.point is None and not joint.prismatic:
+        raise InputError(place, "missing key 'point'")
+    point = [one * units.factor("m") for one in row.point or (0.0, 0.0, 0.0)]
+    if joint.prismatic and (row.x or row.y):
+        raise InputError(place, "x or y of a slide", "pitch and roll: it has a direction alone")
+    values = {kind: _si(kind, getattr(row, kind), units, place) for kind in model.SCREW_KINDS}
+    with within(place):
+        builder.add_screw_joint(joint, row.axis, point, values)
 
 
 @checked
@@ -684,7 +738,10 @@ def require_same_chain(robot: Robot, written: Robot, place: str) -> None:
     Raises:
         InputError: The robots have other elements, or parameters.
     """
-    if names_of(robot.parameters) != names_of(written.parameters) or robot.elements != written.elements:
+    same = names_of(robot.parameters) == names_of(written.parameters) and len(robot.elements) == len(written.elements)
+    for one, other in zip(robot.elements, written.elements, strict=same):
+        same &= replace(one, constant=other.constant) == other and abs(one.constant - other.constant) <= ROUNDING
+    if not same:
         expected = "base, joints of one convention or a URDF's, tool: all that a robot file can say"
         raise InputError(place, "the robot has elements or parameters of its own", expected)
 
@@ -693,12 +750,25 @@ def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:
     joint = robot.joints[index]
     row: dict[str, Any] = {} if joint.name == f"q{index + 1}" else {"name": joint.name}
     owned: list[Parameter] = [robot.parameters[i] for i in robot.owned_by(index + 1)]
+    if robot.convention == model.POE:
+        row |= _screw(robot, index, units)
+        owned = [p for p in owned if p.nominal != 0.0]
     row |= {p.kind: units.from_si(p.nominal, p.unit) for p in owned}
     if joint.prismatic:
         row["type"] = "prismatic"
     if (joint.lower, joint.upper) != (-math.inf, math.inf):
         row["limits"] = [units.from_si(limit, joint.unit) for limit in (joint.lower, joint.upper)]
     return _Flow(row)
+
+
+def _screw(robot: Robot, index: int, units: Units) -> dict[str, Any]:
+    """Axis and point of a joint at the values 0 of its parameters."""
+    elements, n = robot.geometry.elements, len(robot.owned_by(index + 1))
+    end = next(i for i, e in enumerate(elements) if e.joint == index) - n
+    *point, yaw, pitch = (e.constant for e in elements[end - 5 : end])
+    axis = rotations.rotation_of(yaw, pitch, 0.0)[:, 2].tolist()
+    rounded = [float(f"{one:.15g}") if abs(one) > ROUNDING else 0.0 for one in axis]
+    return {"axis": rounded, "point": [units.from_si(one, "m") for one in point]}
 
 
 def _tolerances(robot: Robot, units: Units) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """The robot: joints as sequences of elementary transforms, with named parameters.
 
-Every convention (DH, Craig's modified DH, the two with Hayati's extra angle, URDF) becomes the same
+Every convention (DH, Craig's modified DH, the two with Hayati's extra angle, POE, URDF) becomes the same
 thing here: a list of translations along and rotations about the x, y and z axes of the moving frame.
 A convention is therefore data, `CONVENTIONS`, and nothing behind this module knows one from another.
 """
@@ -111,6 +111,9 @@ CONVENTIONS: Mapping[str, tuple[str, ...]] = {
 }
 """Order of one joint's elementary transforms, left to right (`mdh-hayati`: Jia et al. 2019, Eq. 29)."""
 
+POE = "poe"
+"""The convention of screw axes, a product of exponentials: see `RobotBuilder.add_screw_joint`."""
+
 DH_COLUMNS = ("a", "alpha", "d", "theta", "beta")
 """Order of the figures in a row of `Robot.from_dh`, whatever the convention."""
 
@@ -121,6 +124,12 @@ JointType = Literal["revolute", "prismatic"]
 
 FRAME_KINDS = ("x", "y", "z", "yaw", "pitch", "roll")
 """A frame's elementary transforms, left to right: Txyz Rz(yaw) Ry(pitch) Rx(roll), as in URDF."""
+
+SCREW_KINDS = ("x", "y", "pitch", "roll")
+"""Elementary transforms of the axis of a joint of `POE`, left to right; those of a slide are the last two."""
+
+STRAIGHT = 1e-12
+"""Part of an axis along x, y or z below which it is rounding: a yaw by it would be any."""
 
 
 ZEROS = "zeros"
@@ -300,7 +309,7 @@ class Robot(inputs.Record):
 
     Attributes:
         name: The robot's name.
-        convention: A key of `CONVENTIONS`, or `urdf`.
+        convention: A key of `CONVENTIONS`, `poe` or `urdf`.
         joints: The moving joints in chain order.
         parameters: All named parameters: base, joints in chain order, tool.
         elements: The chain, base to tool.
@@ -505,12 +514,16 @@ class Robot(inputs.Record):
     def reach(self) -> float:
         """Length of the arm stretched out, base to tool, sliding joints at their limits, [m]; 1 if it has none."""
         nominal, all_limits, base, reach = self.nominal, self.limits, self.owned_by(0), 0.0
-        for element in self.elements:
-            if element.axis >= Axis.RX or element.parameter in base or element.basis is not None:
-                continue
-            length = element.constant + (0.0 if element.parameter is None else nominal[element.parameter])
-            limits = np.zeros(0) if element.joint is None else all_limits[element.joint]
-            reach += float(np.max(np.abs(length + limits[np.isfinite(limits)]), initial=abs(length)))
+        along = np.zeros((3, 3))  # x, y, z since the last rotation: with joints at 0, at their lower and upper limits
+        for element in (*self.elements, Element(Axis.RX)):
+            if element.axis >= Axis.RX:
+                reach += float(np.abs(along).max(axis=1).sum())
+                along[:] = 0.0
+            elif element.parameter not in base and element.basis is None:
+                length = 0.0 if element.parameter is None else nominal[element.parameter]
+                limits = np.zeros(2) if element.joint is None else all_limits[element.joint]
+                ends = np.append(0.0, np.where(np.isfinite(limits), limits, 0.0))
+                along[element.axis] += element.constant + element.sign * (length + ends)
         return reach or 1.0
 
     def scale_of(self, unit: str) -> float:
@@ -539,7 +552,9 @@ class Robot(inputs.Record):
             return e.joint == owner - 1 or (e.parameter is not None and self.parameters[e.parameter].owner == owner)
 
         end = max((i for i, e in enumerate(self.elements) if of_link(e)), default=-1) + 1
-        if self.convention not in CONVENTIONS and owner and self.elements[end - 1].joint == owner - 1:
+        if self.convention == POE and 1 <= owner <= self.n_joints:
+            end += len(Axis) - 1  # back from the joint's axis to the base frame
+        elif self.convention not in CONVENTIONS and owner and self.elements[end - 1].joint == owner - 1:
             end += 2  # turns back from the joint's axis
         return end
 
@@ -647,18 +662,49 @@ class RobotBuilder:
         index, start = len(self._joints), len(self._elements)
         self._joints.append(joint)
         self.add_frame(joint.name, origin, index + 1, True)
-        # Turn z onto the axis, move about z, turn back: constants, so that any axis is elementary.
-        yaw, pitch = np.arctan2(axis[1], axis[0]), np.arctan2(np.hypot(axis[0], axis[1]), axis[2])
-        if pitch == 0.0:
-            yaw = 0.0
-        self._elements += [Element(Axis.RZ, yaw), Element(Axis.RY, pitch)]
+        onto = _onto(axis)
+        self._elements += onto
         if zero:
             self._add_parameter(f"{joint.name}.zero", "theta", index + 1, 0.0, True, index)
         else:
             self._elements.append(Element(Axis.TZ if joint.prismatic else Axis.RZ, joint=index))
-        self._elements += [Element(Axis.RY, -pitch), Element(Axis.RZ, -yaw)]
+        self._elements += _inverse(onto)
         if backwards:
             self._elements[start:] = _inverse(self._elements[start:])
+
+    @checked
+    def add_screw_joint(
+        self, joint: Joint, axis: ArrayLike, point: ArrayLike, values: Mapping[str, float] | None = None
+    ) -> None:
+        """Append a joint by its axis at zero readings: C E J(q) E^-1 C^-1, which is 1 at a reading of zero.
+
+        C brings z onto the axis, as constants. E moves the axis from there: Tx(x) Ty(y) Ry(pitch) Rx(roll) of a joint
+        that turns, the rotations alone of one that slides: what there is to an axis, and no parameter for its zero.
+        The arm is a product of exponentials, and its tool frame that at zero readings (Brockett 1984; Park 1994).
+
+        Args:
+            joint: The moving joint.
+            axis: Direction in the frame behind `base`, shape (3,), of any length but 0.
+            point: Any point on the axis, shape (3,), [m]: x and y move the axis, roll and pitch turn it there.
+            values: x, y, roll and pitch, those missing 0, [m] and [rad].
+
+        Raises:
+            InputError: The axis has no length.
+        """
+        direction, index = as_floats("axis", axis, "(3)"), len(self._joints)
+        if not (length := np.linalg.norm(direction)) > inputs.LEAST_SIZE:
+            raise InputError("axis", f"found {shown(axis)}", "a direction of three numbers")
+        direction = np.where(np.abs(direction) > STRAIGHT * length, direction, 0.0) / length
+        if not self._parameters:
+            self.add_frame("base", {}, 0, False)
+        self._joints.append(joint)
+        there = [*map(Element, Axis, as_floats("point", point, "(3)").tolist()), *_onto(direction)]
+        kinds = SCREW_KINDS[2:] if joint.prismatic else SCREW_KINDS
+        self._elements += there
+        for kind in kinds:
+            self._add_parameter(f"{joint.name}.{kind}", kind, index + 1, (values or {}).get(kind, 0.0), True)
+        there += self._elements[-len(kinds) :]
+        self._elements += [Element(Axis.TZ if joint.prismatic else Axis.RZ, joint=index), *_inverse(there)]
 
     @checked
     def build(
@@ -688,13 +734,15 @@ class RobotBuilder:
         """
         self._check_joints(place)
         behind = len(self._joints) + 1
-        if self._convention in CONVENTIONS and all(p.owner != behind for p in self._parameters):
+        if self._convention in (*CONVENTIONS, POE) and all(p.owner != behind for p in self._parameters):
             self.add_frame("tool", {}, behind, False)
         parts = tuple(self._joints), tuple(self._parameters), tuple(self._elements)
         robot = Robot(self._name, self._convention, *parts, urdf)
         robot = robot.with_effects(*effects) if effects else robot
         fixed, estimate = (robot.own_names(listed(*one)) for one in (("fixed", fixed), ("estimate", estimate)))
         if ZEROS in estimate:
+            if not {*robot.zero_names} <= {*names_of(robot.parameters)}:
+                raise InputError(f"{place}: estimate", "zeros", "parameters", f"{self._convention} has no joint zeros")
             estimate = tuple(name for name in estimate if name != ZEROS)
             free = {*robot.zero_names, *estimate}
             of_joints = names_of(robot.parameters[i] for owner in range(1, behind) for i in robot.owned_by(owner))
@@ -821,6 +869,12 @@ def _joints(
             raise InputError(f"limits: joint {i}", f"found {shown(given)}", "lower below upper, or None")
         joints.append(Joint(str(name), kind == "prismatic", float(lower), float(upper)))
     return joints
+
+
+def _onto(axis: Floats) -> list[Element]:
+    """Rotations that turn z onto a unit vector, shape (3,): constants, so that any axis is elementary."""
+    yaw, pitch = np.arctan2(axis[1], axis[0]), np.arctan2(np.hypot(axis[0], axis[1]), axis[2])
+    return [Element(Axis.RZ, 0.0 if pitch == 0.0 else float(yaw)), Element(Axis.RY, float(pitch))]
 
 
 def _inverse(elements: Sequence[Element]) -> list[Element]:

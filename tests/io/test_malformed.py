@@ -15,6 +15,7 @@ from fg_calib.io import read_measurements
 HEAD = "convention: dh\njoints:\n"
 ROW = "  - {a: 0, alpha: 0, d: 0, theta: 0}\n"
 R = HEAD + ROW
+P = "convention: poe\njoints:\n"
 
 
 def row(text):
@@ -36,7 +37,13 @@ ROBOTS = [
     ('a: 1\nb: \x01\n', 'robot.yaml: not YAML: unacceptable character #x0001 ...'),
     ('name: a\nname: b\n', "robot.yaml:2: key 'name' stands here twice"),
     ('convention: dh\njoints:\n  - {a: 0, alpha: 0, d: 0, theta: 0, beta: 0.1}\n', 'robot.yaml: joint 1: beta: found 0.1, expected none: the convention dh has no beta; dh-hayati has'),
-    ("convention: [dh]\njoints: []\n", "robot.yaml: convention: found ['dh'], expected one of dh, mdh, mdh-hayati, dh-hayati (and 1 more)"),
+    ("convention: [dh]\njoints: []\n", "robot.yaml: convention: found ['dh'], expected one of dh, mdh, mdh-hayati, dh-hayati, poe (and 1 more)"),
+    (P+"  - {axis: [0, 0, 1]}\n", "robot.yaml: joint 1: missing key 'point'"),
+    (P+"  - {axis: [0, 0, 0], point: [0, 0, 0]}\n", "robot.yaml: joint 1: axis: found (0.0, 0.0, 0.0), expected a direction of three numbers"),
+    (P+"  - {axis: [0, 0, 1], type: prismatic, y: 0.1}\n", "robot.yaml: joint 1: x or y of a slide, expected pitch and roll: it has a direction alone"),
+    (P+"  - {axis: [0, 0, 1], point: [0, 0, 0], pitch: 30}\n", "robot.yaml: joint 1: pitch: found 30, expected angles in rad, two turns at most; units: {angle: deg} are deg"),
+    (P+"  - {axis: [0, 0, 1], point: [0, 0, 0], d: 1}\n", "robot.yaml: joint 1: unknown key 'd', expected one of type, name, limits, axis, point, x, y, pitch, roll, sigma"),
+    (P+"  - {axis: [0, 0, 1], point: [0, 0, 0]}\nestimate: zeros\n", "robot.yaml: estimate: zeros, expected parameters; poe has no joint zeros"),
 ]
 
 L = '<link name="a"/><link name="b"/>'

@@ -105,6 +105,44 @@ def test_a_robot_written_in_other_units_reads_back_to_rounding(tmp_path, convent
         assert p_back.tolerance == (p.tolerance and pytest.approx(p.tolerance, rel=4.5e-16))
 
 
+AXES = """\
+name: two
+units: {length: mm, angle: deg}
+convention: poe
+joints:
+- {axis: [0.0, 0.0, -1.0], point: [0.0, 0.0, 100.0], x: 0.5, roll: 2.0, limits: [-90.0, 90.0]}
+- {name: slide, axis: [0.6, 0.0, 0.8], point: [0.0, 0.0, 0.0], type: prismatic, limits: [0.0, 200.0]}
+tool: {z: 50.0, roll: 180.0}
+fixed: [q1.roll]
+estimate: [tool.z]
+tolerance: {x: 1.0, pitch: 0.5}
+"""
+
+
+def test_axes_are_read_and_written(tmp_path):
+    robot = read(tmp_path, AXES.replace("[0.6, 0.0, 0.8]", "[3, 0, 4]").replace("x: 0.5", "sigma: {x: 0.1}, x: 0.5"))
+    by_name = {p.name: p for p in robot.parameters}
+    assert [name for name in by_name if name[:4] not in ("base", "tool")] == [
+        "q1.x", "q1.y", "q1.pitch", "q1.roll", "slide.pitch", "slide.roll"]  # fmt: skip
+    assert (by_name["q1.x"].nominal, by_name["q1.x"].tolerance) == pytest.approx((5e-4, 1e-3))
+    assert by_name["slide.pitch"].tolerance == pytest.approx(math.radians(0.5))
+    assert [p.name for p in robot.parameters if p.estimated] == [
+        "q1.x", "q1.y", "q1.pitch", "slide.pitch", "slide.roll", "tool.z"]  # fmt: skip
+    write_robot(tmp_path / "out.yaml", robot, units=Units(length="mm", angle="deg"))
+    assert (tmp_path / "out.yaml").read_text() == AXES
+
+
+@pytest.mark.parametrize("axis", [[1e-17, 6e-17, -1.0], [1e-9, 2e-9, 1.0], [0.0, -1.0, 6e-17], [0.1, -0.2, 0.3]])
+def test_axes_in_any_direction_read_back_with_their_parameters(tmp_path, axis):
+    builder = RobotBuilder("one", "poe")
+    builder.add_screw_joint(Joint("j"), axis, [0.1, 0.2, 0.3], {"x": 0.4, "y": 0.5, "pitch": 0.6, "roll": 0.7})
+    robot = builder.build()
+    write_robot(tmp_path / "one.yaml", robot)
+    back = read_robot(tmp_path / "one.yaml")
+    assert back.nominal.tolist() == robot.nominal.tolist()
+    assert tool_pose(back, np.ones(1)) == pytest.approx(tool_pose(robot, np.ones(1)), abs=rounding(1.0))
+
+
 def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
     """Custom elements would be lost without a word, and a result saved with them could not be loaded."""
     robot = Robot.from_dh([[0.1, 0.2, 0.3, 0.4]] * 2)

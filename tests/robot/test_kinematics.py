@@ -50,7 +50,7 @@ def test_a_urdf_joint_moves_about_its_own_axis(prismatic):
         assert tool_pose(builder.build(), np.array([0.7])) == pytest.approx(frame(**origin) @ motion, abs=rounding(1.0))
 
 
-@pytest.mark.parametrize(("convention", "n"), diagonal([*CONVENTIONS, "urdf"], [1, 2, 3, 6, 7, 12], every=3))
+@pytest.mark.parametrize(("convention", "n"), diagonal([*CONVENTIONS, "urdf", "poe"], [1, 2, 3, 6, 7, 12], every=3))
 def test_poses_and_derivatives_equal_4x4_products_and_central_differences(convention, n):
     rng = np.random.default_rng(100 + n)
     robot = random_robot(convention, n, rng)
@@ -199,7 +199,7 @@ def pose_with_coefficients(robot, values, q):
     return T
 
 
-@pytest.mark.parametrize("convention", [*CONVENTIONS, "urdf"])
+@pytest.mark.parametrize("convention", [*CONVENTIONS, "urdf", "poe"])
 def test_coefficients_times_functions_of_readings(convention):
     rng = np.random.default_rng(7)
     robot = with_coefficients(random_robot(convention, 4, rng), rng)
