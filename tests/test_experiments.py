@@ -15,6 +15,7 @@ import verify  # noqa: E402
 QUICK = [
     ("paper", "identifiability"), ("paper", "claims"), ("real_data", "panda"), ("validation", "landmarks"),
     ("validation", "outliers"), ("validation", "monitoring"), ("design", "criteria"), ("speed", "steps"),
+    ("effects", "ranks"), ("effects", "arm"),
 ]  # fmt: skip
 
 
