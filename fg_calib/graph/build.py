@@ -95,7 +95,7 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     if not kept:
         found = "the rows determine none of the parameters to estimate"
         raise ProblemError(problem.data.source, found, "rows that some of them act on")
-    reduced = robot.with_estimated(kept)
+    reduced = robot.with_estimated([*kept, *(p.name for p in robot.parameters if p.kind == "curve" and p.estimated)])
     variables = variables_of(reduced, data, options)
     return problem_at(reduced, data, options, variables, start, whole=problem, evaluated=evaluated)
 

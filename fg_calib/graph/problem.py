@@ -157,9 +157,10 @@ class Problem(FrozenArrays):
     def _without_curves(self, parameters: Floats, curves: Curves, with_loss: bool) -> Eliminated:
         """The rows with error curves, then landmarks, eliminated."""
         v, at = self.variables, self.variables.at(parameters)
-        if with_loss:
-            curves = curves._replace(sigma=curves.sigma / np.sqrt(loss_variance(self)))
-        found, (r, J) = self.rows.without_curves(at, curves), unknown_prior_rows(v, parameters)
+        ratio, (r, J) = np.sqrt(loss_variance(self) if with_loss else 1.0), unknown_prior_rows(v, parameters)
+        found = self.rows.without_curves(at, curves._replace(sigma=curves.sigma / ratio))
+        less = {name: getattr(found, name) / ratio for name in ("own", "A", "b")}
+        found = replace(found, **less, inverse=found.inverse * ratio)
         n, of_curves = v.n_columns, len(curves.sigma)
         others = np.column_stack([np.delete(J, np.s_[n : n + of_curves], axis=1), r])[of_curves:]
         return eliminate_more(found, others, n)
