@@ -655,7 +655,9 @@ def write_report(path: Path | str, folder: Path | str | None = None, *, figures:
 
 def _with_priors(robot: Robot, result: io.Result) -> Robot:
     """A robot with the priors of a result, which may have been estimated, and with its estimated parameters."""
-    robot, prior = robot.with_estimated(result.covariance.names), {p.name: p.prior_sigma for p in result.parameters}
+    curves = [p.name for p in robot.parameters if p.kind == "curve"]
+    estimated = {p.name for p in result.estimated}.intersection(curves).union(result.covariance.names)
+    robot, prior = robot.with_estimated(estimated), {p.name: p.prior_sigma for p in result.parameters}
     return replace(
         robot, parameters=tuple(replace(p, tolerance=prior[p.name] or p.tolerance) for p in robot.parameters)
     )
@@ -680,8 +682,15 @@ def _posterior(robot: Robot, result: io.Result, place: str) -> TangentCovariance
     if saved is None or saved.variables != {v.symbol: tuple(variables.names[v.columns]) for v in variables.items}:
         raise InputError(place, "other variables than the robot and the covariance have", f"{n} columns of them")
     matrices = (saved.covariance, saved.undetermined, saved.undetermined_at_nominal)
-    found = TangentCovariance(variables, values, *(matrix.reshape(len(matrix), n) for matrix in matrices))
-    if not np.allclose(np.diag(found.named()), np.diag(covariance), 1e-6, 0.0, equal_nan=True):
+    curves = saved.curves if len(saved.curves) else np.zeros((0, n))
+    found = TangentCovariance(variables, values, *(M.reshape(len(M), n) for M in matrices), curves=curves)
+    if len(curves) != variables.n_curves:
+        raise InputError(f"{place}: curves", f"{len(curves)} rows", f"{variables.n_curves}, one a coefficient")
+    sigma_of = {one.name: one.sigma for one in result.parameters}
+    sigma = [sigma_of[name] for name in found.curve_names]
+    variance = np.append(np.diag(found.named()), found.variance(curves))
+    expected = np.append(np.diag(covariance), np.array(sigma, dtype=np.float64) ** 2)
+    if not np.allclose(variance, expected, 1e-6, 0.0, equal_nan=True):
         raise InputError(place, "variances of parameters other than those of covariance", "the same", "was it changed?")
     return found
 

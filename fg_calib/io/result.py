@@ -27,7 +27,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import scipy
-from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, WrapSerializer
+from pydantic import (
+    AliasPath,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    WrapSerializer,
+)
 
 from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
@@ -36,7 +46,7 @@ from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_
 from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
 from fg_calib.observability import Identifiability
-from fg_calib.robot import SPAN, Robot, model, pose
+from fg_calib.robot import EFFECT_KINDS, SCALES, SPAN, Robot, model, pose
 
 if TYPE_CHECKING:
     import polars as pl
@@ -134,17 +144,44 @@ def _columns_by_variable(given: Any) -> Any:
     return {v.symbol: given.names[v.columns] for v in given.items} if isinstance(given, Variables) else given
 
 
+def _read_triangle(rows: Any) -> Floats:
+    """The matrix of rows of text, of which each has a figure more than the one before, zeros behind them."""
+    if isinstance(rows, np.ndarray):
+        return rows
+    try:
+        figures = [np.array(row.split(), dtype=np.float64) for row in rows]
+    except (TypeError, AttributeError) as error:  # pydantic reports ValueError alone
+        raise ValueError(str(error)) from None
+    out = np.zeros((len(figures), len(figures[-1]) if figures else 0))
+    for k, row in enumerate(figures):
+        n = out.shape[1] - len(figures) + k + 1
+        if len(row) != n:
+            raise ValueError(f"{len(row)} figures in row {k + 1} instead of {n}")
+        out[k, :n] = row
+    return out
+
+
+def _triangle_as_text(values: Floats) -> list[str]:
+    first = values.shape[1] - len(values) + 1
+    return [" ".join(f"{x:.9g}" for x in row[: first + k].tolist()) for k, row in enumerate(values)]
+
+
+Triangle = Annotated[Floats, PlainValidator(_read_triangle), PlainSerializer(_triangle_as_text)]
+"""A matrix whose last columns are a lower triangle, which alone is written, a text of nine digits a figure a row."""
+
+
 class Posterior(Section):
     """The covariance in the tangent space of the variables, and the undetermined directions, for predictions.
 
     Columns are those of the variables one after the other: the parameters of a vector; of a pose, the rotation about
-    its own x, y, z axes, then the translation along them.
+    its own x, y, z axes, then the translation along them. For `curves` see `TangentCovariance`.
     """
 
     variables: Annotated[dict[str, tuple[str, ...]], BeforeValidator(_columns_by_variable)]
     covariance: Floats = of("tangent")
     undetermined: Floats
     undetermined_at_nominal: Floats
+    curves: Triangle = Field(default_factory=lambda: np.zeros((0, 0)))
 
 
 class Knowledge(Section):
@@ -508,7 +545,10 @@ def _shapes(result: Result) -> Iterator[tuple[str, Any, Any]]:
     names, sigmas = result.covariance.names, {p.name: p.sigma for p in result.parameters}
     matrices = [("covariance", result.covariance.matrix, len(names))]
     if (posterior := result.posterior) is not None:
-        matrices.append(("posterior: covariance", posterior.covariance, sum(map(len, posterior.variables.values()))))
+        n, C = sum(map(len, posterior.variables.values())), posterior.curves
+        matrices.append(("posterior: covariance", posterior.covariance, n))
+        yield "posterior: curves: shape", C.shape if C.size else (0, 0), (len(C), n + len(C)) if C.size else (0, 0)
+        yield "posterior: curves: values that are none", int(np.sum(~(np.abs(C) < MOST_VALUE))), 0
     for key, M, n in matrices:
         yield f"{key}: shape", M.shape if M.size else (0, 0), (n, n)
         yield f"{key}: negative variances", int(np.sum(np.diag(M) < 0.0)) if n else 0, 0
@@ -686,16 +726,22 @@ def _write_robot(path: Path, robot: Robot) -> None:
         file, own = path.with_suffix(".urdf"), has_own_zeros(robot)
         write_urdf(file, robot)
         links = {"base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
-        require_same_chain(robot, read_robot(file, **links, estimate=[model.ZEROS] * own), str(file))
+        require_same_chain(robot.geometry, read_robot(file, **links, estimate=[model.ZEROS] * own), str(file))
         ends = [p for p in robot.parameters if p.owner in (0, robot.n_joints + 1)]
-        if not own and not any(p.nominal != 0.0 or p.estimated for p in ends):
+        if not own and not robot.effects and not any(p.nominal != 0.0 or p.estimated for p in ends):
             return
-    rounded = [
-        round(p.nominal / factor, math.ceil(math.log10(factor / RESOLUTION))) * factor if p.estimated else p.nominal
-        for p, factor in ((p, units.factor(p.unit)) for p in robot.parameters)
-    ]
+    rounded = []
+    for p, resolution in zip(robot.parameters, _resolutions(robot), strict=True):
+        factor = 1.0 if p.kind in EFFECT_KINDS else units.factor(p.unit)  # effects are written in SI
+        digits = math.ceil(math.log10(factor / resolution))
+        rounded.append(round(p.nominal / factor, digits) * factor if p.estimated else p.nominal)
     name = None if robot.urdf is None else "robot_calibrated.urdf"
     write_robot(path, robot.with_values(rounded), units=units, urdf_name=name)
+
+
+def _resolutions(robot: Robot) -> list[float]:
+    """`RESOLUTION` of each parameter in its unit: by its ordinary change over those of m and rad."""
+    return [RESOLUTION * SCALES[p.unit].ordinary / SCALES["m"].ordinary for p in robot.parameters]
 
 
 def read_calibrated_robot(folder: Path, result: Result) -> Robot:
@@ -713,7 +759,7 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     names, estimates = [p.name for p in result.parameters], [p.estimate for p in result.parameters]
     same = [p.name for p in robot.parameters] == names
     calibrated = robot.with_values(estimates) if same else robot
-    if not same or not np.allclose(robot.nominal, as_read(calibrated).nominal, 0.0, RESOLUTION):
+    if not same or not np.allclose(robot.nominal, as_read(calibrated).nominal, 0.0, _resolutions(robot)):
         found = "other values" if same else "other parameters"
         raise InputError(str(file), f"{found} than in result.json", "the files of one calibration")
     return calibrated

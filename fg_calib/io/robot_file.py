@@ -162,7 +162,8 @@ def _links_of(root: Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], 
         T = first @ place
         return lambda mass, com: Mass(owner, mass, tuple((T[:3, :3] @ np.array(com) + T[:3, 3]).tolist()))
 
-    links = {name: made for link in root.findall("link") if (made := maker(name := link.get("name", "")))}
+    links: dict[str, Any] = {str(i): partial(Mass, i) for i in range(number + 1)}
+    links |= {name: made for link in root.findall("link") if (made := maker(name := link.get("name", "")))}
     masses = list[Mass]()
     for link in root.findall("link"):
         inertial, made = link.find("inertial"), links.get(link.get("name", ""))

@@ -14,7 +14,7 @@ derivative of the tool's position in joint j.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from fg_calib.graph import Problem, build_variables
 from fg_calib.inputs import Floats, FrozenArrays, Integers, Record
 from fg_calib.measurements import Dataset
 from fg_calib.observability import ObservedQuantities
-from fg_calib.robot import Chain, forward, without_rigid_motion
+from fg_calib.robot import Chain, Context, forward, without_rigid_motion
 from fg_calib.statistics import TangentCovariance
 
 MAX_CONFIGURATIONS = 1000
@@ -32,7 +32,7 @@ MAX_CONFIGURATIONS = 1000
 MIN_JUDGED = 10
 """Test configurations below which the train ones are looked at: a rigid fit takes up the errors of few."""
 
-_AT_ONCE = 2000
+_AT_ONCE = 500
 """Configurations at once: derivatives of all would fill the memory."""
 
 
@@ -105,7 +105,8 @@ def errors_at(covariance: TangentCovariance, readings: Floats) -> tuple[PoseRms,
         covariance: The covariance at the estimate.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
     """
-    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), readings)
+    few = readings[_evenly(np.arange(len(readings)))] if len(covariance.curves) else readings
+    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), few)
     return pose_rms(points, motion, covariance.variance)
 
 
@@ -114,7 +115,7 @@ def pose_rms(points: Floats, jacobian: Floats, variance: Callable[[Floats], Floa
 
     Args:
         points: Tool points, shape (n, 3), [m].
-        jacobian: (w, v) of each, shape (n, 6, n_columns).
+        jacobian: (w, v) of each as rows of a covariance, shape (n, 6, n_columns).
         variance: Of linear functions of the columns, shape (m, n_columns), nan where not determined: shape (m,).
     """
     w, v = jacobian[:, :3], jacobian[:, 3:]
@@ -140,22 +141,41 @@ def base_chain(covariance: TangentCovariance) -> Chain:
     return chain.at(covariance.parameters).with_joint_columns()
 
 
-def tool_derivatives(covariance: TangentCovariance, chain: Chain, readings: Floats) -> tuple[Floats, Floats, Floats]:
-    """Tool points, shape (n, 3), [m], and (w, v) in the columns, shape (n, 6, n_columns), and in the joints.
+def tool_derivatives(
+    covariance: TangentCovariance, chain: Chain, readings: Floats, context: Context | None = None
+) -> tuple[Floats, Floats, Floats]:
+    """Tool points, shape (n, 3), [m], and (w, v) as rows of the covariance, shape (n, 6, m), and in the joints.
 
     Args:
-        covariance: The covariance, whose columns are meant.
+        covariance: The covariance.
         chain: From `base_chain`.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        context: What effects depend on besides: see `Robot.trig`.
     """
-    at = forward(chain, covariance.variables.robot.trig(readings))
-    motion = np.zeros((len(readings), 6, covariance.variables.n_columns))
-    motion[:, :, : chain.n_columns] = at.jacobian[:, :, : chain.n_columns]
+    trig = covariance.variables.robot.trig(readings, context, covariance.parameters)
+    at = forward(chain, trig)
+    motion = _with_curves(covariance, chain, trig, at.jacobian[:, :, : chain.n_columns])
     return at.position, motion, at.jacobian[:, :, chain.n_columns :]
 
 
+def _with_curves(covariance: TangentCovariance, chain: Chain, trig: Floats, jacobian: Floats) -> Floats:
+    """Derivatives in a chain's columns as rows of a covariance, shape (n, 6, n_columns + n_curves)."""
+    v, curves = covariance.variables, covariance.curves
+    rows = np.zeros((*jacobian.shape[:2], v.n_columns + len(curves)))
+    rows[:, :, : chain.n_columns] = jacobian
+    if len(curves):
+        turns = forward(chain.without_columns().with_turn_columns(), trig).jacobian
+        found, errors = chain.splines(trig), np.zeros((len(trig), v.robot.n_joints, rows.shape[2]))
+        for one in (one for one in v.nuisance if one.kind == "curve"):
+            knots, weights = found[one.number - 1]
+            places = knots + one.columns.start - v.n_columns
+            errors[:, one.number - 1] = np.einsum("nk,nkc->nc", weights, curves[places])
+        rows += turns @ errors
+    return rows
+
+
 def predict_poses(
-    covariance: TangentCovariance, readings: Floats, table: int | None = None
+    covariance: TangentCovariance, readings: Floats, table: int | None = None, context: Context | None = None
 ) -> tuple[Floats, Floats, Floats]:
     """Tool points, shape (n, 3), [m], orientations, shape (n, 3, 3), and their joint covariance, shape (n, 6, 6).
 
@@ -166,14 +186,20 @@ def predict_poses(
         covariance: The covariance at the estimate.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
         table: Number of the table in whose estimated measurement frame the poses are; the base frame if None.
+        context: What effects depend on besides: see `Robot.trig`.
     """
     v = covariance.variables
     chain = build_variables(v.robot, [False]).chains[0] if table is None else v.chains[table]
-    at = forward(chain.at(covariance.parameters), v.robot.trig(readings))
-    rows = np.zeros((len(readings), 6, v.n_columns))
-    rows[:, :, : chain.n_columns] = at.jacobian[:, [3, 4, 5, 0, 1, 2]]
-    covariances = np.array([covariance.covariance(one) for one in rows]).reshape(-1, 6, 6)
+    chain, trig = chain.at(covariance.parameters), v.robot.trig(readings, context, covariance.parameters)
+    at, covariances = forward(chain, trig), np.empty((len(readings), 6, 6))
+    for rows in _chunks(len(readings)):
+        motion = _with_curves(covariance, chain, trig[rows], at.jacobian[rows])
+        covariances[rows] = [covariance.covariance(one) for one in motion[:, [3, 4, 5, 0, 1, 2]]]
     return at.position, at.rotation, covariances
+
+
+def _chunks(n: int) -> Iterator[slice]:
+    return (slice(start, start + _AT_ONCE) for start in range(0, n, _AT_ONCE))
 
 
 class ToolErrors(FrozenArrays):
@@ -202,8 +228,8 @@ class ToolPoseUncertainty(FrozenArrays):
         chain: The arm in its base frame, at the estimate.
         sigma_joint: Of joint readings, shape (n_joints,), [rad] (prismatic: [m]); None where it is not known.
         centre: Mean of the measured points, shape (3,), [m].
-        shift: How the best rigid fit moves it, in the columns, shape (3, n_columns).
-        turn: How the best rigid fit rotates about it, in the columns, shape (3, n_columns).
+        shift: How the best rigid fit moves it, as rows of the covariance, shape (3, m).
+        turn: How the best rigid fit rotates about it, likewise.
     """
 
     covariance: TangentCovariance
@@ -232,17 +258,18 @@ class ToolPoseUncertainty(FrozenArrays):
             turn = w.mean(axis=0)  # points that are not determined fit nothing: orientations by their own best rotation
         return cls(covariance, chain, sigma_joint, points.mean(axis=0), (v - left).mean(axis=0), turn)
 
-    def motions(self, readings: Floats, *, fitted: bool) -> Floats:
-        """(w, v) in the columns, after the best rigid fit or in the base frame, shape (n, 6, n_columns)."""
-        points, motion, _ = tool_derivatives(self.covariance, self.chain, readings)
+    def motions(self, readings: Floats, context: Context, *, fitted: bool) -> Floats:
+        """(w, v) as rows of the covariance, after the best rigid fit or in the base frame, shape (n, 6, m)."""
+        points, motion, _ = tool_derivatives(self.covariance, self.chain, readings, context)
         return self._without_fit(points, motion) if fitted else motion
 
-    def at(self, readings: Floats) -> ToolErrors:
-        """Expected errors at joint readings, shape (n, n_joints), [rad] (prismatic: [m])."""
-        n = len(readings)
+    def at(self, readings: Floats, context: Context | None = None) -> ToolErrors:
+        """Expected errors at joint readings, shape (n, n_joints), [rad] (prismatic: [m]); context as `Robot.trig`'s."""
+        n, context = len(readings), context or {}
         position, base, fitted, noise = np.empty((n, 3)), np.empty((n, 2)), np.empty((n, 2)), np.zeros((n, 2))
-        for rows in (slice(start, start + _AT_ONCE) for start in range(0, n, _AT_ONCE)):
-            position[rows], motion, of_joints = tool_derivatives(self.covariance, self.chain, readings[rows])
+        for rows in _chunks(n):
+            there = readings[rows], {name: values[rows] for name, values in context.items()}
+            position[rows], motion, of_joints = tool_derivatives(self.covariance, self.chain, *there)
             base[rows] = self._rms(motion)
             fitted[rows] = self._rms(self._without_fit(position[rows], motion))
             if self.sigma_joint is not None:

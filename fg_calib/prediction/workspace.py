@@ -8,6 +8,7 @@ correlated parameters overlap, so they need not add to 1.
 """
 
 from collections.abc import Mapping
+from dataclasses import field
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, Record
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
-from fg_calib.robot import Robot, pose, random_readings, unit_of
+from fg_calib.robot import Context, Robot, pose, random_readings, unit_of
 from fg_calib.statistics import TangentCovariance
 
 QUANTILES: Mapping[str, float] = {"median": 0.5, "p95": 0.95, "largest": 1.0}
@@ -86,6 +87,7 @@ class PredictedErrors(FrozenArrays):
         far: Whether no measured position is near each of them, shape (n,).
         measured: Where the tool was measured, shape (m, 3), [m].
         limit: Largest allowed position error, [m]; None without any.
+        context: What effects depend on besides: see `Robot.trig`.
     """
 
     model: ToolPoseUncertainty
@@ -95,6 +97,7 @@ class PredictedErrors(FrozenArrays):
     far: Booleans
     measured: Floats
     limit: float | None
+    context: Context = field(default_factory=dict)
 
     @cached_property
     def worst(self) -> WorstConfiguration | None:
@@ -158,6 +161,7 @@ def predict_errors(
     fitted: bool,
     sigma_joint: Floats | None = None,
     limit: float | None = None,
+    context: Context | None = None,
 ) -> PredictedErrors:
     """Expected errors at configurations, or all over the workspace, and where they are largest.
 
@@ -171,23 +175,25 @@ def predict_errors(
         fitted: Whether errors count after the best rigid fit.
         sigma_joint: Of joint readings, shape (n_joints,), [rad] (prismatic: [m]); None where it is not known.
         limit: Largest allowed position error, [m].
+        context: What effects depend on besides at given configurations: see `Robot.trig`.
     """
     model = ToolPoseUncertainty.of(posterior, measured, sigma_joint)
     n, rng = N_DRAWN if readings is None else _N_SAMPLED, np.random.default_rng(0)
     drawn = random_readings(robot, n, rng)
-    errors = model.at(drawn if readings is None else readings)
+    errors = model.at(drawn if readings is None else readings, context)
     points = errors.position if readings is None else pose(robot, drawn).position
     radius = float(np.linalg.norm(points - points.mean(axis=0), axis=1).max())
     measured_points = pose(robot, measured).position
     far = np.asarray(cKDTree(measured_points).query(errors.position)[0]) > FAR * radius
-    return PredictedErrors(model, errors, fitted, readings is not None, far, measured_points, limit)
+    return PredictedErrors(model, errors, fitted, readings is not None, far, measured_points, limit, context or {})
 
 
 def _worst(found: PredictedErrors, row: int) -> WorstConfiguration:
     """The error ellipsoid and the responsible parameters at one configuration."""
-    model, errors = found.model, found.model.at(found.errors.readings[row : row + 1])
-    v = model.motions(errors.readings, fitted=found.fitted)[0, 3:]
-    size, axes = np.linalg.eigh(v @ model.covariance.tangent @ v.T)
+    model, there = found.model, {name: values[row : row + 1] for name, values in found.context.items()}
+    errors = model.at(found.errors.readings[row : row + 1], there)
+    v = model.motions(errors.readings, there, fitted=found.fitted)[0, 3:]
+    size, axes = np.linalg.eigh(model.covariance.covariance(v))
     sigma, axes = np.sqrt(np.maximum(size[::-1], 0.0)), axes.T[::-1]
     axes = axes * np.where(axes[np.arange(3), np.argmax(np.abs(axes), axis=1)] < 0.0, -1.0, 1.0)[:, None]
     responsible = _responsible(model.covariance, v, axes[0] @ v)
@@ -199,16 +205,19 @@ def _responsible(posterior: TangentCovariance, v: Floats, along: Floats) -> tupl
 
     Args:
         posterior: The covariance.
-        v: The error in the columns, shape (3, n_columns).
-        along: The same along one direction, shape (n_columns,): changes are those that go with it.
+        v: The error as rows of the covariance, shape (3, m).
+        along: The same along one direction, shape (m,): changes are those that go with it.
     """
-    variables = posterior.variables
+    variables, curves = posterior.variables, posterior.curves.reshape(-1, v.shape[1])
     named = variables.named_derivative(posterior.parameters)[: variables.n_robot_columns]
+    named = np.vstack([np.pad(named, ((0, 0), (0, len(curves)))), curves])
+    names = (*variables.names[: variables.n_robot_columns], *posterior.curve_names)
     with np.errstate(invalid="ignore", divide="ignore"):  # nan: yaw and roll at a pitch of a quarter turn
-        covariance = named @ posterior.tangent  # of parameters with the columns
+        of_core, own = np.split(named, [len(posterior.tangent)], axis=1)
+        covariance = np.hstack([of_core @ posterior.tangent, own])  # of parameters with the columns
         variance = posterior.variance(named)  # nan: not determined, and so of no part in what is
-        shares = np.square(covariance @ v.T).sum(axis=1) / (variance * np.trace(v @ posterior.tangent @ v.T))
-        changes = covariance @ along / np.sqrt(along @ posterior.tangent @ along)
+        shares = np.square(covariance @ v.T).sum(axis=1) / (variance * posterior.variance(v).sum())
+        changes = covariance @ along / np.sqrt(posterior.variance(along[None]))
     order = np.argsort(-np.nan_to_num(shares, nan=-1.0), kind="stable")[:_NAMED].tolist()
-    chosen = [(variables.names[i], i) for i in order if shares[i] >= _LEAST_SHARE]
+    chosen = [(names[i], i) for i in order if shares[i] >= _LEAST_SHARE]
     return tuple(Responsible(name, unit_of(name), float(shares[i]), float(changes[i])) for name, i in chosen)

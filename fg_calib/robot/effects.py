@@ -180,7 +180,7 @@ class _Moments:
         """Rotation (n, 3, 3) and origin (n, 3) behind the first elements of the chain."""
         if n_elements not in self._frames:
             part = replace(self.robot, elements=(Element(Axis.TX), *self.robot.elements[:n_elements]))
-            at = forward(replace(build_chain(part), curves=()), part.trig(self.readings))
+            at = forward(build_chain(part), part.trig(self.readings))
             self._frames[n_elements] = at.rotation, at.position
         return self._frames[n_elements]
 

@@ -400,8 +400,10 @@ class Robot(inputs.Record):
 
     @cached_property
     def geometry(self) -> Robot:
-        """The robot without effects; parameters keep their places."""
-        return replace(self, elements=tuple(e for e in self.elements if e.basis is None), effects=())
+        """The robot without effects and their parameters; the others keep their places."""
+        elements = tuple(e for e in self.elements if e.basis is None)
+        parameters = tuple(p for p in self.parameters if p.kind not in EFFECT_KINDS)
+        return replace(self, elements=elements, parameters=parameters, effects=())
 
     @cached_property
     def terms(self) -> tuple[tuple[Term, ...], ...]:

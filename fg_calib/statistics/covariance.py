@@ -18,7 +18,7 @@ estimate is known to be, whatever x_L, is that of the combination `x_K + G x_L`,
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +41,11 @@ class TangentCovariance(FrozenArrays):
         undetermined: Undetermined directions at the estimate, orthonormal in changes of ordinary size, shape
             (n_undetermined, n_columns).
         undetermined_at_nominal: Such directions at the nominal parameters.
+        curves: Errors of the coefficients of error curves: how they follow the columns, then a triangular root of what
+            they vary by at given columns, shape (n_curves, n_columns + n_curves).
+
+    Linear functions are given by rows: derivatives in the columns and, where a function depends on error curves with
+    derivatives C, `C @ curves` added. Columns after the first `n_columns` are of independent errors of variance 1.
     """
 
     variables: graph.Variables
@@ -48,11 +53,19 @@ class TangentCovariance(FrozenArrays):
     tangent: Floats
     undetermined: Floats
     undetermined_at_nominal: Floats
+    curves: Floats = field(default_factory=lambda: np.zeros((0, 0)), kw_only=True)
+
+    @property
+    def curve_names(self) -> tuple[str, ...]:
+        """Names of the coefficients of error curves that were estimated, shape (n_curves,)."""
+        of_curves = (v for v in self.variables.nuisance if v.kind == "curve")
+        return tuple(self.variables.robot.parameters[i].name for v in of_curves for i in v.parameters)
 
     def covariance(self, rows: Floats) -> Floats:
-        """Covariance of linear functions of the columns, shape (m, n_columns); nan where undetermined."""
+        """Covariance of linear functions, shape (m, n_columns + n_curves or none); nan where undetermined."""
+        core, own = np.split(rows, [len(self.tangent)], axis=1)
         with np.errstate(invalid="ignore"):  # yaw and roll at a pitch of a quarter turn have no derivative
-            out: Floats = rows @ self.tangent @ rows.T
+            out: Floats = core @ self.tangent @ core.T + own @ own.T
         unknown = self._unknown(rows) | ~np.isfinite(np.diag(out))
         out[unknown, :] = np.nan
         out[:, unknown] = np.nan
@@ -60,14 +73,15 @@ class TangentCovariance(FrozenArrays):
 
     def variance(self, rows: Floats) -> Floats:
         """The diagonal of `covariance`, shape (m,)."""
+        core, own = np.split(rows, [len(self.tangent)], axis=1)
         with np.errstate(invalid="ignore"):
-            out: Floats = np.einsum("ij,ij->i", rows @ self.tangent, rows)
+            out: Floats = np.einsum("ij,ij->i", core @ self.tangent, core) + np.einsum("ij,ij->i", own, own)
         out[self._unknown(rows) | ~np.isfinite(out)] = np.nan
         return out
 
     def _unknown(self, rows: Floats) -> NDArray[np.bool_]:
         """Which linear functions have a share in what nothing determines, at nominal and at the estimate."""
-        scaled = rows * self.variables.scales
+        scaled = rows[:, : len(self.tangent)] * self.variables.scales
         with np.errstate(invalid="ignore"):
             size = np.linalg.norm(scaled, axis=1)
             shares = [np.linalg.norm(scaled @ D.T, axis=1) for D in (self.undetermined, self.undetermined_at_nominal)]
@@ -124,7 +138,12 @@ class Spread(TangentCovariance):
         grown = np.eye(self.rank) + (variance - 1.0) * (np.eye(self.rank) - priors.T @ priors)
         root = np.hstack([half @ np.linalg.cholesky(grown), held])
         more = root @ root.T - self.tangent
-        return replace(self, root=root, tangent=self.tangent + more, actual=self.actual + more)
+        n = self.variables.n_columns
+        follow, own = np.split(self.curves, [n], axis=1)
+        sure = own / self.variables.all_scales[n : n + len(own), None]  # of their priors
+        grown = np.eye(len(own)) + (variance - 1.0) * (np.eye(len(own)) - sure.T @ sure)
+        curves = np.hstack([follow, np.linalg.cholesky(own @ grown @ own.T)])
+        return replace(self, root=root, tangent=self.tangent + more, actual=self.actual + more, curves=curves)
 
 
 def spread_of(solution: graph.Solution) -> Spread:
@@ -160,7 +179,14 @@ def spread_of(solution: graph.Solution) -> Spread:
         undetermined_at_nominal=_orthonormal(undetermined_at_nominal, variables.scales),
         rank=rank,
         excess=float(np.trace(middle)),
+        curves=_curves_of(system, variables.n_curves),
     )
+
+
+def _curves_of(system: graph.NormalSystem, n: int) -> Floats:
+    """`TangentCovariance.curves` of a system, whose first nuisance columns are those of the curves."""
+    own = system.left.inverse[:n]
+    return np.hstack([system.left.follow[:n], np.linalg.cholesky(own @ own.T)])
 
 
 def held_frames(undetermined: Floats, undetermined_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
@@ -221,6 +247,11 @@ def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
     def moved(own: Floats, M: Floats, errors: Floats) -> Floats:
         return _orthonormal(np.vstack([(own * own_scales) @ M.T, errors[:, ~known].T]), variables.scales)
 
+    curves = np.zeros((0, variables.n_columns))
+    if n := len(spread.curves):  # as they follow all parameters
+        weighted = problem.state.weights is not None
+        left = replace(problem, variables=variables).linearize(solution.parameters, with_loss=weighted).left
+        curves = np.hstack([left.follow[:n], spread.curves[:, len(own_scales) :]])
     return replace(
         spread,
         variables=variables,
@@ -228,6 +259,7 @@ def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
         actual=M @ spread.actual @ M.T + of_left_out @ of_left_out.T,
         undetermined=moved(spread.undetermined, M, errors),
         undetermined_at_nominal=moved(spread.undetermined_at_nominal, M_nominal, errors_nominal),
+        curves=curves,
     )
 
 

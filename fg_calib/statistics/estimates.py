@@ -20,19 +20,24 @@ LEAST_SHARE = 1e-3
 """Share of a reading's variance below which the measurements say nothing of its error."""
 
 
+MEASURED_SHARE = 0.9
+"""Sigma over prior sigma of an error curve's coefficient from which rows do not measure it."""
+
+
 class ParameterEstimate(Record):
     """One parameter of the robot after calibration.
 
     Attributes:
         name: Its name.
-        unit: `m` or `rad`.
+        unit: `m`, `rad`, or another of `robot.SCALES`.
         nominal: Nominal value.
         estimate: Estimated value; nominal if it is fixed.
         correction: Estimate minus nominal; angles of a frame by the shorter way (see `factors.corrections_of`).
         sigma: 1 sigma of estimate minus true; 0 if fixed; None where neither data nor priors determine it. Of a
             parameter that was left out to fix the gauge: its prior sigma.
         prior_sigma: 1 sigma of its prior; None without one.
-        identifiability: Class by the data alone: `independent`, `relative`, `ineffective`; or `fixed`.
+        identifiability: Class by the data alone: `independent`, `relative`, `ineffective`; or `fixed`. Coefficients of
+            an error curve are relative, to the joint's zero, where rows measure them, ineffective elsewhere.
         stands_for: Of a relative parameter that was kept where others were left out to fix the gauge: the combination
             that it was estimated for, factors by name; else None.
         sigma_of_combination: 1 sigma of the estimate as one of that combination; None where it stands for itself.
@@ -187,6 +192,10 @@ def _parameters(
     problem, estimated = solution.problem, spread.variables.names
     classes = dict(zip(observability.names, observability.classes, strict=True))
     sigmas = dict(zip(observability.names, np.sqrt(np.diag(whole.named())), strict=True))
+    of_curves = dict(zip(whole.curve_names, np.sqrt(whole.variance(whole.curves)).tolist(), strict=True))
+    for p in (p for p in problem.robot.parameters if p.name in of_curves):
+        learned = of_curves[p.name] < MEASURED_SHARE * (p.tolerance or np.inf)
+        classes[p.name], sigmas[p.name] = "relative" if learned else "ineffective", of_curves[p.name]
     combinations: dict[str, dict[str, float]] = {}
     for group in observability.relative if problem.whole is not None else ():
         combinations |= group.combinations([name for name in group.parameters if name in estimated])

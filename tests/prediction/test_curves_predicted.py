@@ -1,0 +1,161 @@
+"""Predictions of an arm with error curves: covariances against dense sums, errors against draws, saved and loaded."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fg_calib import Calibration, InputError, Measurements, Options, Robot, build_problem, calibrate, predict, solve
+from fg_calib.graph.problem import square_root
+from fg_calib.prediction import errors_at, predict_poses, workspace
+from fg_calib.robot import Compliance, ErrorCurve, Gain, Mass, build_chain, forward
+from fg_calib.statistics import spread_of, with_left_out
+
+ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
+LOAD = Compliance([Mass(3, 10.0, (0.2, 0.0, 0.1))], [2, 3])
+MEASURED = 1.5
+"""Joint 2 is measured within, [rad]."""
+
+
+def drawn(seed=0, n=40, tolerance=TOLERANCE, **options):
+    """A problem, and the true arm that it was measured on."""
+    rng, effects = np.random.default_rng(seed), (ErrorCurve([2, 3], knots=8, sigma=1e-3), LOAD, Gain([2]))
+    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=tolerance).with_effects(*effects)
+    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
+    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    q = rng.uniform(-2.5, 2.5, (n, 4)) * [1.0, MEASURED / 2.5, 1.0, 1.0]
+    p = forward(build_chain(true), true.trig(q)).position + 1e-4 * rng.normal(size=(n, 3))
+    data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
+    return build_problem(robot, data, Options(model="position", **options)), true
+
+
+def position_derivative(variables, x, q):
+    """Of tool points in all columns of core and curves, shape (3 n, n_columns + n_curves), by central differences."""
+    robot, steps = variables.robot, 1e-6 * np.eye(variables.n_columns + variables.n_curves)
+    trig = robot.trig(q, values=x)  # loads as they are
+
+    def at(step):
+        moved = variables.moved(x, step)
+        return forward(build_chain(robot.with_values(moved[variables.robot_span])), trig).position.ravel()
+
+    return np.array([(at(h) - at(-h)) / 2e-6 for h in steps]).T
+
+
+@pytest.mark.parametrize(("seed", "options"), [(0, {}), (1, {"loss": "huber"})])
+def test_covariance_of_predicted_poses_is_the_dense_sum(seed, options):
+    solution = solve(drawn(seed, **options)[0])
+    x, v = solution.parameters, solution.problem.variables
+    root = solution.problem.linearize(x, with_loss=True).full_root
+    q = np.random.default_rng(2).uniform(-3.0, 3.0, (12, 4))
+    J = position_derivative(v, x, q).reshape(12, 3, -1)
+    expected = np.einsum("nij,jk,nlk->nil", J, root @ root.T, J)
+    spread = spread_of(solution)
+    assert predict_poses(spread, q)[2][:, :3, :3] == pytest.approx(expected, rel=1e-5, abs=1e-14)  # of differences
+    assert spread.variance(spread.curves) == pytest.approx(np.square(root).sum(axis=1)[v.n_columns :], rel=1e-9)
+
+
+def test_covariance_with_parameters_left_out_is_the_dense_sum():
+    """Their own errors are of their tolerances, and others, curves among them, make up for them."""
+    solution = solve(drawn(gauge="keep")[0])
+    problem, x = solution.problem, solution.parameters
+    whole = problem.whole.variables
+    A = square_root(replace(problem, variables=whole), x)[:, :-1]
+    kept = np.array([*(name in problem.variables.names for name in whole.names), *[True] * whole.n_curves])
+    assert 0 < np.sum(~kept)
+    assert problem.variables.n_curves == 16
+    tolerances = [p.tolerance for p in problem.whole.estimated if p.name not in problem.variables.names]
+    noise, errors = np.linalg.pinv(A[:, kept]), -np.eye(len(kept))[:, ~kept] * tolerances
+    errors[kept] = noise @ A[:, ~kept] * tolerances
+    C = errors @ errors.T
+    C[np.ix_(kept, kept)] += noise @ noise.T
+    q = np.random.default_rng(2).uniform(-3.0, 3.0, (12, 4))
+    J = position_derivative(whole, x, q).reshape(12, 3, -1)
+    found = predict_poses(with_left_out(solution, spread_of(solution)), q)[2][:, :3, :3]
+    assert found == pytest.approx(np.einsum("nij,jk,nlk->nil", J, C, J), rel=1e-5, abs=1e-14)  # of differences
+
+
+def test_noise_of_more_variance_leaves_priors_of_curves_as_they_are():
+    """Where no row is the prior stays; elsewhere the covariance is that of the same estimate from noisier rows."""
+    spread = spread_of(solve(drawn()[0]))
+    n, own = spread.variables.n_columns, spread.curves[:, spread.variables.n_columns :]
+    found = spread.inflated(4.0).curves
+    prior, C = np.eye(16) / 1e-3**2, own @ own.T
+    rows = np.linalg.inv(C) - prior
+    assert found[:, n:] @ found[:, n:].T == pytest.approx(C @ (4.0 * rows + prior) @ C, abs=1e-12)
+    assert np.array_equal(found[:, :n], spread.curves[:, :n])
+
+
+def test_errors_over_a_range_without_rows_are_as_expected():
+    """By draws of arms: tool errors over the expected ones, where joint 2 was measured and where it was not."""
+    ratios, q = [], np.random.default_rng(9).uniform(-2.5, 2.5, (60, 4))
+    far = np.abs(q[:, 1]) > MEASURED + np.pi / 4.0  # no spline reaches there from the rows
+    q[~far, 1] *= MEASURED / (MEASURED + np.pi / 4.0)
+    for seed in range(30):
+        problem, true = drawn(seed)
+        solution = solve(problem)
+        spread, robot = spread_of(solution), problem.robot.with_values(solution.parameters[: len(true.parameters)])
+        off = forward(build_chain(robot), robot.trig(q)).position - forward(build_chain(true), true.trig(q)).position
+        expected = [errors_at(spread, q[rows])[0].position for rows in (~far, far)]
+        rms = [np.sqrt(np.square(off[rows]).sum(axis=1).mean()) for rows in (~far, far)]
+        ratios.append(np.square(rms) / np.square(expected))
+        assert expected[1] > 3.0 * expected[0]
+    mean, sigma = np.mean(ratios, axis=0), np.std(ratios, axis=0) / np.sqrt(len(ratios))
+    assert np.all(np.abs(mean - 1.0) < 4.0 * sigma)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A calibration, its folder, and what it is when loaded."""
+    problem, _ = drawn()
+    found = calibrate(problem.robot, problem.data.tables[0].measurements, model="position")
+    folder = tmp_path_factory.mktemp("curves")
+    found.save(folder)
+    return found, folder, Calibration.load(folder)
+
+
+def test_parameters_hold_every_coefficient(calibrated):
+    found, root = calibrated[0].parameters, calibrated[0].solution.system.full_root
+    v = calibrated[0].solution.problem.variables
+    for one in (one for one in (*v.items, *v.nuisance) if one.letter in "ES"):
+        for place, sigma in zip(one.places, np.linalg.norm(root[one.columns], axis=1), strict=True):
+            p = v.robot.parameters[place]
+            estimate = found[p.name]
+            assert estimate.sigma == pytest.approx(sigma, rel=1e-9)
+            assert (estimate.estimate, estimate.prior_sigma, estimate.unit) == (
+                calibrated[0].solution.parameters[place], p.tolerance, p.unit)  # fmt: skip
+            assert estimate.identifiability != "fixed"
+    # splines of joint 2 that no row within +-1.5 rad reaches: centred beyond +-(1.5 + pi / 2)
+    assert [found[f"theta2.curve[{k}]"].identifiability for k in (0, 4)] == ["relative", "ineffective"]
+
+
+def test_a_loaded_calibration_predicts_the_same(calibrated, monkeypatch):
+    monkeypatch.setattr(workspace, "N_DRAWN", 200)
+    found, _, loaded = calibrated
+    q = np.random.default_rng(4).uniform(-3.0, 3.0, (40, 4))
+    one, other = found.predict(q), loaded.predict(q)
+    assert np.abs(other.position - one.position).max() < 1e-15
+    assert other.sigma_position == pytest.approx(one.sigma_position, rel=1e-6)
+    assert other.sigma_rotation == pytest.approx(one.sigma_rotation, rel=1e-6)
+    everywhere = [predict(each) for each in (found, loaded)]
+    assert everywhere[1].expected == pytest.approx(everywhere[0].expected, rel=1e-6)
+    assert everywhere[0].worst.responsible[0].name.startswith("theta2.curve[")  # no rows there
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda c: c[0] + " 1", "in row 1 instead of"),
+    (lambda c: c[0].replace(c[0].split()[0], "x"), "could not convert string to float"),
+    (lambda c: c[0].replace(c[0].split()[0], "nan"), "values that are none: found 1, expected 0"),
+    (lambda c: None, "posterior: curves: found"),
+])  # fmt: skip
+def test_damaged_curves_are_named_in_one_line(calibrated, tmp_path, change, message):
+    _, folder, _ = calibrated
+    document = json.loads((folder / "result.json").read_text())
+    document["posterior"]["curves"][0] = change(document["posterior"]["curves"])
+    (tmp_path / "result.json").write_text(json.dumps(document))
+    (tmp_path / "robot_calibrated.yaml").write_text((folder / "robot_calibrated.yaml").read_text())
+    with pytest.raises(InputError) as error:
+        Calibration.load(tmp_path)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
