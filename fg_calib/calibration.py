@@ -479,6 +479,14 @@ class Calibration(Record, repr=False, eq=False):
         """Draw each correction with its sigma."""
         return draw(self.report_data, "parameters")
 
+    def plot_curves(self) -> Drawing:
+        """Draw the error curves of joints with 2 sigma, and where they were measured."""
+        return draw(self.report_data, "curves")
+
+    def plot_compliances(self) -> Drawing:
+        """Draw errors of joints over their torque, with and without their compliance."""
+        return draw(self.report_data, "compliances")
+
     def plot_residuals(self) -> Drawing:
         """Draw residuals row by row, and how they are distributed."""
         return draw(self.report_data, "residuals")

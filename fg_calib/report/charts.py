@@ -166,10 +166,10 @@ class Plot:
         """A ring about a dot; its text shows when it is pointed at."""
         self._add("circle", title(text), cx=self.x(x), cy=self.y(y), r=5.0, class_="ring")
 
-    def curve(self, x: Floats, y: Floats) -> None:
-        """A curve through values."""
+    def curve(self, x: Floats, y: Floats, kind: str = "curve") -> None:
+        """A curve through values, or the area within it."""
         points = zip(self.x(x).tolist(), self.y(y).tolist(), strict=True)
-        self._add("path", d="M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in points), class_="curve")
+        self._add("path", d="M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in points), class_=kind)
 
     def box(self, x: tuple[float, float], y: tuple[float, float], about: str = "", **attributes: str) -> None:
         """A rectangle between values; what it is about shows when it is pointed at."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fg_calib import robot, simulation
 from fg_calib.inputs import Booleans, Floats, InputError
 from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
-from fg_calib.report.tables import shown_in
+from fg_calib.report.tables import figure, in_words, shown_in
 from fg_calib.report.text import ReportData
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ MAX_SIGMA = 5.0
 MAX_STUDENTISED = 12.0
 """Residuals in their sigma, up to which rows are drawn where they are."""
 
+MIN_TORQUE_RANGE = 1e-6
+"""Range of torques that is more than rounding, [N m]."""
+
 WORST = 5
 """Dots that are marked by name."""
 
@@ -42,6 +47,8 @@ def figures_of(data: ReportData) -> dict[str, Sequence[Chart]]:
     space = None if data.result.evaluated_only else data.workspace
     return {
         "parameters": list(parameter_whiskers(data)),
+        "curves": list(error_curves(data)),
+        "compliances": list(errors_over_torque(data)),
         "residuals": residual_charts(data),
         "joints": list(error_over_joints(data)),
         "correlations": correlation_matrix(data),
@@ -96,7 +103,7 @@ def parameter_whiskers(data: ReportData) -> Iterator[Chart]:
     """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
     for unit in robot.SCALES:
         what = {"m": "Lengths", "rad": "Angles"}.get(unit, "Effects of joints")
-        shown = [p for p in data.result.estimated if p.unit == unit]
+        shown = [p for p in data.result.estimated if p.unit == unit and robot.kind_of(p.name) != "curve"]
         if not shown:
             continue
         columns = [[p.correction for p in shown], [p.sigma for p in shown], [p.prior_sigma for p in shown]]
@@ -111,6 +118,73 @@ def parameter_whiskers(data: ReportData) -> Iterator[Chart]:
         for known, kind in ((np.isfinite(sigma), "large a"), (np.isnan(sigma), "large b")):
             plot.dots(value[known], row[known], kind)
         yield plot.chart(f"{what}: correction {name}")
+
+
+def error_curves(data: ReportData) -> Iterator[Chart]:
+    """Error curves of joints over their range or a turn, with 2 sigma to both sides, and the fitted readings."""
+    posterior, (unit, factor, *_) = data.posterior, shown_in("rad")
+    for v in (v for v in posterior.variables.nuisance if v.kind == "curve"):
+        joint, n = data.robot.joints[v.number - 1], len(v.places)
+        low, high = (joint.lower, joint.upper) if joint.upper - joint.lower < 2.0 * np.pi else (-np.pi, np.pi)
+        x = np.linspace(low, high, 2 * n + 1)
+        knots, weights = robot.spline(x, n)
+        turn = np.einsum("nk,nk->n", weights, posterior.parameters[v.places[knots]]) * factor
+        errors = posterior.curves[v.columns.start - posterior.variables.n_columns + knots]
+        variance = posterior.variance(np.einsum("nk,nkc->nc", weights, errors))
+        band = turn + 2.0 * np.nan_to_num(np.sqrt(variance)) * factor * np.array([[-1.0], [1.0]])
+        names = f"{charts.short(joint.name, 40)} [{unit}]", f"error [{unit}]"
+        plot = Plot((low * factor, high * factor), limits_of(band), names)
+        plot.curve(np.append(x, x[::-1]) * factor, np.append(band[0], band[1, ::-1]), "band")
+        plot.curve(x * factor, turn)
+        if data.configurations is not None:
+            q = np.unique(np.round((data.readings[~data.held_out, v.number - 1] - low) % (2.0 * np.pi), 2)) + low
+            plot.dots(q * factor, np.full(len(q), plot.y.low), "a")
+        yield plot.chart(f"{joint.name}: error curve, and the readings of fitted rows")
+
+
+def errors_over_torque(data: ReportData) -> Iterator[Chart]:
+    """Errors of joints that give way over their torque, with their compliance and without it."""
+    if (errors := joint_errors(data)) is None:
+        return
+    known = {p.name: p for p in data.result.parameters}
+    for effect in (e for e in data.robot.effects if isinstance(e, robot.Compliance)):
+        alone = replace(data.robot, effects=(effect,))
+        torques = alone.trig(data.readings)[:, alone.n_joints :, 0].T
+        for term, tau in zip(alone.terms[0], torques, strict=True):
+            if not term.name.endswith(".compliance") or np.ptp(tau) < MIN_TORQUE_RANGE:
+                continue
+            p, factor, ends = known[term.name], shown_in("rad/(N m)").factor, limits_of(tau)
+            after, line = errors[:, term.owner - 1] * factor, p.estimate * np.array(ends) * factor
+            before = after + p.estimate * tau * factor
+            limits = limits_of(np.nanquantile([after, before], [0.005, 0.995]), line)
+            names = f"torque on {charts.short(data.robot.joints[term.owner - 1].name, 30)} [N m]", "error [urad]"
+            plot = Plot(ends, limits, names)
+            plot.dots(tau, np.clip(before, *limits), "b")
+            plot.dots(tau, np.clip(after, *limits), "a")
+            plot.curve(np.array(ends), line)
+            yield plot.chart(f"{p.name}: {figure(p.estimate, p.unit, '.3g')} ± {in_words(p.sigma, p.unit, '.2g')}")
+
+
+def joint_errors(data: ReportData) -> Floats | None:
+    """Errors of joints, measured minus predicted, each as if it alone made those of the tool's position.
+
+    Shape (n, n_joints), [rad] (prismatic: [m]), nan where there are none; None where no positions were measured.
+    """
+    rows, table = data.residuals, data.configurations
+    if rows is None or table is None or "rms_position" not in table.columns:
+        return None
+    place, error = {name: k for k, name in enumerate(table["id"])}, np.zeros((len(table), 3))
+    for t, (label, _) in enumerate(data.result.tables):
+        of_table = rows.filter(rows["table"] == label) if "table" in rows.columns else rows
+        frame = data.result.frames.get(f"X({t})")
+        world_R_base = np.eye(3) if frame is None else Rotation.from_quat(frame.quaternion_xyzw).as_matrix()
+        for axis, along in zip("xyz", world_R_base, strict=True):
+            some = of_table.filter(of_table["kind"] == f"position.{axis}")
+            error[[place[name] for name in some["a"]]] -= np.outer(some["residual"], along)
+    error[table["rms_position"].is_null()] = np.nan
+    arm = data.robot.geometry
+    J = robot.forward(robot.build_chain(arm).with_joint_columns(), arm.trig(data.readings)).jacobian[:, 3:]
+    return np.einsum("ni,nij->nj", error, J) / np.sum(J**2, axis=1)
 
 
 def correlation_matrix(data: ReportData) -> list[Chart]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import cached_property
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
 from fg_calib.io import Result, key_of
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
-from fg_calib.robot import Robot
+from fg_calib.robot import Robot, kind_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -112,6 +113,7 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
         *_cross_validation(result),
         *expected_tool_error(result.expected_error),
         *section(PARAMETERS, parameter_table(result)),
+        *section(CURVES, _error_curves(result)),
         *section("Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)", _tolerances(result)),
         *section("Combinations that the kept parameters stand for", _combinations(result)),
         *section("Suspicious rows", *_suspicious_rows(found.residuals, "train", most)),
@@ -126,7 +128,7 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
     ]
 
 
-RESIDUALS, PARAMETERS, NOTES = "Residuals (RMS)", "Parameters", "Notes"
+RESIDUALS, PARAMETERS, NOTES, CURVES = "Residuals (RMS)", "Parameters", "Notes", "Error curves of joints"
 """Titles of sections to which the page adds charts, or which it shows first."""
 
 
@@ -287,9 +289,9 @@ def _lengths(result: Result) -> Table:
 
 
 def parameter_table(result: Result) -> Table:
-    """Every parameter; base and tool fixed at zero are left out, and all fixed ones of an evaluation."""
+    """Every parameter but those of curves; base and tool fixed at zero are left out, all fixed ones of evaluations."""
     rows: list[tuple[Any, ...]] = []
-    for p in result.parameters:
+    for p in (p for p in result.parameters if kind_of(p.name) != "curve"):
         if p.identifiability != "fixed":
             more = p.correction, p.nominal, "" if p.prior_sigma is None else p.prior_sigma
             rows.append((p.name, p.estimate, p.sigma, p.unit, *more, p.identifiability))
@@ -297,6 +299,17 @@ def parameter_table(result: Result) -> Table:
             rows.append((p.name, p.estimate, "", p.unit, "", "", "", "fixed"))
     columns = ("", "estimate|q", "± sigma|q", "|unit", "correction|q:+", "nominal|q", "prior|q", "class")
     return table_of(columns, rows)
+
+
+def _error_curves(result: Result) -> Table:
+    """Of each estimated error curve how many coefficients were measured, and their RMS and sigma."""
+    rows, of_curves = [], (p for p in result.estimated if kind_of(p.name) == "curve")
+    for name, each in groupby(of_curves, lambda p: p.name.partition("[")[0]):
+        curve = list(each)
+        measured = np.array([(p.estimate, p.sigma) for p in curve if p.identifiability == "relative"]).reshape(-1, 2)
+        rms = np.linalg.norm(measured, axis=0) / np.sqrt(max(len(measured), 1))
+        rows.append((name, len(curve), len(measured), *rms, "rad", curve[0].prior_sigma))
+    return table_of(("", "coefficients|d", "measured|d", "RMS|q", "± sigma|q", "|unit", "prior|q"), rows)
 
 
 def _tolerances(result: Result) -> Table:
@@ -441,7 +454,7 @@ def _undetermined(solution: graph.Solution, assessed: assessment.Assessment) -> 
     """Explain what fixes the parameters that the data do not determine."""
     estimated, fixed = set(assessed.names), dict[str, list[str]]()
     for p in assessed.estimates.parameters:
-        if p.identifiability in ("relative", "ineffective"):
+        if p.identifiability in ("relative", "ineffective") and kind_of(p.name) != "curve":
             if p.name in estimated and p.prior_sigma is not None:
                 what = "not identifiable from these data, fixed by their priors"
             elif abs(p.correction) <= UNMOVED:

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from lxml import html
-from simulated import measure, small_arm, true_robot
+from scipy.spatial.transform import Rotation
+from simulated import measure, plus, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
 from fg_calib.calibration import write_report
 from fg_calib.report.charts import Scale
+from fg_calib.report.figures import error_curves, errors_over_torque, joint_errors
 from fg_calib.report.html import build_page
+from fg_calib.robot import Compliance, ErrorCurve, Mass
 
 WEAKLY = "Weakly determined (sigma above a tenth of the prior sigma, or of 1 mrad at the reach)"
 SECTIONS = [
@@ -125,6 +128,66 @@ def test_without_tables_the_page_says_what_is_missing(folder, tmp_path):
     page = text_of(html.fromstring(build_page(Calibration.load(tmp_path).report_data)))
     assert "The folder holds no table of configurations: calibrate again with --out to have its charts." in page
     assert "no table of residuals: calibrate again with --out and without --residuals none" in page
+
+
+def drawn(chart, kind):
+    """Values on the axes of what a chart draws as a path of a kind, x and y."""
+    svg = html.fromstring(chart.svg)
+    points = re.findall(r"[ML]([-\d.]+) ([-\d.]+)", svg.xpath(f"//path[contains(@class, '{kind}')]")[0].get("d"))
+    for axis, end, values in zip("xy", ("middle", "end"), np.array(points, dtype=float).T, strict=True):
+        labels = svg.xpath(f"//text[@class='tick {end}']")
+        at = np.array([float(one.get(axis)) for one in labels]) - 3.5 * (axis == "y")
+        yield np.polyval(np.polyfit(at, [float(one.text.replace("\N{MINUS SIGN}", "-")) for one in labels], 1), values)
+
+
+@pytest.fixture(scope="module")
+def with_effects():
+    """An arm with an error curve and compliance, held-out rows of which have joint 4 turned by 1 mrad."""
+    rng, masses = np.random.default_rng(5), [Mass(4, 10.0, (0.3, 0.1, 0.2))]
+    robot = small_arm(TOLERANCE).with_effects(ErrorCurve([1, 2], 8, 1e-3), Compliance(masses, [2]))
+    more = [{"curve": 1e-3 * rng.normal(), "compliance": 1e-4}.get(p.kind, 0.0) for p in robot.parameters]
+    q, frame = rng.uniform(-1.5, 1.5, (60, 4)), (Rotation.from_rotvec([0.5, 1.0, -0.7]), np.ones(3))
+    given = {"sigma": (1e-5, 1e-5), "frame": frame, "n_test": 20, "readings": plus(q, np.s_[40:, 3], 1e-3)}
+    m = replace(measure(robot.with_values(robot.nominal + more), 40, rng, **given), readings=q)
+    return calibrate(robot, m, model="pose", frame="unknown")
+
+
+def test_error_curves_are_drawn_with_two_sigma_and_the_readings(with_effects):
+    _, chart = error_curves(with_effects.report_data)
+    c = np.array([with_effects.parameters[f"theta2.curve[{k}]"].estimate for k in range(8)])
+    x, y = drawn(chart, "curve")
+    knots = np.degrees(np.arange(-4, 5) * np.pi / 4)
+    expected = np.degrees([(c[k - 1] + 4.0 * c[k] + c[(k + 1) % 8]) / 6.0 for k in np.arange(-4, 5) % 8])
+    assert np.interp(knots, x, y) == pytest.approx(expected, abs=1e-3)
+    below, above = list(drawn(chart, "band"))[1].reshape(2, -1)
+    prior = np.degrees(2e-3 * np.sqrt(18.0) / 6.0)  # of three independent coefficients, 1 mrad each
+    width = 0.5 * (above[::-1] - below)
+    assert width[[0, -1]] == pytest.approx(prior, rel=0.05)
+    assert np.all(width[np.abs(x) < 70.0] < 0.52 * prior)  # a constant of all is that of theta2
+    assert np.abs(next(drawn(chart, "dots"))).max() == pytest.approx(86.0, abs=3.0)
+
+
+def test_errors_over_torque_show_the_line_that_the_compliance_takes_away(with_effects):
+    (chart,) = errors_over_torque(with_effects.report_data)
+    k = with_effects.parameters["theta2.compliance"].estimate * 1e6
+    slopes = [np.polyfit(*drawn(chart, kind), 1)[0] for kind in ("curve", "dots b", "dots a")]
+    assert k == pytest.approx(100.0, rel=0.1)
+    assert slopes == pytest.approx([k, k, 0.0], abs=0.1 * k)
+
+
+def test_a_loaded_calibration_draws_its_effects_too(with_effects, tmp_path):
+    with_effects.save(tmp_path)
+    page, loaded = build_page(with_effects.report_data), Calibration.load(tmp_path)
+    assert build_page(loaded.report_data) == page
+    assert loaded.plot_curves()[:4] == loaded.plot_compliances()[:4] == "<svg"
+    assert "Error curves of joints</h2>" in page
+    assert "Compliance of joints</h2>" in page
+
+
+def test_errors_of_joints_are_measured_minus_predicted(with_effects):
+    assert joint_errors(with_effects.report_data)[40:, 3] == pytest.approx(
+        1e-3, rel=0.25
+    )  # noise and errors of the estimate
 
 
 @pytest.mark.slow
