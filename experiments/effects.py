@@ -112,10 +112,10 @@ def ranks_answer(found: Row) -> str:
     gained = []
     for arm, name in ARMS.items():
         each = found[f"{arm} distance-rotation"].items()
-        gained.append(f"{name}: " + ", ".join(f"{e} {row['gained']} of {row['of']}" for e, row in each))
-    words = "All that poses see" if same else "Not all that poses see"
+        gained.append(f"of {name} " + ", ".join(f"{e} {row['gained']} of {row['of']}" for e, row in each))
+    words = "As many coefficients as poses" if same else "Fewer coefficients than poses"
     return (
-        f"{words} in an unknown frame. {'; '.join(gained)}. Lost: compliances about vertical axes, and in the UR10 an "
+        f"{words} in an unknown frame: {'; '.join(gained)}. Lost: compliances about vertical axes, and in the UR10 an "
         "even tilt of joint 1, which compliances of joint 2 repeat"
     )
 
@@ -182,9 +182,9 @@ def arm_answer(found: Row) -> str:
     ratios = {k: ", ".join(f"{cell[f'{k} ratio']:.2f}" for cell in found.values()) for k in ("geometry", "effects")}
     before = rms([cell["before"] for cell in found.values()]) / MM
     return (
-        f"Geometry alone hardly helps, however much is measured. RMS tool error, mm, {before:.1f} nominal, geometry "
-        f"alone -> with effects: {errors}. Realised over expected: with effects {ratios['effects']}, geometry alone "
-        f"{ratios['geometry']}"
+        f"Half of the nominal error stays without them, however much is measured. RMS tool error, mm, {before:.1f} "
+        f"nominal, geometry alone -> with effects: {errors}. Realised over expected: with effects {ratios['effects']}, "
+        f"geometry alone {ratios['geometry']}"
     )
 
 

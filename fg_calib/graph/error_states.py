@@ -352,13 +352,20 @@ class WhitenedRows(Brief):
             return _reduced(n, [self.states.whiten(self.private(at))])
         return _reduced(n, (chunk for part in self.parts for chunk in part.reduce(at)))
 
-    def without_curves(self, at: State, curves: Curves) -> Eliminated:
+    def without_curves(self, at: State, variance: float = 1.0) -> Eliminated:
         """The rows with error curves eliminated, where no errors are shared.
 
         A curve's coefficients, in units of their sigma, are states like others, but with values to linearise at.
+
+        Args:
+            at: The state.
+            variance: Of the rows, in units of that by which they were whitened.
         """
-        y = self.private(at.without_curves())
-        L = _stacked([curve_columns(part.at(at), at.chains[part.table], curves) for part in self.parts]) * curves.sigma
+        curves = at.curves
+        assert curves is not None
+        y = self.private(at.without_curves()) / np.sqrt(variance)
+        L = _stacked([curve_columns(part.at(at), at.chains[part.table], curves) for part in self.parts])
+        L = L * (curves.sigma / np.sqrt(variance))
         before, states = curves.values / curves.sigma, SchurComplement(Sparse(L))
         y[:, -1] -= L @ before
         U = states.triangle

@@ -14,7 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fg_calib.graph.error_states import Curves, Eliminated, WhitenedRows, correlation_of, whitened_rows
+from fg_calib.graph.error_states import Eliminated, WhitenedRows, correlation_of, whitened_rows
 from fg_calib.graph.factors import linearize_factors, measurement_factors, prior_factors, with_added
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, POSE_SLOTS, NoiseState, RowNoise, TableState, same_everywhere
@@ -142,11 +142,11 @@ class Problem(FrozenArrays):
         """
         v, given = self.variables, self.rows  # of the system, which would keep the problem in a cycle
         r, J = prior_rows(v, parameters)
-        priors, curves = np.column_stack([J, r]), v.at(parameters).curves
-        if curves is None or given.states.n_states or self.has_more:
+        priors = np.column_stack([J, r])
+        if not v.n_curves or given.states.n_states or self.has_more:
             rows: Floats | Eliminated = square_root(self, parameters, with_loss=with_loss)
         else:
-            rows = self._without_curves(parameters, curves, with_loss)
+            rows = self._without_curves(parameters, with_loss)
         with np.errstate(over="ignore"):
             size = rows if isinstance(rows, np.ndarray) else rows.A
             if not np.isfinite(np.vdot(size, size) + np.vdot(priors, priors)):
@@ -154,14 +154,12 @@ class Problem(FrozenArrays):
         gather = lambda: given.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
         return NormalSystem(rows, v.n_columns, v.prior_scales, priors, self.rows.states, gather)
 
-    def _without_curves(self, parameters: Floats, curves: Curves, with_loss: bool) -> Eliminated:
+    def _without_curves(self, parameters: Floats, with_loss: bool) -> Eliminated:
         """The rows with error curves, then landmarks, eliminated."""
-        v, at = self.variables, self.variables.at(parameters)
-        ratio, (r, J) = np.sqrt(loss_variance(self) if with_loss else 1.0), unknown_prior_rows(v, parameters)
-        found = self.rows.without_curves(at, curves._replace(sigma=curves.sigma / ratio))
-        less = {name: getattr(found, name) / ratio for name in ("own", "A", "b")}
-        found = replace(found, **less, inverse=found.inverse * ratio)
-        n, of_curves = v.n_columns, len(curves.sigma)
+        v, variance = self.variables, loss_variance(self) if with_loss else 1.0
+        found = self._curve_roots(parameters.tobytes(), variance)
+        r, J = unknown_prior_rows(v, parameters)
+        n, of_curves = v.n_columns, v.n_curves
         others = np.column_stack([np.delete(J, np.s_[n : n + of_curves], axis=1), r])[of_curves:]
         return eliminate_more(found, others, n)
 
@@ -283,6 +281,14 @@ class Problem(FrozenArrays):
         rows, variables = self.rows, self.variables
         return lru_cache(N_REMEMBERED)(lambda x: rows.square_root(variables.at(np.frombuffer(x))))
 
+    @cached_property
+    def _curve_roots(self) -> Callable[[bytes, float], Eliminated]:
+        """The same with error curves eliminated, where no errors are shared; and with so many times the variance."""
+        rows, variables = self.rows, self.variables
+        return lru_cache(N_REMEMBERED)(
+            lambda x, variance: rows.without_curves(variables.at(np.frombuffer(x)), variance)
+        )
+
 
 def with_factors(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:
     """A problem with its rows whitened, and started, at a parameter vector.
@@ -401,7 +407,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
     same = same and not problem.robot.loads
     if (state is None or state is problem.state) and same:
         started = replace(problem, start=parameters)
-        started.__dict__["_square_roots"] = problem._square_roots
+        vars(started).update(_square_roots=problem._square_roots, _curve_roots=problem._curve_roots)
         return started
     return with_factors(problem, parameters, state)
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from fg_calib import Measurements, Options, Robot, build_problem, solve
-from fg_calib.graph import NormalSystem, prior_rows
+from fg_calib.graph import NormalSystem, prior_rows, unknown_prior_rows
+from fg_calib.graph.normal_system import eliminate_more
 from fg_calib.graph.problem import square_root
 from fg_calib.robot import Compliance, ErrorCurve, Mass, build_chain, forward
 
@@ -77,3 +78,17 @@ def test_curves_and_compliance_are_within_their_sigmas():
         root = solution.system.full_root[columns]
         squares.append(e @ np.linalg.pinv(root @ root.T, rcond=1e-12) @ e / root.shape[1])
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (6 * root.shape[1])))  # 4 sigma of the mean
+
+
+def test_rows_of_more_variance_count_for_less():
+    problem, _ = problem_of()
+    v, x = problem.variables, problem.start
+    r, J = prior_rows(v, x)
+    own_r, own_J = unknown_prior_rows(v, x)
+    rows = np.vstack([np.column_stack([own_J, own_r]), problem.rows.square_root(v.at(x)) / np.sqrt(1.7)])
+    expected = NormalSystem(rows, v.n_columns, v.prior_scales, np.column_stack([J, r]))
+    left = eliminate_more(problem.rows.without_curves(v.at(x), 1.7), np.zeros((0, v.n_columns + 1)), v.n_columns)
+    found = NormalSystem(left, v.n_columns, v.prior_scales, np.column_stack([J, r]))
+    sigma = np.linalg.norm(expected.full_root, axis=1)
+    assert found.step / sigma == pytest.approx(expected.step / sigma, abs=1e-6)
+    assert np.linalg.norm(found.full_root, axis=1) == pytest.approx(sigma, rel=1e-8)
