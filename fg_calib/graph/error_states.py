@@ -293,8 +293,9 @@ class WhitenedBlock(Brief):
 
 def curve_columns(block: Block, chain: Chain, curves: Curves) -> Sparse:
     """Derivatives of a block in the coefficients of error curves, shape (rows, n_curves): of joints, times splines."""
-    chain, columns, values = chain.without_columns().with_turn_columns(), list[Integers](), list[Floats]()
+    chain = chain.without_columns().with_turn_columns()
     J = residuals.linearise(block, chain)[1]
+    columns, values = [np.zeros((block.n, 0), dtype=np.int64)], [J[:, :, :0]]
     for end, rows in enumerate(block.ends.T):
         found = chain.splines(block.trig[rows])
         for joint, first in curves.first.items():

@@ -3,6 +3,8 @@
 import gtsam
 import numpy as np
 import pytest
+from simulated import small_arm
+from touches import corners, touch
 
 from fg_calib import Measurements, Options, Robot, build_problem, solve
 from fg_calib.graph import NormalSystem, prior_rows, unknown_prior_rows
@@ -92,3 +94,17 @@ def test_rows_of_more_variance_count_for_less():
     sigma = np.linalg.norm(expected.full_root, axis=1)
     assert found.step / sigma == pytest.approx(expected.step / sigma, abs=1e-6)
     assert np.linalg.norm(found.full_root, axis=1) == pytest.approx(sigma, rel=1e-8)
+
+
+def test_points_in_contact_and_distances_between_them_tell_curves():
+    rng = np.random.default_rng(4)
+    robot = small_arm({"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}).with_effects(ErrorCurve([2, 4], knots=8))
+    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
+    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    apart = [(0, k, 1e-4) for k in range(1, 8)]
+    data = touch(true, corners(robot, 8, rng), 10, rng, distances=apart)
+    solution = solve(build_problem(robot, data, Options(model="distance")))
+    curves = np.concatenate([v.places for v in solution.problem.variables.nuisance if v.kind == "curve"])
+    root = solution.system.full_root[solution.problem.variables.n_columns :][: len(curves)]
+    z = np.linalg.solve(np.linalg.cholesky(root @ root.T), solution.parameters[curves] - true.nominal[curves])
+    assert z @ z / len(z) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / len(z)))
