@@ -9,12 +9,13 @@ with r the residuals of the model's fit, J its columns, those of the priors too,
 m its rank and n the residuals that noise can make differ freely. It has an F distribution whatever the size of the
 noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k.
 
-*Lack of fit* adds what real arms have beyond their model, stage by stage; the statistics of the stages are independent:
+*Lack of fit* adds effects of `robot.effects` that the model lacks, stage by stage; the statistics of the stages are
+independent:
 
-1. compliance of joints: gravity along z of the base, loads at the tool and on every link after the joint;
-2. joints that are off by a part of how far the tool reaches out, every small motion of every link, and errors of each
-   joint of one and two periods a turn (eccentric encoders and gears, gains of prismatic joints);
-3. the same loads of an arm that is mounted otherwise, gravity along x and y.
+1. compliance of joints that turn: gravity along z of the base, masses at the tool and on every link after the joint;
+2. every small motion of every link, harmonics of one and two periods a turn (eccentric encoders and gears), gains of
+   joints that slide: a constant load of these is their zero;
+3. the same masses of an arm that is mounted otherwise, gravity along x and y.
 
 A *change point* is a small motion of tool or base from one row of a table on, for every row tried. Other effects
 explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all links.
@@ -22,7 +23,9 @@ A *missing convention parameter* is the same test of small motions between links
 of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made residuals 1.1 times as large as
 specified.
 
-Loads: by virtual work the torque about joint k of a weight in direction g at the point x is g . dx / dq_k.
+*Error curves* of the model are eliminated as random effects of their prior, y = A x + L z + e; noise specified too
+large, and priors too wide, would make the ratio F too large, so both are made as small as rows and coefficients are:
+MacKay's fixed point, with tr L S^-1 L^T the number of coefficients that the rows determine (see `error_states`).
 """
 
 from __future__ import annotations
@@ -32,20 +35,27 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 from numpy.typing import NDArray
 from scipy import special
+from scipy.sparse import csr_array
 
-from fg_calib.graph import Problem, Solution, build_variables, prior_rows, subsampled, unknown_prior_rows
-from fg_calib.inputs import Floats, Record
-from fg_calib.measurements import Block, residuals
-from fg_calib.observability import MissingMotion, end_of_link
-from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Chain, Element, Parameter, Robot, pose
+from fg_calib.graph import Problem, SchurComplement, Solution, State, Variables, WhitenedBlock, subsampled
+from fg_calib.graph.variables import build_variables, prior_rows, unknown_prior_rows
+from fg_calib.inputs import Booleans, Floats, Integers, Record
+from fg_calib.measurements import residuals
+from fg_calib.observability import MissingMotion
+from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Effect, Element, Parameter, Robot
+from fg_calib.robot.effects import Compliance, Gain, Harmonics, Mass
 
 MAX_ROWS = 10_000
 """Rows by which residuals are tested: more would take long, and are not needed."""
 
 LEAST_LEFT = 10
 """Degrees of freedom that a test must leave: else what it does is left to chance."""
+
+MAX_ROUNDS = 30
+"""Rounds of the estimate of noise and of the size of error curves."""
 
 LEAST_SIDE, MAX_TRIED = 6, 100
 """Configurations before and after a change, and rows at which one is tried, evenly spaced if there are more."""
@@ -68,15 +78,12 @@ LINK, OFFSET = "2 small motion of link ", "offset "
 _STAGES = ("1 ", "2 ", "3 ")
 """How names of the columns of each stage begin."""
 
-_JOINT_ERRORS = ("1 gravity", "1 gravity", "2 reach", *["2 position"] * 4, *["3 side load"] * 4)
-"""Names of the columns of `_joint_errors`, before the number of the joint."""
-
 _WORDS = {
     "1 gravity": "yields to gravity",
-    "2 reach": "errs with the reach of the tool",
     "2 position": "errs with its position (gear, encoder)",
     "3 side load": "yields to loads along x and y of the base",
 }
+"""Effects of single joints, by how the names of their columns begin, before the number of the joint."""
 
 LIKE_NOISE = 1e-4
 """P-value below which residuals are systematic."""
@@ -140,12 +147,14 @@ class LinearFit(Record):
     Attributes:
         r: Residuals of the fit, rows first, then priors, shape (n,).
         fitted: Orthonormal basis of its columns, shape (n, rank).
+        free: Variance of each residual by noise before the fit, shape (n,).
         dof: Degrees of freedom.
         variance: Of the noise: what a fit with all columns leaves.
     """
 
     r: Floats
     fitted: Floats
+    free: Floats
     dof: int
     variance: float = 1.0
 
@@ -172,7 +181,7 @@ class LinearFit(Record):
 
     def clipped(self) -> LinearFit:
         """The fit of residuals that are cut at `MOST_TYPICAL` robust sigmas: gross errors hide effects."""
-        free = 1.0 - np.sum(self.fitted**2, axis=1)
+        free = self.free - np.sum(self.fitted**2, axis=1)
         size, seen = np.sqrt(np.maximum(free, 0.0)), free > LEAST_SHARE
         most = MOST_TYPICAL * 1.4826 * float(np.median(np.abs(self.r[seen]) / size[seen])) * size
         r = np.clip(self.r, -most, most)
@@ -181,37 +190,41 @@ class LinearFit(Record):
     @property
     def information(self) -> float:
         """Schwarz's criterion, whose least value chooses among models."""
-        return float(len(self.r) * np.log(self.r @ self.r) + self.fitted.shape[1] * np.log(len(self.r)))
+        n = self.dof + self.fitted.shape[1]
+        return float(n * np.log(self.r @ self.r) + self.fitted.shape[1] * np.log(n))
 
 
 class Regression(Record):
     """The fit of a solution, linearised, and columns that it does not have.
 
     These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of
-    tables that were not estimated (`OFFSET`, the number of the table), and joint errors (see `_JOINT_ERRORS`).
+    tables that were not estimated (`OFFSET`, the number of the table), and effects of joints (see `_WORDS`).
 
     Attributes:
         problem: The problem of the rows, which count as their noise says: at most `MAX_ROWS`, evenly drawn.
         fit: Their fit, whose noise is as specified.
-        columns: The columns of the rows, shape (n_rows, m).
+        states: How rows follow from shared errors and error curves.
+        columns: The columns of the rows before these are dealt with, shape (n_rows, m).
         names: Their names, shape (m,).
     """
 
     problem: Problem
     fit: LinearFit
+    states: SchurComplement
     columns: Floats
     names: NDArray[np.str_]
 
     @cached_property
     def fit_with_noise(self) -> LinearFit:
         """The fit with the noise that one with all columns leaves, at most that specified."""
-        with_all = self.fit.test(self.columns)[2]
+        with_all = self.fit.test(self.named(""))[2]
         variance = 1.0 if with_all is self.fit else float(with_all.r @ with_all.r) / with_all.dof
         return replace(self.fit, variance=min(variance, 1.0))
 
-    def named(self, *begin: str) -> Floats:
-        """The columns whose names begin so, shape (n_rows, k)."""
-        return self.columns[:, [name.startswith(begin) for name in self.names.tolist()]]
+    def named(self, *begin: str, rows: Booleans | None = None) -> Floats:
+        """The whitened columns whose names begin so, zero but in some rows if these are given, shape (n, k)."""
+        columns = self.columns[:, [name.startswith(begin) for name in self.names.tolist()]]
+        return self.states.whiten(columns if rows is None else columns * rows[:, None])
 
 
 def of_several(p: float, n: int) -> float:
@@ -291,16 +304,17 @@ def find_change(regression: Regression) -> Change | None:
     several = len(problem.data.tables) > 1 or problem.rows.states.n_states > 0
     if several or problem.data.landmarks.names or any(b.kind.ends != 1 for b in blocks):
         return None
-    fit, links = regression.fit_with_noise, {"tool": problem.robot.n_joints, "base": 0}
-    motions = {what: regression.named(f"{LINK}{link}.") for what, link in links.items()}
+    fit, links = regression.fit_with_noise, {"tool": f"{LINK}{problem.robot.n_joints}.", "base": f"{LINK}0."}
     at = np.concatenate([np.repeat(block.ends[:, 0], block.residual_dim) for block in blocks])
     first = np.unique(at)[LEAST_SIDE : 1 - LEAST_SIDE]
     first = first[np.unique(np.linspace(0, len(first) - 1, min(MAX_TRIED, len(first))).astype(np.int64))]
-    found = [(*fit.test(M * (at >= k)[:, None])[:2], what, int(k)) for k in first for what, M in motions.items()]
+    found = [
+        (*fit.test(regression.named(of, rows=at >= k))[:2], what, int(k)) for k in first for what, of in links.items()
+    ]
     if not found:
         return None
     p, left, what, k = min(found)
-    moved = motions[what] * (at >= k)[:, None]
+    moved = regression.named(links[what], rows=at >= k)
     p_with, left_with, _ = fit.test(regression.named(LINK))[2].test(moved)
     if max(of_several(p, len(found)), p_with) >= P_VALUE or max(left, left_with) > CHANGE_LEFT:
         return None
@@ -344,97 +358,141 @@ def regress(solution: Solution) -> Regression:
     problem, parameters = solution.problem, solution.parameters
     if problem.state.weights is not None or problem.n_residuals > MAX_ROWS:
         problem = subsampled(problem, min(1.0, MAX_ROWS / problem.n_residuals), parameters)
-    at = problem.variables.at(parameters)
-    (chains, core), offsets = with_link_motions(problem, parameters), _offsets(problem)
-    errors = list[Floats]()
-    for table, place in zip(problem.data.tables, problem.data.places, strict=True):
-        fitted, n = problem.data.fitted[place], problem.robot.n_joints
-        errors.append(np.zeros((len(place), len(_JOINT_ERRORS), n)))
-        errors[-1][fitted] = _joint_errors(problem.robot, table.measurements.readings[fitted])
-    columns = np.where(at.columns >= 0, at.columns + len(core) - at.n_columns, -1)
-    columns[list(offsets)] = len(core) + at.n_nuisance + np.arange(len(offsets))
-    wide = replace(at, chains=chains, n_columns=len(core), columns=columns, n_nuisance=at.n_nuisance + len(offsets))
-    rows = problem.rows
-    of_joints = [_by_joint_errors(part.at(wide), chains[part.table], errors[part.table]) for part in rows.parts]
+    rows, at, offsets = problem.rows, problem.variables.at(parameters), _offsets(problem)
+    variables, values = with_link_motions(problem, parameters)
+    plain, n_core, n_curves = at.without_curves(), variables.n_columns, problem.variables.n_curves
+    columns = np.where(plain.columns >= 0, plain.columns + n_core - plain.n_columns, -1)
+    columns[list(offsets)] = n_core + plain.n_nuisance + np.arange(len(offsets))
+    wide = replace(plain, chains=variables.at(values).chains, n_columns=n_core, columns=columns)
+    wide = replace(wide, n_nuisance=plain.n_nuisance + len(offsets))
+    names, of_joints = zip(*(_of_joints(problem, part, at) for part in rows.parts), strict=True)
     private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
-    J, r = np.split(rows.states.whiten(private), [-1], axis=1)
-    names = [f"{effect} {k}," for effect in _JOINT_ERRORS for k in range(problem.robot.n_joints)]
-    names += [name if name.startswith(LINK) else "" for name in core] + [""] * at.n_nuisance
-    all_names = np.array(names + [f"{OFFSET}{table}," for table in offsets.values()])
-    more = all_names != ""
-    r_prior, J_prior = prior_rows(problem.variables, parameters)
-    r_unknown, J_unknown = unknown_prior_rows(problem.variables, parameters)
-    J_prior = np.pad(J_prior, ((0, 0), (0, problem.variables.n_nuisance)))
-    own = basis_of(J[:, ~more])
-    left, dof = r[:, 0] - own @ (own.T @ r[:, 0]), problem.n_independent - own.shape[1]
-    scale = np.clip(np.sqrt(float(left @ left) / dof), 0.1, 1.0) if dof >= LEAST_LEFT else 1.0
-    J, r = J / scale, r / scale  # of noise specified too large: else columns take up the pull of the priors
-    n = problem.n_independent + len(r_prior) + len(r_unknown)
-    basis = basis_of(np.concatenate([J[:, ~more], J_prior, J_unknown]))
-    r = np.concatenate([r[:, 0], r_prior, r_unknown])
+    all_names = [*names[0], *(name if name.startswith(LINK) else "" for name in variables.names)]
+    all_names += [""] * plain.n_nuisance + [f"{OFFSET}{table}," for table in offsets.values()]
+    more, J, r = np.array(all_names) != "", private[:, :-1], private[:, -1]
     if solution.problem.state.weights is not None:
         most = MOST_TYPICAL * 1.4826 * float(np.median(np.abs(r)))
         r = np.clip(r, -most, most)  # before outliers spread over all rows
-    fit = LinearFit(r - basis @ (basis.T @ r), basis, n - basis.shape[1])
-    return Regression(problem, fit, J[:, more], all_names[more])
+    L = rows.curve_loadings(at)
+    r = r if at.curves is None else r - L @ (at.curves.values / at.curves.sigma)
+    own = np.column_stack([J[:, ~more], r])
+    states, free, scale = _eliminate(rows.states, L, own, problem.n_independent)
+    own = states.whiten(own) / scale
+    r_prior, J_prior = prior_rows(variables, values)
+    r_unknown, J_unknown = (each[n_curves:] for each in unknown_prior_rows(problem.variables, parameters))
+    J_prior = J_prior[:, [not name.startswith(LINK) for name in variables.names]]
+    J_prior = np.pad(J_prior, ((0, 0), (0, plain.n_nuisance)))
+    J_unknown = np.delete(J_unknown, np.s_[at.n_columns : at.n_columns + n_curves], axis=1)
+    basis = basis_of(np.concatenate([own[:, :-1], J_prior, J_unknown]))
+    r, ones = np.concatenate([own[:, -1], r_prior, r_unknown]), np.ones(len(r_prior) + len(r_unknown))
+    dof = problem.n_independent + len(ones) - basis.shape[1]
+    fit = LinearFit(r - basis @ (basis.T @ r), basis, np.append(free, ones), dof)
+    return Regression(problem, fit, states, J[:, more] / scale, np.array(all_names)[more])
 
 
-def with_link_motions(problem: Problem, at: Floats) -> tuple[tuple[Chain, ...], tuple[str, ...]]:
-    """The chains at a parameter vector with columns for the links' small motions too, and the columns' names.
+def _eliminate(
+    shared: SchurComplement, loadings: csr_array, rows: Floats, n: int
+) -> tuple[SchurComplement, Floats, float]:
+    """Eliminate error curves, at most as wide as their coefficients are: see the module's head.
+
+    Args:
+        shared: How rows follow from errors that they share.
+        loadings: L, change of each row per 1 sigma of each coefficient, shape (n_rows, n_curves).
+        rows: Rows [J r] by what is estimated, shape (n_rows, k + 1).
+        n: How many of them noise can make differ freely.
+
+    Returns:
+        The elimination; the variance of each residual by noise, shape (n_rows + n_states,); and the noise over that
+        specified, 1 at most: else columns take up the pull of the priors.
+    """
+    m, white = loadings.shape[1], shared.whiten(rows)
+    own = basis_of(white[:, :-1])
+    rows = np.column_stack([own, white[:, -1] - own @ (own.T @ white[:, -1])])
+    L = csr_array(shared.whiten(loadings.toarray())) if shared.n_states else loadings
+    g, V = np.linalg.eigh((L.T @ L).toarray())
+    B, N, kept = V.T @ (L.T @ rows), rows.T @ rows, np.ones(m)
+    scale = factor = 1.0
+    for _ in range(MAX_ROUNDS if m else 1):
+        kept = 1.0 / (1.0 + (factor / scale) ** 2 * g)
+        M = N - (factor / scale) ** 2 * (B.T * kept) @ B
+        x = np.append(-np.linalg.solve(M[:-1, :-1], M[:-1, -1]), 1.0)
+        of_curves = float(np.sum((factor / scale * kept * (B @ x)) ** 2))
+        taken, n_own = float(np.sum(1.0 - kept)), own.shape[1]
+        if n - n_own - taken < LEAST_LEFT:
+            break
+        scale = float(np.clip(np.sqrt(max(x @ M @ x - of_curves, 0.0) / (n - n_own - taken)), 0.1, 1.0))
+        factor = min(factor * np.sqrt(of_curves / max(taken, 1e-300)) / scale, 1.0)
+    if not m:
+        return shared, np.ones(len(white)), scale
+    root = V * np.sqrt(kept)
+    free = 1.0 - np.concatenate([np.sum(np.asarray(L @ (factor / scale * root)) ** 2, axis=1), np.sum(root**2, axis=1)])
+    states = csr_array(scipy.sparse.hstack([shared.loadings, loadings * (factor / scale)]))
+    return SchurComplement(states), free, scale
+
+
+def with_link_motions(problem: Problem, at: Floats) -> tuple[Variables, Floats]:
+    """The core's variables at a parameter vector with the links' small motions too, and their parameter vector.
 
     Six columns are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as there
     are joints.
     """
     robot = problem.robot
-    elements, parameters = list(robot.elements), list(robot.parameters)
+    elements, parameters, n = list(robot.elements), list(robot.parameters), len(robot.parameters)
     for owner in range(robot.n_joints, -1, -1):
-        place = end_of_link(robot, owner)
+        place = robot.end_of(owner)
         for kind in FRAME_KINDS:
-            more = Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0)
             elements.insert(place, Element(PARAMETER_KINDS[kind].axis, parameter=len(parameters)))
-            parameters.append(more)
+            parameters.append(Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0))
     wide = replace(robot, elements=tuple(elements), parameters=tuple(parameters))
-    variables = build_variables(wide, [table.unknown_frame for table in problem.data.tables])
-    none = np.zeros(len(parameters) - len(robot.parameters))
-    values = np.concatenate([at[: len(robot.parameters)], none, at[problem.variables.frame_span]])
-    return tuple(chain.at(values) for chain in variables.chains), variables.names
+    unknown = [table.unknown_frame for table in problem.data.tables]
+    values = np.concatenate([at[:n], np.zeros(len(parameters) - n), at[problem.variables.frame_span]])
+    return build_variables(wide, unknown, problem.variables.priors), values
 
 
-def _by_joint_errors(block: Block, chain: Chain, errors: Floats) -> Floats:
-    """Derivatives of a block in joint errors, before what its rows share is taken out, shape (n_rows, m).
+def _of_joints(problem: Problem, part: WhitenedBlock, at: State) -> tuple[list[str], Floats]:
+    """Names of effects of joints, and a block's derivatives in them before errors are shared, shape (n_rows, m)."""
+    J = residuals.linearise(part.at(at), at.chains[part.table].without_columns().with_turn_columns())[1]
+    readings, n = problem.data.tables[part.table].measurements.readings, problem.robot.n_joints
+    names, moved = list[str](), np.zeros(())
+    for k, rows in enumerate(part.block.ends.T):
+        names, joints, values = _lacking(problem.robot, readings[rows])
+        moved = moved + J[:, :, k * n + joints] * values[:, None]
+    return names, moved.reshape(J[:, :, 0].size, len(names))
 
-    Args:
-        block: The block.
-        chain: The chain of its table.
-        errors: See `_joint_errors`.
+
+def _effects_of_joints(robot: Robot) -> list[tuple[str, Effect]]:
+    """Effects that act at single joints, after the beginning of the names of their columns."""
+    n, slides = robot.n_joints, [k for k, joint in enumerate(robot.joints, 1) if joint.prismatic]
+    found: list[tuple[str, Effect]] = [("2 position", Gain(slides))]
+    if len(slides) < n:
+        loads = [Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, n)]
+        along = zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), strict=True)
+        found += [(name, Compliance(masses, gravity=g)) for name, g in along for masses in loads]
+        found.append(("2 position", Harmonics()))
+    return found
+
+
+def _lacking(robot: Robot, readings: Floats) -> tuple[list[str], Integers, Floats]:
+    """Terms of the effects of single joints that a robot lacks: their names, their joints, and their values.
+
+    It has the loads in a direction at joints that are compliant under a gravity that is not across it. An error curve
+    holds harmonics and gain of its joint.
     """
-    r, J = residuals.linearise(block, chain.with_joint_columns())
-    moved, n = np.zeros((*r.shape, *errors.shape[1:])), chain.n_joints
-    for k, rows in enumerate(block.ends.T):
-        first = chain.n_columns + k * n
-        moved += J[:, :, None, first : first + n] * errors[rows][:, None]
-    return moved.reshape(r.size, -1)
-
-
-def _joint_errors(robot: Robot, readings: Floats) -> Floats:
-    """Effects that a joint's error may follow, shape (n, len(_JOINT_ERRORS), n_joints).
-
-    Loads along z; how far the tool reaches out; harmonics of one and two periods a turn (of a prismatic joint its
-    position and the square of that); loads along x and y.
-    """
-    robot = robot.geometry
-    at = pose(robot, readings)
-    rotations, shifts = np.split(at.jacobian[:, :, len(robot.parameters) :], 2, axis=1)  # (n, 3, n_joints) each
-    of_links = np.zeros_like(shifts)
-    for owner in range(1, robot.n_joints):
-        link = pose(replace(robot, elements=robot.elements[: end_of_link(robot, owner)]), readings)
-        arm = (link.position - at.position)[:, :, None]
-        of_links[:, :, :owner] += (shifts + np.cross(rotations, arm, axis=1))[:, :, :owner]
-    prismatic = np.array([joint.prismatic for joint in robot.joints])
-    cos, sin = np.where(prismatic, readings, np.cos(readings)), np.where(prismatic, 0.0, np.sin(readings))
-    reach = np.repeat(np.linalg.norm(at.position[:, :2], axis=1)[:, None], robot.n_joints, axis=1)
-    (x, y, z), (x_links, y_links, z_links) = np.moveaxis(shifts, 1, 0), np.moveaxis(of_links, 1, 0)
-    return np.stack([z, z_links, reach, cos, sin, cos * cos, cos * sin, x, x_links, y, y_links], axis=1)
+    arm, names, joints, values = robot.geometry, list[str](), list[int](), [np.zeros((len(readings), 0))]
+    has, loaded = {p.name for p in robot.parameters}, set[tuple[int, int]]()
+    for effect in robot.effects:
+        if isinstance(effect, Compliance):
+            loaded |= {(t.owner, k) for t in effect.terms(arm) for k in np.flatnonzero(effect.gravity).tolist()}
+    for name, effect in _effects_of_joints(arm):
+        terms = effect.terms(arm)
+        if isinstance(effect, Compliance):
+            new = [k for k, t in enumerate(terms) if (t.owner, int(np.argmax(effect.gravity))) not in loaded]
+        else:
+            new = [k for k, t in enumerate(terms) if has.isdisjoint((t.name, f"{t.name.rpartition('.')[0]}.curve[0]"))]
+        names += [f"{name} {terms[k].owner - 1}," for k in new]
+        joints += [terms[k].owner - 1 for k in new]
+        values.append(effect.values(arm, readings, {}, np.zeros(len(terms)))[:, new, 0])
+    return names, np.array(joints, dtype=np.int64), np.hstack(values)
 
 
 def basis_of(columns: Floats, fitted: Floats | None = None, least: float = 0.0) -> Floats:

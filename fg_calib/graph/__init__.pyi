@@ -6,6 +6,7 @@ from .build import (
 )
 from .error_states import (
     PRIVATE_SHARE,
+    SchurComplement,
     State,
     WhitenedBlock,
     WhitenedRows,
@@ -81,6 +82,7 @@ __all__ = [
     "Problem",
     "RotationAngleFactor",
     "RowNoise",
+    "SchurComplement",
     "Solution",
     "SolverOptions",
     "State",

@@ -353,6 +353,13 @@ class WhitenedRows(Brief):
             return _reduced(n, [self.states.whiten(self.private(at))])
         return _reduced(n, (chunk for part in self.parts for chunk in part.reduce(at)))
 
+    def curve_loadings(self, at: State) -> Sparse:
+        """Change of each row per 1 sigma of each coefficient of error curves, shape (n_rows, n_curves)."""
+        if at.curves is None:
+            return Sparse((sum(part.n_rows for part in self.parts), 0))
+        each = [curve_columns(part.at(at), at.chains[part.table], at.curves) for part in self.parts]
+        return Sparse(_stacked(each) * at.curves.sigma)
+
     def without_curves(self, at: State, variance: float = 1.0) -> Eliminated:
         """The rows with error curves eliminated, where no errors are shared.
 
@@ -365,9 +372,8 @@ class WhitenedRows(Brief):
         curves = at.curves
         assert curves is not None
         y = self.private(at.without_curves()) / np.sqrt(variance)
-        L = _stacked([curve_columns(part.at(at), at.chains[part.table], curves) for part in self.parts])
-        L = L * (curves.sigma / np.sqrt(variance))
-        before, states = curves.values / curves.sigma, SchurComplement(Sparse(L))
+        L = Sparse(self.curve_loadings(at) / np.sqrt(variance))
+        before, states = curves.values / curves.sigma, SchurComplement(L)
         y[:, -1] -= L @ before
         U = states.triangle
         Z = scipy.linalg.cho_solve((U, False), L.T @ y, check_finite=False)

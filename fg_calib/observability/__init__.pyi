@@ -1,6 +1,6 @@
 from .identifiability import Identifiability, identifiability_of, observe_configurations, observe_structure
 from .indices import CORRELATED, IdentifiabilityClass, Observability, observability_of_rows
-from .parallel_axes import MissingMotion, end_of_link, missing_motions
+from .parallel_axes import MissingMotion, missing_motions
 from .predicted import STRUCTURAL_FLOOR, places_of, predicted_problem, random_problem, true_problem
 from .reasons import NOT_EXCITED, LostDirection, ObservedQuantities
 
@@ -14,7 +14,6 @@ __all__ = [
     "MissingMotion",
     "Observability",
     "ObservedQuantities",
-    "end_of_link",
     "identifiability_of",
     "missing_motions",
     "observability_of_rows",

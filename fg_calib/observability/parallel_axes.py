@@ -62,16 +62,6 @@ class MissingMotion(Record):
         return f"axes {axes} are {how} and {lacks}: use {self.use}"
 
 
-def end_of_link(robot: Robot, owner: int) -> int:
-    """How many of a robot's elements come before the end of the link that joint `owner` moves (0: the base)."""
-
-    def of_link(i: int) -> bool:
-        e = robot.elements[i]
-        return e.joint == owner - 1 or (e.parameter is not None and robot.parameters[e.parameter].owner == owner)
-
-    return max(filter(of_link, range(len(robot.elements))), default=-1) + 1
-
-
 @lru_cache(maxsize=16)  # cross-validation and simulations ask of one robot again and again
 def missing_motions(robot: Robot) -> tuple[MissingMotion, ...]:
     """Motions that a robot's parameters leave out at its nominal values; fixed parameters of a convention count."""
