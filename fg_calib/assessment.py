@@ -1,7 +1,5 @@
 """Solve a job and assess its solution: the steps of `calibrate`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -66,7 +64,7 @@ class Assessment(FrozenArrays):
     acceptance: statistics.Acceptance | None = None
     cross_validation: statistics.CrossValidation | None = None
 
-    def with_held_out(self, others: Sequence[statistics.HeldOut], solution: graph.Solution) -> Assessment:
+    def with_held_out(self, others: Sequence[statistics.HeldOut], solution: graph.Solution) -> "Assessment":
         """The assessment with limits on kinds without test rows judged by other measurements that were predicted.
 
         Args:

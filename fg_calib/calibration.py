@@ -7,8 +7,6 @@
 `calibrate_job` does the same for a job, and the command line calls it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import suppress
@@ -48,7 +46,7 @@ def calibrate(
     *,
     executor: Executor | None = None,
     **choices: Any,
-) -> Calibration:
+) -> "Calibration":
     """Estimate a robot's parameters from measurements, with their uncertainties.
 
     It builds the problem, solves it (`estimate_noise=True`: with the noise), looks for other optima, and assesses what
@@ -78,7 +76,7 @@ def calibrate(
 
 
 @checked
-def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> Calibration:
+def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> "Calibration":
     """`calibrate` of a job: what `fg-calib calibrate` does.
 
     Args:
@@ -169,7 +167,7 @@ class Calibration(Record, repr=False, eq=False):
 
     @classmethod
     @checked
-    def of(cls, solution: Solution, uncertainty: Assessment, **origin: Any) -> Calibration:
+    def of(cls, solution: Solution, uncertainty: Assessment, **origin: Any) -> "Calibration":
         """The calibration of a solution and its assessment.
 
         Args:
@@ -182,7 +180,7 @@ class Calibration(Record, repr=False, eq=False):
 
     @classmethod
     @checked
-    def load(cls, path: Path | str) -> Calibration:
+    def load(cls, path: Path | str) -> "Calibration":
         """The calibration in a folder that `save` or `calibrate --out` wrote, or in its `result.json`.
 
         It prints, draws and predicts like a new one; the solution and its assessment are not saved.
@@ -222,14 +220,14 @@ class Calibration(Record, repr=False, eq=False):
         io.write_calibration(Path(folder), self.result, self.robot, known, pages)
 
     @cached_property
-    def configurations(self) -> pl.DataFrame | None:
+    def configurations(self) -> "pl.DataFrame | None":
         """Every measured configuration, as `configurations.csv` has it; None if that file is missing."""
         if self.assessed is not None:
             return io.configuration_frame(*self.assessed)
         return None if self.folder is None else io.read_table(self.folder, "configurations", self.result)
 
     @cached_property
-    def residuals(self) -> pl.DataFrame | None:
+    def residuals(self) -> "pl.DataFrame | None":
         """Every scalar residual, as `residuals.csv` has it; None if it was not saved."""
         if self.assessed is not None:
             return io.residual_frame(*self.assessed)
@@ -306,7 +304,7 @@ class Calibration(Record, repr=False, eq=False):
         anchors_stay: bool = False,
         pairs: Path | str | None = None,
         like: str | None = None,
-    ) -> Calibration:
+    ) -> "Calibration":
         """The calibration with new rows added, from its posterior: what `fg-calib update` does.
 
         Args:
@@ -451,7 +449,7 @@ class Calibration(Record, repr=False, eq=False):
         rows = [given.names.index(name) if name in given.names else len(given.names) for name in names]
         return every[np.ix_(rows, rows)]
 
-    def to_dataframe(self, of: DataFrameOf = "parameters") -> pl.DataFrame:
+    def to_dataframe(self, of: DataFrameOf = "parameters") -> "pl.DataFrame":
         """A part of it as a polars table, which `.to_pandas()` makes one of pandas.
 
         Args:

@@ -1,17 +1,13 @@
 """`fg-calib bag`."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+from rich.console import Group
+
+from fg_calib import importers, io
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, names_in, option, say, show_result
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-    from fg_calib.importers import JointStream, PoseStream, Stops
 
 _OFFSET = "Stamp of a pose minus that of the joints at the same moment, in s; 0: as stamped."
 
@@ -33,8 +29,6 @@ def bag(
     as_json: Json = False,
 ) -> None:
     """Make a table of poses from a ROS bag: joint readings and poses while the arm stands still, with their sigmas."""
-    from fg_calib import importers, io
-
     if out is not None:
         io.require_absent(out.parent, [out.name])
     arm = io.read_robot(robot, base_link=base_link, tip_link=tip_link)
@@ -49,13 +43,13 @@ def bag(
     say(nothing if out is None else f"wrote {len(stops.ids)} poses to {out}")
 
 
-def _topic(stream: JointStream | PoseStream) -> dict[str, Any]:
-    from fg_calib.importers import period
-
-    return asdict(stream.source) | {"messages": len(stream.time), "period": period(stream.time)}
+def _topic(stream: "importers.JointStream | importers.PoseStream") -> dict[str, Any]:
+    return asdict(stream.source) | {"messages": len(stream.time), "period": importers.period(stream.time)}
 
 
-def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> dict[str, Any]:
+def _document(
+    name: str, joints: "importers.JointStream", poses: "importers.PoseStream", stops: "importers.Stops"
+) -> dict[str, Any]:
     """The content of the recording for programs: [m], [rad], [s]."""
     from fg_calib.report import plain
 
@@ -66,7 +60,9 @@ def _document(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -
     return plain({"schema": "fg-calib/bag/1", "bag": name, **more})
 
 
-def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> RenderableType:
+def _report(
+    name: str, joints: "importers.JointStream", poses: "importers.PoseStream", stops: "importers.Stops"
+) -> Group:
     """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
     from fg_calib.report import line, report, section, table_of
 
@@ -89,7 +85,7 @@ def _report(name: str, joints: JointStream, poses: PoseStream, stops: Stops) -> 
     )
 
 
-def _clocks(stops: Stops) -> list[str]:
+def _clocks(stops: "importers.Stops") -> list[str]:
     offset = stops.offset
     if offset is None:
         return [f"offset {stops.applied:.6g} s as specified"]

@@ -1,19 +1,14 @@
 """`fg-calib board`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from rich.console import Group
 
+from fg_calib import importers, io
 from fg_calib.cli.output import Angle, Json, Length, argument, end, option, say, show_result
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
-    from fg_calib.importers import BoardTables
 
 _READINGS = "Joint readings; id is an image's name without its ending."
 
@@ -32,8 +27,6 @@ def board(
     """Make tables of images of a board: its corners, and its poses with their covariances."""
     if (camera is None) != estimate_camera:
         raise typer.BadParameter("one of the two is needed", param_hint="--camera and --estimate-camera")
-    from fg_calib import importers, io
-
     importers.load_opencv()
     io.require_writable(out)
     target, files = importers.read_calibration_board(board), importers.image_files(images)
@@ -51,11 +44,10 @@ def board(
     end(tables.fit.findings)
 
 
-def _report(tables: BoardTables) -> RenderableType:
+def _report(tables: "importers.BoardTables") -> Group:
     """Corners, images and the camera, then what to know of the tables."""
     import numpy as np
 
-    from fg_calib.importers import INTRINSICS
     from fg_calib.report import line, report, section, table_of
 
     fit, board = tables.fit, tables.fit.board
@@ -69,7 +61,7 @@ def _report(tables: BoardTables) -> RenderableType:
         values = view.rms, view.sigma, float(np.linalg.norm(view.position)), shift, turn
         images.append((view.name, len(view.corners), *values, remark))
     for name, sigma in (fit.camera_sigma or {}).items():
-        unit, decimals = ("px", 3) if name in INTRINSICS[:4] else ("", 6)
+        unit, decimals = ("px", 3) if name in importers.INTRINSICS[:4] else ("", 6)
         camera.append((name, f"{getattr(fit.camera, name):.{decimals}f}", f"{sigma:.{decimals}f}", unit))
     pose = ("distance mm|m:.1f", "sigma mm|m", "sigma deg|rad")
     columns = ("Image", "corners|d", "RMS px|.3f", "sigma px|.3f", *pose, "")
@@ -83,7 +75,7 @@ def _report(tables: BoardTables) -> RenderableType:
     )
 
 
-def _notes(tables: BoardTables) -> Iterator[str]:
+def _notes(tables: "importers.BoardTables") -> Iterator[str]:
     from fg_calib.report import shortened
 
     fit, units = tables.fit, tables.units

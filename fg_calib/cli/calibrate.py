@@ -1,25 +1,18 @@
 """`fg-calib calibrate` and `report`."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
+from rich.console import Group
 
+import fg_calib
 from fg_calib.cli.output import Json, ResultFolder, argument, end, option, say, show_result
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
-    from rich.console import RenderableType
-
-    from fg_calib.batch import JobSummary, Order
-    from fg_calib.calibration import Calibration
 
 Residuals = Literal["csv", "parquet", "none"]
 
@@ -60,7 +53,7 @@ def calibrate(
             show_calibration(orders[0].carry_out(executor), as_json)
 
 
-def show_calibration(found: Calibration, as_json: bool) -> None:
+def show_calibration(found: "fg_calib.Calibration", as_json: bool) -> None:
     """Print a calibration, and end with 3 where it is not to be trusted or not accepted."""
     from fg_calib.report import build_report
 
@@ -68,7 +61,9 @@ def show_calibration(found: Calibration, as_json: bool) -> None:
     end(found.findings, not_accepted=found.not_accepted)
 
 
-def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executor | None, as_json: bool) -> None:
+def _calibrate_many(
+    orders: "Sequence[fg_calib.batch.Order]", out: Path | None, executor: Executor | None, as_json: bool
+) -> None:
     from fg_calib.batch import calibrate_into, exit_code, jobs_document, write_jobs
 
     clock = time.perf_counter()
@@ -84,10 +79,8 @@ def _calibrate_many(orders: Sequence[Order], out: Path | None, executor: Executo
         raise typer.Exit(code)
 
 
-def _jobs_table(jobs: Sequence[JobSummary], seconds: float) -> RenderableType:
+def _jobs_table(jobs: "Sequence[fg_calib.batch.JobSummary]", seconds: float) -> Group:
     """Many jobs for the terminal: a line of each, then how many are good; `seconds` is the duration of all together."""
-    from rich.console import Group
-
     from fg_calib.report import in_order, line, shown_in, table_of
 
     units = {kind: unit for job in jobs for kind, unit in job.units.items()}

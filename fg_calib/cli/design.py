@@ -1,19 +1,13 @@
 """`fg-calib design`."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
+import fg_calib
+from fg_calib import inputs, io, report, simulation
 from fg_calib.cli.output import Json, Seed, argument, end, option, quantity, say, show_result
-
-if TYPE_CHECKING:
-    from fg_calib.io import Units
-    from fg_calib.job import Job
-    from fg_calib.robot import Robot
-    from fg_calib.simulation import Scenario
 
 Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 Frame = Literal["base", "fitted"]
@@ -34,7 +28,6 @@ def design(
     as_json: Json = False,
 ) -> None:
     """Choose which configurations to measure, and say what accuracy to expect of how many."""
-    from fg_calib import io, report
     from fg_calib.designs.design import design as designed
 
     if n is not None and target is not None:
@@ -61,29 +54,25 @@ def design(
     end([] if found.reached else ["the target is not reached"], "doubtful")
 
 
-def _read(of: str) -> tuple[Scenario | Job, Units, Robot]:
+def _read(of: str) -> "tuple[simulation.Scenario | fg_calib.Job, io.Units, fg_calib.Robot]":
     """Read the scenario or job, the units of its tables, and the arm."""
-    from fg_calib import inputs, simulation
-    from fg_calib.io import Units, is_job, read_job, units_of
-
-    if is_job(of):
-        job = read_job(of)
-        return job, units_of(job), job.robot
+    if io.is_job(of):
+        job = io.read_job(of)
+        return job, io.units_of(job), job.robot
     if Path(of).name == "result.json" or (Path(of) / "result.json").exists():
         raise inputs.InputError(of, "a result", "a scenario, or the job that the result came from")
     scenario = simulation.read_scenario(of)
-    return scenario, Units(scenario.length_unit, scenario.angle_unit), scenario.robot
+    return scenario, io.Units(scenario.length_unit, scenario.angle_unit), scenario.robot
 
 
-def _candidates(given: str | None, robot: Robot, units: Units) -> dict[str, Any]:
+def _candidates(given: str | None, robot: "fg_calib.Robot", units: "io.Units") -> dict[str, Any]:
     """Options that say where the candidates come from."""
-    from fg_calib.io import read_joint_table
-    from fg_calib.simulation import GivenReadings, read_scenario
-
     if given is None:
         return {}
     if given.isdecimal():
         return {"n_candidates": int(given)}
     if given.endswith((".yaml", ".yml")):
-        return {"candidates": read_scenario(given).configurations}
-    return {"candidates": given if given == "rows" else GivenReadings(read_joint_table(given, robot, units)[1])}
+        return {"candidates": simulation.read_scenario(given).configurations}
+    if given == "rows":
+        return {"candidates": given}
+    return {"candidates": simulation.GivenReadings(io.read_joint_table(given, robot, units)[1])}

@@ -13,8 +13,6 @@ The mean square error over a task is `tr(W C)`, `W = mean v^T v`. v are the deri
 best rigid fit where the task is *fitted*; C is the covariance of the arm's parameters.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 
@@ -161,11 +159,11 @@ class System(FrozenArrays):
         """Number of candidates."""
         return len(self.rows)
 
-    def with_known(self, candidates: Integers) -> System:
+    def with_known(self, candidates: Integers) -> "System":
         """The system with some candidates measured already."""
         return replace(self, known=self.information(candidates))
 
-    def select(self, candidates: Integers) -> System:
+    def select(self, candidates: Integers) -> "System":
         """The system with some of the candidates."""
         return replace(self, rows=self.rows[candidates])
 
@@ -257,7 +255,7 @@ class Posterior(Brief):
         base, fitted = prediction.errors_at(self.covariance, task.readings)
         return fitted if task.fitted else base
 
-    def with_known_tool(self) -> Posterior:
+    def with_known_tool(self) -> "Posterior":
         """The posterior if the tool were known, to a millionth of a change of ordinary size."""
         v = self.problem.variables
         of_tool = [k for k, name in enumerate(v.names) if name.startswith("tool.")]

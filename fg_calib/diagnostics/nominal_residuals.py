@@ -9,8 +9,6 @@ covariance of the noise. The *excess* is the median length over the median expec
 gross errors. What is fitted takes up a part of the arm's errors, so healthy tables have an excess of a fifth to one.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -87,12 +85,12 @@ class Setup(Record):
         """Whether lengths are measured."""
         return self.instrument.sees_position and self.table.measurements.image is None
 
-    def with_tool(self, fitted: frozenset[str]) -> Setup:
+    def with_tool(self, fitted: frozenset[str]) -> "Setup":
         """The set-up with these of the tool's parameters fitted."""
         names = [p.name for p in self.robot.parameters if p.estimated and p.name not in self.tool]
         return replace(self, robot=self.robot.with_estimated([*names, *sorted(fitted)]))
 
-    def measuring(self, **changes: Any) -> Setup:
+    def measuring(self, **changes: Any) -> "Setup":
         """The set-up with other measurements."""
         return replace(self, table=replace(self.table, measurements=replace(self.table.measurements, **changes)))
 

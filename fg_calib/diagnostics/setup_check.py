@@ -11,8 +11,6 @@ judged by the base and tool that it determines alone. Only where all tables are 
 and tool, which is reported of all that are far off together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
@@ -72,7 +70,7 @@ class SetupCheck(Brief):
     residuals: tuple[TypicalResidual, ...] = ()
     explanations: tuple[Explanation, ...] = ()
     table: str = ""
-    others: tuple[SetupCheck, ...] = ()
+    others: "tuple[SetupCheck, ...]" = ()
 
     @property
     def excess(self) -> float:

@@ -6,10 +6,8 @@ sigmas specified too small, unmodelled effects and gross errors make sigmas too 
 know. Within `FACTOR` of its mean chi-square is no error, whatever its distribution: noise is never known better.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Literal
 
 import numpy as np
@@ -19,7 +17,7 @@ from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, mahalanobis_distances, solve, with_factors
-from fg_calib.inputs import CalibrationError, Floats
+from fg_calib.inputs import CalibrationError, Floats, Record
 from fg_calib.measurements import missing_values
 from fg_calib.observability import NOT_EXCITED, Identifiability
 from fg_calib.robot import SCALES, pose
@@ -61,8 +59,7 @@ NAMED = 3
 """Configurations, rows or parameters that a statement names."""
 
 
-@dataclass(frozen=True)
-class Statement:
+class Statement(Record):
     """A statement about a result: one line, how severe it is, and whether it applies."""
 
     severity: Severity
@@ -70,8 +67,7 @@ class Statement:
     applies: object = True
 
 
-@dataclass(frozen=True)
-class Verdict:
+class Verdict(Record):
     """Whether a result is to be trusted, and what its reader should know.
 
     Attributes:
@@ -103,8 +99,7 @@ class Verdict:
         return (*self.warnings, *self.notes)
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(Record):
     """A solution to be judged, and what its tests found.
 
     Attributes:

@@ -48,8 +48,6 @@ The nearest arm of fewer values minimises the sum over configurations of `|p - p
 R of the arm that is fitted, p' and R' of the calibrated one, and L the arm's length.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
@@ -131,7 +129,7 @@ def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHE
 
 
 def _rows(
-    links: Links, convention: TableConvention, farthest: float
+    links: "Links", convention: TableConvention, farthest: float
 ) -> tuple[list[dict[str, float]], Floats, Floats, tuple[Nearly, ...]]:
     """Rows by kind, base, tool, and the axes that are taken to be parallel."""
     n = len(links.between) - 1
@@ -229,7 +227,7 @@ def _about_z(M: Floats) -> float:
     return float(np.arctan2(sine, cosine)) if np.hypot(cosine, sine) > SAME else 0.0
 
 
-def _start(links: Links, craig: bool) -> tuple[dict[str, float], Floats, Floats]:
+def _start(links: "Links", craig: bool) -> tuple[dict[str, float], Floats, Floats]:
     """The a and alpha of the first row, what is carried on to its theta and d, and the base.
 
     Frame 0 stays where it is if the first joint is along its z axis or, in Craig's table, from there by a and alpha.

@@ -11,8 +11,6 @@ What rows determine at all is asked at the nominal arm: there undetermined direc
 linearised there, too (`nominal`), without what tolerances say.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -61,7 +59,7 @@ class Knowledge(FrozenArrays):
     rows: Floats
     right: Floats
     views: tuple[View, ...] = ()
-    nominal: Knowledge | None = None
+    nominal: "Knowledge | None" = None
 
     @cached_property
     def variables(self) -> Variables:
@@ -79,7 +77,7 @@ class Knowledge(FrozenArrays):
         return np.append(self.variables.scales, np.full(len(self.at), self.robot.scale_of("m")))
 
     @classmethod
-    def of_rows(cls, robot: Robot, unknowns: Sequence[Name], at: Floats, A: Floats, b: Floats) -> Knowledge:
+    def of_rows(cls, robot: Robot, unknowns: Sequence[Name], at: Floats, A: Floats, b: Floats) -> "Knowledge":
         """Knowledge of whitened rows `A s + b`, of which as many are kept as there are directions known.
 
         Args:
@@ -95,7 +93,7 @@ class Knowledge(FrozenArrays):
         rank = determined(s)
         return replace(bare, rows=s[:rank, None] * Vt[:rank] / bare.scales, right=U[:, :rank].T @ R[:, -1])
 
-    def about(self, unknowns: Sequence[Name]) -> Knowledge:
+    def about(self, unknowns: Sequence[Name]) -> "Knowledge":
         """The information about some of the unknowns, the others eliminated."""
         kept = [name for name in unknowns if name in self.unknowns]
         n = self.variables.n_columns
@@ -107,7 +105,7 @@ class Knowledge(FrozenArrays):
         left = eliminate(self.rows[:, order], self.right, len(columns))
         return self._with(Knowledge.of_rows(self.robot, kept, self.at[columns[n:] - n], left.A, left.b), nominal)
 
-    def grown(self, directions: Floats, free: NDArray[np.bool_]) -> Knowledge:
+    def grown(self, directions: Floats, free: NDArray[np.bool_]) -> "Knowledge":
         """The information after random parameter changes with given sigmas.
 
         Args:
@@ -125,12 +123,12 @@ class Knowledge(FrozenArrays):
         left = eliminate(wide, np.append(self.right, np.zeros(len(own))), n)
         return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, left.A, left.b), self.nominal)
 
-    def with_rows(self, A: Floats, b: Floats) -> Knowledge:
+    def with_rows(self, A: Floats, b: Floats) -> "Knowledge":
         """The information with more rows about the same point, none of them measured: `nominal` stays."""
         A, b = np.vstack([self.rows, A]), np.append(self.right, b)
         return self._with(Knowledge.of_rows(self.robot, self.unknowns, self.at, A, b), self.nominal)
 
-    def _with(self, rows: Knowledge, nominal: Knowledge | None) -> Knowledge:
+    def _with(self, rows: "Knowledge", nominal: "Knowledge | None") -> "Knowledge":
         """Other rows of the same tables."""
         return replace(rows, views=self.views, nominal=nominal)
 
@@ -178,7 +176,7 @@ class Knowledge(FrozenArrays):
                 D[rows, variables.columns_at(place)] = 1.0
         return s, D
 
-    def seen_by(self, variables: Variables, unknowns: Landmarks) -> Knowledge:
+    def seen_by(self, variables: Variables, unknowns: Landmarks) -> "Knowledge":
         """The information about a problem's unknowns, the others eliminated."""
         return self.about([n for n in self.unknowns if coordinates_of(variables, unknowns, n) is not None])
 

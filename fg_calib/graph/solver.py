@@ -11,8 +11,6 @@ optimum they are whitened anew after every step, and convergence is judged by th
 estimate. The fixed point solves J^T C(x)^-1 r = 0: quasi-likelihood, consistent, without the log-determinant of C.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import fields, replace
 from functools import cached_property
@@ -300,11 +298,11 @@ class _Point(Record):
         """Whether rounding of the cost is above the decrease that the step promises."""
         return 0.5 * self.system.decrement**2 <= 10.0 * self.rounding * float(np.sqrt(2.0 * self.system.cost))
 
-    def after(self, step: Floats) -> _Point:
+    def after(self, step: Floats) -> "_Point":
         """The point after a tangent step."""
         return replace(self, parameters=self.problem.variables.moved(self.parameters, step))
 
-    def descend(self, damping: float) -> tuple[_Point, float, float] | None:
+    def descend(self, damping: float) -> "tuple[_Point, float, float] | None":
         """Take the next step, undamped if that keeps what it promises: the point, its damping, and the next one.
 
         None if no step lowers the cost.
@@ -321,7 +319,7 @@ class _Point(Record):
             pass  # so far off that the rows have no derivative there
         return None if self.at_rounding else self._descend_damped(damping)
 
-    def _descend_damped(self, damping: float) -> tuple[_Point, float, float] | None:
+    def _descend_damped(self, damping: float) -> "tuple[_Point, float, float] | None":
         """Step by GTSAM's Levenberg-Marquardt on a graph of one factor: rows and priors in the singular directions."""
         system, key, start, graph = self.system, gtsam.symbol("S", 0), gtsam.Values(), gtsam.NonlinearFactorGraph()
         n, weights = len(system.coordinates), system.weights
@@ -354,7 +352,7 @@ class _Point(Record):
         following = max(optimizer.lambda_(), LEAST_DAMPING)
         return self._along(optimizer.values().atVector(key)), DAMPING_FACTOR * following, following
 
-    def _along(self, y: Floats) -> _Point:
+    def _along(self, y: Floats) -> "_Point":
         return self.after(self.system.full_root @ (self.system.weights * y))
 
 

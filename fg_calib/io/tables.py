@@ -4,8 +4,6 @@ An empty cell means not measured under `distance` and `angle`, no contact point 
 `sigma_*`, and train under `split`; in other columns it is an error. Columns without a meaning are ignored.
 """
 
-from __future__ import annotations
-
 import csv
 import logging
 import os
@@ -114,7 +112,7 @@ class Table(Record):
         joints: Iterable[str] = (),
         columns: Mapping[str, Column] | None = None,
         skip_lines: int = 0,
-    ) -> Table:
+    ) -> "Table":
         """Read a CSV, a Parquet file or a frame.
 
         Args:
@@ -207,7 +205,7 @@ class Table(Record):
             self.require(~(value < inputs.LEAST_SIZE), column, inputs.ORDINARY)
         return values * factor if default is None else np.where(np.isnan(values), default, values * factor)
 
-    def texts(self, column: str, expected: str = "") -> pl.Series:
+    def texts(self, column: str, expected: str = "") -> "pl.Series":
         """The column without blanks around its cells, null where they are empty: an error if something is expected.
 
         Whole numbers have no fraction: pandas makes floats of them where cells are empty.
@@ -225,7 +223,7 @@ class Table(Record):
             self.require(texts.is_not_null().to_numpy(), column, expected)
         return texts
 
-    def names(self, column: str, expected: str, *, optional: bool = False) -> pl.Series:
+    def names(self, column: str, expected: str, *, optional: bool = False) -> "pl.Series":
         """The column as texts, without a word such as NA that stands for nothing; null where a cell may be empty."""
         names = self.texts(column, "" if optional else expected)
         self.require(~names.str.to_lowercase().is_in(inputs.NOTHING).fill_null(False).to_numpy(), column, expected)
@@ -341,7 +339,7 @@ def _understood(
     return names
 
 
-def _as_polars(table: Any, name: str) -> pl.DataFrame:
+def _as_polars(table: Any, name: str) -> "pl.DataFrame":
     """A frame of polars from one of polars or pandas, or from a mapping of columns; nan is an empty cell.
 
     Raises:
@@ -733,7 +731,7 @@ def _labels(table: Table, column: str, *, optional: bool) -> Labels:
     return Labels(names, _places(cells, {name: i for i, name in enumerate(names)}))
 
 
-def _places(names: pl.Series, place: dict[str, int]) -> Integers:
+def _places(names: "pl.Series", place: dict[str, int]) -> Integers:
     """The place of each name, -1 for others and for none."""
     import polars as pl
 

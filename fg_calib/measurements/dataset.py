@@ -1,7 +1,5 @@
 """Measurements in [m] and [rad]: configurations, poses and pairs, and their noise; pairs formed from poses."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields, replace
@@ -57,7 +55,7 @@ class Noise(inputs.Record):
         """Sigma of a kind, of `more` too; None where it is not specified."""
         return self.more.get(kind) if kind not in _NOISE else getattr(self, kind)
 
-    def updated(self, **values: Any) -> Noise:
+    def updated(self, **values: Any) -> "Noise":
         """Other sigmas of some kinds, of `more` too; None leaves one of `more` as it is."""
         named = {kind: value for kind, value in values.items() if kind in _NOISE}
         others = {kind: value for kind, value in values.items() if kind not in _NOISE and value is not None}
@@ -106,7 +104,7 @@ class Pairs(FrozenArrays):
         """Number of pairs."""
         return len(self.a)
 
-    def select(self, rows: Booleans | Integers) -> Pairs:
+    def select(self, rows: Booleans | Integers) -> "Pairs":
         """The pairs at `rows` only."""
         return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "source"})
 
@@ -122,7 +120,7 @@ class Labels(FrozenArrays):
     names: tuple[str, ...]
     index: Integers
 
-    def of(self, rows: Integers) -> Labels:
+    def of(self, rows: Integers) -> "Labels":
         """Labels of some rows, the same names."""
         return replace(self, index=self.index[rows])
 
@@ -197,7 +195,7 @@ class Measurements(FrozenArrays):
     from_arrays, from_frame = Reader("read_arrays"), Reader("read_measurements")
 
     @classmethod
-    def at(cls, robot: Robot, readings: Floats) -> Measurements:
+    def at(cls, robot: Robot, readings: Floats) -> "Measurements":
         """Configurations without names, all of them train rows; noise of poses as `Robot.scale_of` says."""
         n = len(readings)
         rows = np.arange(n).astype(np.str_), np.zeros(n, dtype=np.bool_)
@@ -214,7 +212,7 @@ class Measurements(FrozenArrays):
         """Number of configurations, train and test."""
         return len(self.readings)
 
-    def select(self, rows: Integers) -> Measurements:
+    def select(self, rows: Integers) -> "Measurements":
         """Some rows, with what was measured at them; nothing that was measured between configurations."""
         rows_of: dict[str, Any] = {
             name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "sigma_joint"
@@ -232,7 +230,7 @@ class Measurements(FrozenArrays):
         """1 sigma by kind of noise; None where it is not specified."""
         return self.sigmas.get(noise, getattr(self, f"sigma_{noise}", None))
 
-    def with_values(self, values: Mapping[str, Floats]) -> Measurements:
+    def with_values(self, values: Mapping[str, Floats]) -> "Measurements":
         """Copy with other measured values, by the names that `value` takes."""
         own: dict[str, Any] = {name: v for name, v in values.items() if hasattr(self, name)}
         return replace(self, **own, columns={**self.columns, **{k: v for k, v in values.items() if k not in own}})

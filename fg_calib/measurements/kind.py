@@ -6,8 +6,6 @@ the frame, a parameter, a joint, a frame before or behind the arm, has a (w, dp)
 `D . (w, dp)`, summed over the ends. Unknowns besides the arm, *nuisances* such as a contact point, have columns N.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -94,7 +92,7 @@ class Kind(ABC):
         return self.names[0].partition(".")[0]
 
     @property
-    def parts(self) -> tuple[Kind, ...]:
+    def parts(self) -> "tuple[Kind, ...]":
         """The kinds that are measured together, or the one alone."""
         return (self,)
 

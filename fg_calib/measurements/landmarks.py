@@ -1,7 +1,5 @@
 """Landmarks: what measurements depend on besides the arm, such as targets on the tool, anchors, planes and boards."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -52,7 +50,7 @@ class LandmarkKind(Record):
     must_be_fitted: bool = True
     stays: bool = False
     is_one: bool = False
-    reference: LandmarkKind | None = None
+    reference: "LandmarkKind | None" = None
     estimate: Callable[[Floats, Floats, Floats], Estimate] | None = None
 
     @property
@@ -209,7 +207,7 @@ class Landmarks:
         if not self.items[i].is_specified:
             self.items[i] = replace(self.items[i], start=place)
 
-    def with_starts(self, starts: Mapping[int, Floats]) -> Landmarks:
+    def with_starts(self, starts: Mapping[int, Floats]) -> "Landmarks":
         """Copy with other starts of some, wherever a table says that they are.
 
         Args:

@@ -1,7 +1,5 @@
 """Tables of measurements as a job has them, and blocks of one kind as estimation takes them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import field, replace
 from typing import Any
@@ -55,7 +53,7 @@ class MeasurementBlock(Brief):
     @classmethod
     def of_rows(
         cls, kind: Kind, table: int, rows: Integers, data: Floats, sigma: Floats, **more: Any
-    ) -> MeasurementBlock:
+    ) -> "MeasurementBlock":
         """Measurements all of whose components were measured.
 
         Args:
@@ -91,12 +89,12 @@ class MeasurementBlock(Brief):
         return np.flatnonzero(self.used.any(axis=1) & ~self.test)
 
     @property
-    def fitted(self) -> MeasurementBlock:
+    def fitted(self) -> "MeasurementBlock":
         """The train measurements alone."""
         train = self.train
         return self if len(train) == self.n else self.select(train)
 
-    def select(self, rows: Integers) -> MeasurementBlock:
+    def select(self, rows: Integers) -> "MeasurementBlock":
         """Some of the measurements."""
         arrays: dict[str, Any] = {name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray)}
         excluded = {reason: mask[rows] for reason, mask in self.excluded.items()}
@@ -166,7 +164,7 @@ class CustomMeasurements(Brief):
             raise InputError("own: ends", found, f"one a measurement, 0 to {n_configurations - 1}")
         return ends
 
-    def block(self, table: Table, number: int, landmarks: Landmarks) -> MeasurementBlock:
+    def block(self, table: "Table", number: int, landmarks: Landmarks) -> MeasurementBlock:
         """The measurement block of a table.
 
         Their unknowns are in the frame of the table's measurements: one of the same name in another frame is another.
@@ -248,16 +246,16 @@ class Table(Brief):
         """Whether its model is one of pairs."""
         return self.model in inputs.PAIR_MODELS
 
-    def by_itself(self) -> Table:
+    def by_itself(self) -> "Table":
         """Copy without known places that none of its own rows is of."""
         there = {name for labels in self.measurements.labels.values() for name in labels.names}
         return replace(self, known={name: place for name, place in self.known.items() if name in there})
 
-    def all_train(self) -> Table:
+    def all_train(self) -> "Table":
         """Copy with its test rows as train rows."""
         return self.tested_on(np.zeros(self.measurements.n_configurations, dtype=np.bool_))
 
-    def tested_on(self, configurations: Booleans) -> Table:
+    def tested_on(self, configurations: Booleans) -> "Table":
         """Copy with the measurements at some configurations as test rows, all others as train rows.
 
         Args:

@@ -7,8 +7,6 @@ what nothing determined have no such rows. So the smallest sum of squares is chi
 `N + J Sigma J^T`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -35,7 +33,7 @@ class Rows(Record):
     like: tuple[str, ...]
 
     @classmethod
-    def of(cls, tables: Sequence[Table], like: Sequence[str], options: Options) -> Rows:
+    def of(cls, tables: Sequence[Table], like: Sequence[str], options: Options) -> "Rows":
         """Tables apart by their stations.
 
         Args:
@@ -46,11 +44,11 @@ class Rows(Record):
         parts = [(part, name) for t, name in zip(tables, like, strict=True) for part in graph.tables_of([t], options)]
         return cls(tuple(part for part, _ in parts), tuple(name for _, name in parts))
 
-    def all_train(self) -> Rows:
+    def all_train(self) -> "Rows":
         """The rows with test rows as train rows."""
         return replace(self, tables=tuple(table.all_train() for table in self.tables))
 
-    def without(self, configurations: Sequence[Booleans]) -> Rows:
+    def without(self, configurations: Sequence[Booleans]) -> "Rows":
         """The rows with those at some configurations, shape (n_configurations,) a table, as the only test rows."""
         tables = (t.tested_on(which) for t, which in zip(self.tables, configurations, strict=True))
         return replace(self, tables=tuple(tables))

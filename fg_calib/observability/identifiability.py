@@ -5,8 +5,6 @@ lost whatever one measures. *Practical*: at the user's configurations and noise;
 may be weak.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
@@ -62,7 +60,7 @@ class Identifiability(Brief):
     kind: Literal["structural", "practical"]
     n_configurations: int
     observability: Observability
-    with_fixed_known: Identifiability | None = None
+    with_fixed_known: "Identifiability | None" = None
     fixed: tuple[str, ...] = ()
     missing: tuple[MissingMotion, ...] = ()
     lost: tuple[LostDirection, ...] = ()

@@ -10,8 +10,6 @@ other. Random configurations may show what the user's do not: the arm goes there
 predicts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from functools import cache
 
@@ -38,7 +36,7 @@ class ObservedQuantities(Record):
     custom: bool
 
     @classmethod
-    def of(cls, problem: Problem) -> ObservedQuantities:
+    def of(cls, problem: Problem) -> "ObservedQuantities":
         """Quantities that a problem's tables see, and those of its prior information."""
         views: list[tuple[Model, FrameKnowledge]] = []
         for t in problem.data.tables:

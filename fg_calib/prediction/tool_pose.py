@@ -12,8 +12,6 @@ Errors of the joint readings are not included: readings with errors of sigma s a
 derivative of the tool's position in joint j.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Literal
 
@@ -242,7 +240,7 @@ class ToolPoseUncertainty(FrozenArrays):
     @classmethod
     def of(
         cls, covariance: TangentCovariance, measured: Floats, sigma_joint: Floats | None = None
-    ) -> ToolPoseUncertainty:
+    ) -> "ToolPoseUncertainty":
         """The model of a covariance.
 
         Args:

@@ -1,7 +1,5 @@
 """The figures of a calibration, of what is identifiable, and of expected errors over the workspace."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -228,7 +226,7 @@ def residual_charts(data: ReportData) -> list[Chart]:
     return [*found, _row_by_row(rows, values, test)] if found else []
 
 
-def _row_by_row(rows: pl.DataFrame, values: Floats, test: Booleans) -> Chart:
+def _row_by_row(rows: "pl.DataFrame", values: Floats, test: Booleans) -> Chart:
     shown, order = np.clip(values, -MAX_STUDENTISED, MAX_STUDENTISED), np.arange(len(values), dtype=np.float64)
     plot = Plot((0.0, max(len(shown), 2)), limits_of(shown, [-4.0, 4.0]), ("row", "in its sigma"))
     for level in (-3.0, 3.0):

@@ -1,11 +1,9 @@
 """`report.html`: the page of a calibration, one file that needs no other, from the template `page.html`."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Iterator
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import Any
 
 from fg_calib import inputs, io
 from fg_calib.report import text
@@ -13,9 +11,6 @@ from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import arm_scene, figures_of
 from fg_calib.report.predict import FRAMES, percentages, size_table
 from fg_calib.report.tables import POSE_KINDS, Section, in_words, section, shortened
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 WORKSPACE = "Expected error over the workspace"
 
@@ -40,7 +35,7 @@ EXPLANATIONS = {
 
 
 @cache
-def _environment() -> Environment:
+def _environment() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from markupsafe import Markup
 

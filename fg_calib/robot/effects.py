@@ -25,15 +25,13 @@ References:
     calibration of robots with flexible joints and links. J. Intelligent and Robotic Systems 34.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from fg_calib.inputs import Floats, InputError, check_number, shown
+from fg_calib.inputs import Floats, InputError, Record, check_number, shown
 from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Robot, Term
 
@@ -85,8 +83,7 @@ def _with_slopes(values: Floats, slopes: Floats | float = 0.0) -> Floats:
     return np.stack([values, np.broadcast_to(slopes, values.shape)], axis=2)
 
 
-@dataclass(frozen=True)
-class Gain(Effect):
+class Gain(Effect, Record):
     """An encoder or gear ratio that is slightly off: in proportion to the reading."""
 
     joints: Joints = "all"
@@ -98,8 +95,7 @@ class Gain(Effect):
         return _with_slopes(readings[:, _joints(robot, self.joints, "gain", sliding=True)], 1.0)
 
 
-@dataclass(frozen=True)
-class Harmonics(Effect):
+class Harmonics(Effect, Record):
     """Eccentric encoders and gears: sine and cosine of multiples of the reading.
 
     Attributes:
@@ -128,8 +124,7 @@ class Harmonics(Effect):
         return both.reshape(len(readings), -1, 2, 2).transpose(0, 1, 3, 2).reshape(len(readings), -1, 2)
 
 
-@dataclass(frozen=True)
-class ErrorCurve(Effect):
+class ErrorCurve(Effect, Record):
     """Whatever repeats each turn of a joint: a periodic cubic B-spline of the reading.
 
     Attributes:
@@ -201,8 +196,7 @@ class _Moments:
         return np.einsum("nji,nj->ni", R, np.cross(u, self.gravity), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class Compliance(Effect):
+class Compliance(Effect, Record):
     """Joints that give way to gravity: q + k tau(q), k in [rad/(N m)], positive.
 
     Attributes:
@@ -278,8 +272,7 @@ class Compliance(Effect):
         return np.stack(columns, axis=1)
 
 
-@dataclass(frozen=True)
-class Bending(Effect):
+class Bending(Effect, Record):
     """Bending of a base or column: it turns by the moment of all masses about its origin.
 
     Attributes:
@@ -299,8 +292,7 @@ class Bending(Effect):
         return _with_slopes(moments.of_masses(robot.end_of(0), self.masses)[:, :2])
 
 
-@dataclass(frozen=True)
-class Backlash(Effect):
+class Backlash(Effect, Record):
     """Half the dead zone of a gear, times the side that it lies on.
 
     Attributes:
@@ -334,8 +326,7 @@ class Backlash(Effect):
         return {self.side: sides}
 
 
-@dataclass(frozen=True)
-class Coupling(Effect):
+class Coupling(Effect, Record):
     """A joint that turns with another one, as in wrists whose gears pass through each other.
 
     Attributes:
@@ -354,8 +345,7 @@ class Coupling(Effect):
         return _with_slopes(readings[:, [i for i, _ in self._places(robot)]], 1.0)
 
 
-@dataclass(frozen=True)
-class Thermal(Effect):
+class Thermal(Effect, Record):
     """Links that grow and zeros that drift with a temperature.
 
     Attributes:

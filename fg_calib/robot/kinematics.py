@@ -16,8 +16,6 @@ References:
     Lynch & Park (2017), Modern Robotics, Cambridge University Press.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -95,7 +93,7 @@ class Chain(Brief):
     joint_columns: bool = False
     curves: tuple[Curve, ...] = ()
 
-    def at(self, parameters: Floats) -> Chain:
+    def at(self, parameters: Floats) -> "Chain":
         """Copy with parameter values, shape (n_parameters,) or (n_parameters + 6,), [m] or [rad].
 
         The six further values are those of the measurement frame, in the order of `FRAME_KINDS`.
@@ -109,19 +107,19 @@ class Chain(Brief):
         """Value of each element without its reading at parameter values as `at` takes them, shape (n_elements,)."""
         return self.constant + self.sign * np.where(self.source >= 0, parameters[self.source], 0.0)
 
-    def without_columns(self) -> Chain:
+    def without_columns(self) -> "Chain":
         """Copy without derivatives."""
         return replace(self, column=np.full_like(self.column, -1), n_columns=0, joint_columns=False)
 
-    def with_joint_columns(self) -> Chain:
+    def with_joint_columns(self) -> "Chain":
         """Copy with the derivatives in the joints too."""
         return replace(self, joint_columns=True)
 
-    def with_turn_columns(self) -> Chain:
+    def with_turn_columns(self) -> "Chain":
         """Copy with derivatives in what each joint turns alone: joint columns without slopes of effects."""
         return replace(self, joint_columns=True, joint=np.where(self.basis >= 0, -1, self.joint))
 
-    def with_curves_in(self, trig: Floats) -> tuple[Chain, Floats]:
+    def with_curves_in(self, trig: Floats) -> "tuple[Chain, Floats]":
         """The chain without error curves, and readings with them: q + curve(q)."""
         if not self.curves:
             return self, trig

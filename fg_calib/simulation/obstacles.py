@@ -1,19 +1,13 @@
 """The arm as lines in space: where its straight pieces begin and end, and whether they pass through a box."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fg_calib import simulation
 from fg_calib.inputs import Booleans, Floats
 from fg_calib.robot import Axis, Element, Robot, build_chain, forward
-
-if TYPE_CHECKING:  # pages draw arms without reading scenarios
-    from fg_calib.simulation.scenario import Box
-
 
 MAX_CONTACT_M = 1e-9
 """How deep something may be in a box and still only touch it, [m]: far above rounding, far below any clearance."""
@@ -37,7 +31,7 @@ def link_points(robot: Robot, readings: Floats) -> Floats:
     return np.stack(found, axis=1)
 
 
-def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
+def enters(robot: Robot, readings: Floats, boxes: "Sequence[simulation.Box]") -> Booleans:
     """Whether something of the arm is inside one of some boxes, at each configuration, shape (n,).
 
     The joints' origins, the straight lines between them and the tool point count; the links' thickness does not, so
@@ -59,7 +53,7 @@ def enters(robot: Robot, readings: Floats, boxes: Sequence[Box]) -> Booleans:
     return np.any([_cross(start, end, box).any(axis=1) for box in boxes], axis=0)
 
 
-def _cross(start: Floats, end: Floats, box: Box) -> Booleans:
+def _cross(start: Floats, end: Floats, box: "simulation.Box") -> Booleans:
     """Which straight lines pass through a box, shape (...) of ends of shape (..., 3), [m].
 
     On each axis a line start + t (end - start) is between the box's two planes for an interval of t. It is inside the

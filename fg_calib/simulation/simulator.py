@@ -19,8 +19,6 @@ With R, p the true tool frame in the base (where the joints stand, not their rea
 Every draw has a generator of its own, by the seed and the name of what is drawn: changing one leaves the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any, NamedTuple
@@ -84,13 +82,13 @@ class Visits(NamedTuple):
     ids: NDArray[np.str_]
     test: Booleans
 
-    def select(self, rows: Integers | Booleans) -> Visits:
+    def select(self, rows: Integers | Booleans) -> "Visits":
         """Some of the visits."""
         values: list[Any] = [values[rows] for values in self]
         return Visits(*values)
 
     @staticmethod
-    def joined(parts: Sequence[Visits]) -> Visits:
+    def joined(parts: "Sequence[Visits]") -> "Visits":
         """Visits one after the other."""
         values: list[Any] = [np.concatenate(values) for values in zip(*parts, strict=True)]
         return Visits(*values)

@@ -24,8 +24,6 @@ References:
     Sidak (1967), Rectangular confidence regions for the means of multivariate normal distributions. JASA 62(318).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -262,7 +260,7 @@ class Fit(Record):
         priors: Corrections against prior sigmas; None without priors.
     """
 
-    chi_square: ChiSquare
+    chi_square: "ChiSquare"
     residuals: ResidualTable
     goodness: Goodness
     priors: PriorFit | None

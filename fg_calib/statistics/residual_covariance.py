@@ -5,8 +5,6 @@ fitted residuals have the covariance `C - J T J^T`. Predicted ones have `C + J K
 estimate is off, and -T F^T its covariance with the errors of configurations that fitted rows took part in as well.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -47,22 +45,22 @@ class ResidualCovariance(Record):
         """Variances, shape (n,)."""
         return self.d + row_squares(self.L) + np.einsum("ij,ij->i", self.P @ self.M, self.P)
 
-    def at(self, rows: Integers) -> ResidualCovariance:
+    def at(self, rows: Integers) -> "ResidualCovariance":
         """The part at some rows."""
         return ResidualCovariance(self.d[rows], self.L[rows], self.P[rows], self.M)
 
-    def over(self, sigma: Floats) -> ResidualCovariance:
+    def over(self, sigma: Floats) -> "ResidualCovariance":
         """The covariance of rows divided by their sigma, shape (n,)."""
         L = Sparse(scipy.sparse.diags_array(1.0 / sigma) @ self.L)
         return ResidualCovariance(self.d / sigma**2, L, self.P / sigma[:, None], self.M)
 
     @staticmethod
-    def joined(parts: Sequence[ResidualCovariance]) -> ResidualCovariance:
+    def joined(parts: "Sequence[ResidualCovariance]") -> "ResidualCovariance":
         """Several groups of rows, one after the other, M still open."""
         d, P = np.concatenate([part.d for part in parts]), np.concatenate([part.P for part in parts])
         return ResidualCovariance(d, Sparse(scipy.sparse.vstack([part.L for part in parts])), P, np.zeros((0, 0)))
 
-    def with_errors(self, K: Floats, T: Floats | None = None) -> ResidualCovariance:
+    def with_errors(self, K: Floats, T: Floats | None = None) -> "ResidualCovariance":
         """The rows with M by the covariance of the estimate's errors.
 
         Args:
@@ -72,7 +70,7 @@ class ResidualCovariance(Record):
         cross, n = np.zeros_like(K) if T is None else -T, self.P.shape[1]
         return replace(self, M=np.block([[K, cross], [cross, np.zeros_like(K)]])[:n, :n])
 
-    def split(self) -> ResidualCovariance:
+    def split(self) -> "ResidualCovariance":
         """Copy with errors of more than one in `FEW` rows among the columns of P."""
         many = FEW * np.bincount(self.L.indices, minlength=self.L.shape[1]) > len(self.d)
         P, M = np.hstack([self.P, self.L[:, many].toarray()]), block_diag(self.M, np.eye(int(many.sum())))

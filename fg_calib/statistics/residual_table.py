@@ -1,10 +1,8 @@
 """Every scalar residual, train and test, before and after."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from fg_calib.graph import Solution, noises_at
-from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers
+from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers, Record
 from fg_calib.measurements import Labels, MeasurementBlock
 
 T = TypeVar("T")
@@ -41,8 +39,7 @@ def suspect_level(n: int, alarm: float = ALARM) -> float:
     return float(special.ndtri(0.5 + 0.5 * (1.0 - alarm) ** (1.0 / max(1, n))))
 
 
-@dataclass(frozen=True)
-class RowKind:
+class RowKind(Record):
     """The quantity that a scalar row is one component of.
 
     Attributes:
@@ -61,8 +58,7 @@ class RowKind:
         return self.name.partition(".")[0]
 
 
-@dataclass(frozen=True)
-class HeldOut:
+class HeldOut(Record):
     """Measurements of one kind that were predicted and not fitted; RMS of the length of each one's rows.
 
     Attributes:
@@ -307,7 +303,7 @@ class ResidualTable(FrozenArrays):
         first, last = np.searchsorted(self.block, np.array([number, number + 1], dtype=self.block.dtype)).tolist()
         return slice(first, last)
 
-    def without(self, unknown: Booleans) -> ResidualTable:
+    def without(self, unknown: Booleans) -> "ResidualTable":
         """The table with some rows taking no part, for nothing determines what they depend on."""
         if not unknown.any():
             return self
