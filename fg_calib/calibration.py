@@ -30,6 +30,7 @@ from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_bef
 from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
 from fg_calib.report import Drawing, ReportData, draw, format_result, judged, notebook_html, notes_of, pages_of, summary
 from fg_calib.robot import Robot, names_of
+from fg_calib.selection import select_effects
 from fg_calib.statistics import CrossValidation, ParameterEstimate, TangentCovariance, cross_validate
 
 if TYPE_CHECKING:
@@ -92,6 +93,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> "C
     options = given.options
     try:
         parallel.tell("calibrating")
+        given, effects = select_effects(given, solve_job)
         solution = solve_job(given)
         parallel.tell("judging the result")
         assessment = assess(solution)
@@ -103,7 +105,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> "C
             raise
         found = "noise and tolerance cannot be estimated from these rows, which leave no error: specify them"
         raise SolverError(found) from error
-    return Calibration.of(solution, assessment, inputs=given.inputs, job=given.document)
+    return Calibration.of(solution, assessment, inputs=given.inputs, job=given.document, effects=effects)
 
 
 def _with_first_sigmas(m: Measurements) -> Measurements:
@@ -382,7 +384,10 @@ class Calibration(Record, repr=False, eq=False):
             raise InputError("pairs" if pairs else "like", "given with rows that say it themselves", "none")
         new, digests = io.read_job(given) if isinstance(given, Path | str) else given, {}
         if isinstance(new, Job):
-            if names_of(new.robot.parameters) != names_of(robot.parameters) or new.robot.convention != robot.convention:
+            names, known = names_of(new.robot.parameters), names_of(robot.parameters)
+            if new.robot.select_effects:  # the calibration kept some of them
+                names = [name for name in names if name in known]
+            if names != known or new.robot.convention != robot.convention:
                 expected = f"that of the result, {robot.name}"
                 raise InputError(str(new.path or "job"), f"the robot {new.robot.name}", expected)
             digests, new = new.inputs, new.tables

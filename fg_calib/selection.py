@@ -1,4 +1,4 @@
-r"""The prior sigma of error curves by marginal likelihood.
+r"""The prior sigma of error curves, and the choice of effects, by marginal likelihood.
 
 The coefficients of error curves are Gaussian, and their sigma s, one for all joints, is estimated with them. With the
 covariance C of the coefficients c, integrated over all else, and n of them, MacKay's fixed point is
@@ -8,19 +8,31 @@ covariance C of the coefficients c, integrated over all else, and n of them, Mac
 gamma the number of directions that the data determine. Its own sigma is about s / sqrt(2 gamma). A linearised fit gives
 C and c for every s, so that the fixed point is found between fits.
 
+Effects are tried one by one in the order of `EFFECTS`, each next to all that are kept, until nothing changes: some
+are of use only after others, and some no longer. Rows are linearised once, where the geometry alone is estimated, for
+effects are small; noise and s are estimated anew each time. An effect is kept if
+
+1. there is evidence: of error curves a ratio of marginal likelihoods, of others an F test of their coefficients;
+2. rows held out by blocks, the quarters of each joint's readings in turn, are predicted better;
+3. no block is predicted worse than by the geometry alone, as far as the scatter of its rows tells.
+
 References:
     MacKay (1992), Bayesian interpolation. Neural Computation 4(3).
 """
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+import scipy.linalg
+from scipy import special
 
 from fg_calib import graph
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Figure, Floats, Integers, Probability, Record
+from fg_calib.job import Job
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import ErrorCurve
+from fg_calib.robot import EFFECT_KINDS, EFFECTS, ErrorCurve
 from fg_calib.statistics.variance_components import settle
 
 SETTLED = 3e-3
@@ -34,6 +46,54 @@ MAX_ROUNDS = 1000
 
 LEAST_SHARE = 1e-15
 """Share of its prior variance that a coefficient has left at least: rounding."""
+
+MAX_P_VALUE = 1e-6
+"""Largest p-value that is evidence of an effect, 11 nats of a likelihood ratio: rows are not quite independent."""
+
+LEAST_GAIN = 0.01
+"""Share by which an effect must lower the RMS of held-out rows."""
+
+MAX_SCORE = 3.0
+"""Sigma by which the mean square of a block may be larger than by the geometry alone."""
+
+QUANTILES = (0.25, 0.5, 0.75)
+"""Shares of a joint's readings at the ends of its blocks."""
+
+N_PASSES = 4
+"""How often all effects are tried at most."""
+
+RIDGE = 0.1
+"""Information on parameters of the geometry, 1 over so many prior sigmas or mm and mrad: small."""
+
+MAX_RESIDUALS = 40_000
+"""Residuals above which some measurements, drawn evenly, are enough to choose by."""
+
+FIT_ROUNDS, FIT_SETTLED = 30, 0.02
+"""Rounds of a linear fit, and change of the logarithms of noise and sigma below which they have settled."""
+
+
+class EffectTest(Record):
+    """What the rows say of one effect.
+
+    Attributes:
+        effect: Its key in a robot file.
+        joints: Numbers of its joints, from 1.
+        p_value: Probability of as much by chance.
+        folds_before: RMS error of the rows held out without it, in `unit`.
+        folds_after: The same with it.
+        kept: Whether it is part of the arm.
+        reason: Why it is not; empty if it is.
+        unit: `m` where positions or lengths were measured.
+    """
+
+    effect: str
+    joints: tuple[int, ...]
+    p_value: Probability
+    folds_before: Figure
+    folds_after: Figure
+    kept: bool
+    reason: str = ""
+    unit: str = "m"
 
 
 @single_threaded
@@ -53,45 +113,33 @@ def estimate_curve_sigma(
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    robot, state = problem.robot, problem.state
-    free = [e for e in robot.effects if isinstance(e, ErrorCurve) and e.sigma is None]
-    names = {term.name for effect in free for term in effect.terms(robot.geometry)}
-    curves = [v for v in problem.variables.nuisance if v.kind == "curve"]
-    curves = [v for v in curves if robot.parameters[v.parameters[0]].name in names]
-    if not curves or problem.evaluated:
+    specified, state = [e.sigma for e in problem.robot.effects if isinstance(e, ErrorCurve)], problem.state
+    first = [sigma for v in problem.variables.nuisance if v.kind == "curve" and v.prior for sigma in v.prior[1]]
+    if problem.evaluated or not first or any(specified):
         return solve_with(problem)
-    first, keys = robot.parameters[curves[0].parameters[0]].scale, {v.key for v in curves}
 
     def refit(theta: Floats) -> tuple[graph.Solution, Floats, None]:
         nonlocal state
-        sigma = first * float(np.exp(theta[0]))
-        solution = solve_with(_with_sigma(replace(problem, state=state), keys, sigma))
+        sigma = first[0] * float(np.exp(theta[0]))
+        solution = solve_with(_with_sigma(replace(problem, state=state), sigma))
         state = replace(state, factors=solution.problem.state.factors)  # where the next fit takes the noise up
-        return solution, np.array([np.log(_next_sigma(solution, keys, sigma) / sigma)]), None
+        return solution, np.array([np.log(_next_sigma(solution, sigma) / sigma)]), None
 
     return settle(refit, 1, SETTLED, "prior sigma of error curves")[0]
 
 
-def _with_sigma(problem: graph.Problem, keys: Container[int], sigma: float) -> graph.Problem:
-    """The problem with the prior sigma of some error curves, by the keys of their variables, [rad]."""
-
-    def change(p: graph.Problem) -> graph.Problem:
-        parameters, nuisance = list(p.robot.parameters), list(p.variables.nuisance)
-        for k, v in enumerate(nuisance):
-            if v.key in keys:
-                n = len(v.parameters)
-                nuisance[k] = replace(v, prior=(n * (0.0,), n * (sigma,)), scales=n * (sigma,))
-                for i in v.parameters:
-                    parameters[i] = replace(parameters[i], tolerance=sigma)
-        robot = replace(p.robot, parameters=tuple(parameters))
-        return replace(p, robot=robot, variables=replace(p.variables, robot=robot, nuisance=tuple(nuisance)))
-
-    return replace(change(problem), whole=None if problem.whole is None else change(problem.whole))
+def _with_sigma(problem: graph.Problem, sigma: float) -> graph.Problem:
+    """The problem with a prior sigma of error curves, [rad]."""
+    parameters = (replace(p, tolerance=sigma) if p.kind == "curve" else p for p in problem.robot.parameters)
+    robot = replace(problem.robot, parameters=tuple(parameters))
+    whole = None if problem.whole is None else _with_sigma(problem.whole, sigma)
+    variables = graph.variables_of(robot, problem.data, problem.options)
+    return replace(problem, robot=robot, variables=variables, whole=whole)
 
 
-def _next_sigma(solution: graph.Solution, keys: Container[int], sigma: float) -> float:
+def _next_sigma(solution: graph.Solution, sigma: float) -> float:
     """The fixed point of the prior sigma of error curves by a fit with another one, [rad]."""
-    curves = [v for v in solution.problem.variables.nuisance if v.key in keys]
+    curves = [v for v in solution.problem.variables.nuisance if v.kind == "curve"]
     places = np.concatenate([v.places for v in curves])
     root = np.concatenate([solution.system.full_root[v.columns] for v in curves]) / sigma
     share, V = np.linalg.eigh(root @ root.T)  # of the prior variance, in [0, 1]
@@ -105,3 +153,133 @@ def _next_sigma(solution: graph.Solution, keys: Container[int], sigma: float) ->
         if abs(s / before - 1.0) < 0.1 * SETTLED:
             break
     return float(s * sigma)
+
+
+@single_threaded
+def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Job, tuple[EffectTest, ...]]:
+    """The job with those effects of its robot that the rows speak for, and what they say of each.
+
+    Args:
+        job: The job; the same is returned where its robot does not ask for a choice, or all rows are test rows.
+        solve: Calibrates a job.
+
+    Raises:
+        ProblemError: The measurements do not suffice for the geometry.
+        SolverError: GTSAM could not solve a step at all.
+    """
+    effects, kept = job.robot.effects, frozenset[int]()
+    solution = solve(_with_effects(job, kept)) if job.robot.select_effects and effects else None
+    if solution is None or solution.problem.evaluated:
+        return job, ()
+    choice, found, of = _Choice(job, solution), dict[int, EffectTest](), list(EFFECTS.values())
+    for _ in range(N_PASSES):
+        before = kept
+        for i in sorted(range(len(effects)), key=lambda i: of.index(type(effects[i]))):
+            found[i] = choice.test(kept - {i}, i)
+            kept = kept | {i} if found[i].kept else kept - {i}
+        if kept == before:
+            break
+    return _with_effects(job, kept), tuple(found.values())
+
+
+def _with_effects(job: Job, kept: Collection[int]) -> Job:
+    """The job with some of its robot's effects, by their numbers; their parameters stay as specified."""
+    robot = job.robot
+    parameters = tuple(p for p in robot.parameters if p.kind not in EFFECT_KINDS)
+    bare = replace(robot.geometry, parameters=parameters, select_effects=False)
+    found = bare.with_effects(*(e for i, e in enumerate(robot.effects) if i in kept))
+    as_specified = tuple(robot.parameters[robot.index(p.name)] for p in found.parameters)
+    return replace(job, robot=replace(found, parameters=as_specified))
+
+
+_Fit = tuple[Integers, float, Floats, float, Floats, Floats]
+"""A linear fit: columns, factor on the variance of the noise, prior information of each column, log evidence, estimate
+x, and U with U^T U its covariance."""
+
+
+class _Choice:
+    """The rows of a job with all its effects, linearised at a solution for the geometry alone.
+
+    Columns are in prior sigmas; the last one has the residuals.
+    """
+
+    def __init__(self, job: Job, solution: graph.Solution) -> None:
+        robot, x, n = job.robot, solution.parameters, len(solution.problem.robot.parameters)
+        options = replace(job.options, encoder="propagated", pair_errors="independent")
+        options = replace(options, gauge="none", estimate_tolerance=None)
+        full = graph.problem_of_tables(robot, graph.tables_of(job.measurements, options), options)
+        start = np.concatenate([x[:n], np.zeros(len(robot.parameters) - n), x[n:]])
+        problem = graph.with_factors(full, start, solution.problem.state)
+        if problem.n_residuals > MAX_RESIDUALS:
+            problem = graph.subsampled(problem, MAX_RESIDUALS / problem.n_residuals)
+        self.robot, self.n, v, parts = robot, problem.n_residuals, problem.variables, problem.rows.parts
+        of_curves = (robot.parameters[i].name for one in v.nuisance if one.kind == "curve" for i in one.parameters)
+        names = [*v.names, *of_curves, *(v.n_nuisance - v.n_curves) * ("",)]
+        effect_of = {t.name: i for i, e in enumerate(robot.effects) for t in e.terms(robot.geometry)}
+        scale_of = {p.name: p.scale for p in robot.parameters}
+        self.effect = np.array([effect_of.get(name, -1) for name in names])
+        self.is_curve = np.char.find(names, ".curve[") > 0
+        self.rows = problem.rows.private(v.at(start)) * [*(scale_of.get(name, 1e-3) for name in names), 1.0]
+        units = np.concatenate([p.block.n * p.block.kind.units for p in parts])
+        self.unit = "m" if "m" in units else str(units[0])
+        self.n_lengths = sum(p.block.n for p in parts if self.unit in p.block.kind.units)
+        noises = [problem.noises[p.number] for p in parts]
+        self.sigma = np.concatenate([one.sigma[one.block.train].ravel() for one in noises]) * (units == self.unit)
+        every = [t.measurements.readings for t in problem.data.tables]
+        of_parts = [every[p.table][p.block.ends].sum(axis=1).repeat(p.block.residual_dim, axis=0) for p in parts]
+        blocks = [np.searchsorted(np.quantile(q, QUANTILES), q) for q in np.concatenate(of_parts).T]
+        held = [(j, np.flatnonzero(block == k)) for j, block in enumerate(blocks) for k in np.unique(block)]
+        self.held = [(j, rows, self.rows[rows].T @ self.rows[rows]) for j, rows in held]
+        self.gram = self.rows.T @ self.rows
+        self.fit, self.held_out = cache(self._fit), cache(self._held_out)
+
+    def _fit(self, kept: frozenset[int]) -> _Fit:
+        """The fit with some effects, noise and prior sigma of curves at their maximum likelihood."""
+        c = np.flatnonzero(np.isin(self.effect, [-1, *kept]))
+        curve, base, noise, sigma = self.is_curve[c], self.effect[c] < 0, 1.0, 1.0
+        G, h = self.gram[np.ix_(c, c)], self.gram[c, -1]
+        for _ in range(FIT_ROUNDS):
+            prior = np.where(base, RIDGE**2, np.where(curve, sigma**-2.0, 1.0))
+            U = scipy.linalg.lapack.dtrtri(np.linalg.cholesky(G / noise + np.diag(prior)), lower=1)[0]
+            x = -U.T @ (U @ h) / noise
+            square = float(self.gram[-1, -1] + h @ x)
+            determinant = 2.0 * np.log(np.diag(U)).sum() + np.log(prior).sum()
+            found = c, noise, prior, 0.5 * float(determinant - self.n * np.log(noise) - square / noise), x, U
+            before, noise = np.array([noise, sigma]), max(square / max(self.n - int(base.sum()), 1), LEAST_SHARE)
+            gamma = float(np.sum(1.0 - prior[curve] * np.sum(U[:, curve] ** 2, axis=0)))
+            sigma = max(float(np.linalg.norm(x[curve])) / np.sqrt(max(gamma, LEAST_SHARE)), 1e-3)
+            if np.abs(np.log([noise, sigma] / before)).max() < FIT_SETTLED:
+                break
+        return found
+
+    def _held_out(self, kept: frozenset[int]) -> Floats:
+        """Whitened residuals of all rows, each predicted without its block of a joint, shape (n_joints, n)."""
+        c, noise, prior, *_ = self.fit(kept)
+        ix, out = np.ix_(c, c), np.tile(self.rows[:, -1], (self.robot.n_joints, 1))
+        whole = self.gram[ix] + noise * np.diag(prior)
+        for j, rows, gram in self.held:
+            x = scipy.linalg.solve(whole - gram[ix], gram[c, -1] - self.gram[c, -1], assume_a="pos")
+            out[j, rows] += self.rows[np.ix_(rows, c)] @ x
+        return out
+
+    def test(self, kept: frozenset[int], i: int) -> EffectTest:
+        """Whether an effect is to be added to some that are kept."""
+        effect, (_, _, _, before, _, _) = self.robot.effects[i], self.fit(kept)
+        c, _, _, after, x, U = self.fit(kept | {i})
+        own = self.effect[c] == i
+        square, k = float(x[own] @ np.linalg.solve(U[:, own].T @ U[:, own], x[own])), max(int(own.sum()), 1)
+        p_value = float(special.fdtrc(k, self.n, square / k))
+        if isinstance(effect, ErrorCurve):  # sigma is on the boundary where there is no curve
+            p_value = 0.5 * float(special.chdtrc(1, 2.0 * max(after - before, 0.0)))
+        old, new, bare = map(self.held_out, (kept, kept | {i}, frozenset[int]()))
+        change = new**2 - bare**2
+        blocks = ((j + 1, change[j, rows]) for j, rows, _ in self.held)
+        worse = [j for j, d in blocks if d.mean() > MAX_SCORE * d.std() / np.sqrt(len(d))]
+        reason = f"a block of joint {worse[0]} is predicted worse than by the geometry alone" if worse else ""
+        if np.sum(new**2) > (1.0 - LEAST_GAIN) ** 2 * np.sum(old**2):
+            reason = "held-out blocks are not predicted better"
+        reason = reason if p_value < MAX_P_VALUE else "no evidence"
+        name = next(key for key, of in EFFECTS.items() if of is type(effect))
+        joints = tuple(sorted({t.owner for t in effect.terms(self.robot.geometry)} - {0}))
+        rms, new_rms = (float(np.linalg.norm(e * self.sigma)) / np.sqrt(len(e) * self.n_lengths) for e in (old, new))
+        return EffectTest(name, joints, p_value, rms, new_rms, not reason, reason, self.unit)

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fg_calib import Measurements, Options, Robot, build_problem
+from fg_calib import Calibration, Job, Measurements, Options, Robot, build_problem, calibrate, selection
+from fg_calib.assessment import solve_job
 from fg_calib.graph import solve
-from fg_calib.robot import ErrorCurve, build_chain, forward
-from fg_calib.selection import estimate_curve_sigma
+from fg_calib.robot import Compliance, ErrorCurve, Gain, Harmonics, Mass, build_chain, forward
+from fg_calib.selection import EffectTest, estimate_curve_sigma, select_effects
 from fg_calib.statistics import estimate_noise
 
 ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
@@ -81,3 +82,126 @@ def test_a_specified_sigma_of_curves_is_kept():
     problem = build_problem(robot, measured(drawn(robot, 1), 1), Options(model="position"))
     found = estimate_curve_sigma(problem).problem.robot
     assert {p.tolerance for p in found.parameters if p.kind == "curve"} == {3.0 * SIGMA}
+
+
+MASSES = [Mass(3, 10.0, (0.2, 0.0, 0.1))]
+LISTED = (Harmonics([1, 2]), Compliance(MASSES, [2, 3]), Gain(), ErrorCurve([2, 3], 20))
+"""Effects that are to be chosen from, not in the order in which they are tried."""
+
+
+def choosing(robot):
+    return replace(robot, select_effects=True)
+
+
+def curved_and_compliant(seed):
+    """An arm with error curves and compliance of 2e-5 rad/(N m)."""
+    true = drawn(with_prior(arm(*LISTED[1::2]), SIGMA), seed)
+    return true.with_values([2e-5 if p.kind == "compliance" else p.nominal for p in true.parameters])
+
+
+def test_effects_that_the_arm_has_are_kept_and_others_are_left(tmp_path):
+    data = measured(curved_and_compliant(1), 1, n=160)
+    found = calibrate(choosing(arm(*LISTED)), data, model="position", estimate_noise=True)
+    tests = {one.effect: one for one in found.result.effects}
+    assert list(tests) == ["error_curve", "compliance", "harmonics", "gain"]
+    assert [one.kept for one in tests.values()] == [True, True, False, False]
+    assert found.robot.effects == LISTED[1::2]
+    assert {p.kind for p in found.robot.parameters} >= {"curve", "compliance"}
+    assert not {p.kind for p in found.robot.parameters} & {"sin", "cos", "gain"}
+    for one in tests.values():
+        assert one.kept == (one.p_value < 1e-6) == (one.folds_after < 0.99 * one.folds_before) == (not one.reason)
+    assert tests["compliance"].joints == (2, 3)
+    assert tests["compliance"].folds_after == tests["error_curve"].folds_after == tests["gain"].folds_before
+    alone = calibrate(arm(*LISTED[1::2]), data, model="position", estimate_noise=True)
+    assert found.robot.nominal == pytest.approx(alone.robot.nominal, abs=1e-9)
+    found.save(tmp_path)
+    for one in (found, Calibration.load(tmp_path)):
+        lines = [line.strip() for line in str(one).splitlines()]
+        assert any(line.startswith("compliance of joints 2, 3: p ") and line.endswith(" mm: kept") for line in lines)
+        assert any(
+            line.startswith("gain of joints 1, 2, 3, 4: p ") and line.endswith(": left, no evidence") for line in lines
+        )
+    again = Job(None, choosing(arm(*LISTED)), measured(curved_and_compliant(1), 2), Options(model="position"))
+    assert found.check(again).verdict == "pass"
+
+
+def test_nothing_is_kept_of_an_arm_that_is_its_geometry():
+    job = Job(None, choosing(arm(*LISTED)), measured(drawn(arm(), 3), 3), Options(model="position"))
+    chosen, tests = select_effects(job, solve_job)
+    assert chosen.robot == arm()
+    assert [one.reason for one in tests] == ["no evidence"] * 4
+    plain = replace(job, robot=arm(*LISTED))
+    assert select_effects(plain, solve_job) == (plain, ())
+
+
+def test_effects_are_tried_until_nothing_changes(monkeypatch):
+    """One is of use only after another that comes later, and replaces it: the first is tried again, and one dropped."""
+    of_use = {
+        "error_curve": lambda kept: 1 in kept,
+        "compliance": lambda kept: True,
+        "harmonics": lambda kept: 3 not in kept,
+    }
+
+    class Scripted:
+        def __init__(self, job, solution):
+            self.effects = job.robot.effects
+
+        def test(self, kept, i):
+            name = ("harmonics", "compliance", "gain", "error_curve")[i]
+            return EffectTest(name, (), 1.0, 1.0, 1.0, of_use.get(name, lambda kept: False)(kept))
+
+    monkeypatch.setattr(selection, "_Choice", Scripted)
+    job = Job(None, choosing(arm(*LISTED)), measured(arm(), 0), Options(model="position"))
+    assert select_effects(job, solve_job)[0].robot.effects == LISTED[1::2]
+
+
+@pytest.fixture(scope="module")
+def choice():
+    job = Job(None, choosing(arm(*LISTED)), measured(curved_and_compliant(2), 2, 60), Options(model="position"))
+    return selection._Choice(job, solve_job(replace(job, robot=arm())))
+
+
+@pytest.mark.parametrize("kept", [(), (1,), (1, 3)])
+def test_evidence_is_the_density_of_the_residuals(choice, kept):
+    columns, noise, prior, evidence, x, U = choice.fit(frozenset(kept))
+    A, b = choice.rows[:, columns], choice.rows[:, -1]
+    C = noise * np.eye(len(b)) + (A / prior) @ A.T
+    density = -0.5 * (b @ np.linalg.solve(C, b) + np.linalg.slogdet(C)[1])
+    assert evidence == pytest.approx(density, rel=1e-6)
+    assert x == pytest.approx(-(A / prior).T @ np.linalg.solve(C, b), rel=1e-4, abs=1e-6)
+    K = np.linalg.inv(A.T @ A / noise + np.diag(prior))
+    assert U.T @ U == pytest.approx(K, rel=1e-5, abs=1e-9)
+
+
+def test_noise_and_sigma_are_those_of_largest_evidence(choice):
+    """Neighbours by 10 % have a smaller one."""
+    columns, noise, prior, best, *_ = choice.fit(frozenset((1, 3)))
+    A, b, of_curves = choice.rows[:, columns], choice.rows[:, -1], choice.is_curve[columns]
+
+    def evidence(by_noise, by_sigma):
+        C = by_noise * noise * np.eye(len(b)) + (A / np.where(of_curves, prior / by_sigma**2, prior)) @ A.T
+        return -0.5 * (b @ np.linalg.solve(C, b) + np.linalg.slogdet(C)[1])
+
+    assert best > max(evidence(1.1, 1.0), evidence(1 / 1.1, 1.0), evidence(1.0, 1.2), evidence(1.0, 1 / 1.2))
+
+
+def test_blocks_are_predicted_by_the_other_rows(choice):
+    columns, noise, prior, *_ = choice.fit(frozenset((1, 3)))
+    A, b = choice.rows[:, columns], choice.rows[:, -1]
+    found = choice.held_out(frozenset((1, 3)))
+    assert [np.sum([len(rows) for j, rows, _ in choice.held if j == k]) for k in range(4)] == [len(b)] * 4
+    for j, rows, _ in choice.held[1::3]:
+        rest = np.setdiff1d(np.arange(len(b)), rows)
+        x = -np.linalg.solve(A[rest].T @ A[rest] + noise * np.diag(prior), A[rest].T @ b[rest])
+        assert found[j, rows] == pytest.approx(b[rows] + A[rows] @ x, rel=1e-4, abs=1e-4)
+
+
+def test_an_effect_that_makes_a_block_worse_than_the_geometry_is_left(choice, monkeypatch):
+    j, rows, _ = choice.held[5]
+    with_curve = np.full((4, len(choice.rows)), 0.5)
+    with_curve[j, rows] = 1.1
+    monkeypatch.setattr(choice, "held_out", lambda kept: with_curve if 3 in kept else np.ones(with_curve.shape))
+    found = choice.test(frozenset((1,)), 3)
+    assert (found.kept, found.reason) == (False, "a block of joint 2 is predicted worse than by the geometry alone")
+    with_curve[j, rows] = 0.9
+    assert choice.test(frozenset((1,)), 3).kept

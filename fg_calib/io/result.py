@@ -47,6 +47,7 @@ from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_s
 from fg_calib.io.yaml import Units, first_misfit, shown
 from fg_calib.observability import Identifiability
 from fg_calib.robot import EFFECT_KINDS, SCALES, SPAN, Robot, model, pose
+from fg_calib.selection import EffectTest
 
 if TYPE_CHECKING:
     import polars as pl
@@ -285,6 +286,7 @@ class Result(Section):
     test: statistics.PredictedFit | None = of("assessed.fit.goodness.test", None)
     acceptance: statistics.Acceptance | None = of("assessed.acceptance", None)
     folds: statistics.CrossValidation | None = of("assessed.cross_validation", None)
+    effects: tuple[EffectTest, ...] = ()
     priors: statistics.PriorFit | None = of("assessed.fit.priors", None)
     expected_error: prediction.ExpectedError | None = of("assessed.expected_error", None)
     sigma_joint: Floats = of("problem.sigma_joint", np.zeros(0))
@@ -321,6 +323,7 @@ class Result(Section):
         date: str | None = None,
         history: tuple[Run, ...] = (),
         notes: tuple[str, ...] = (),
+        effects: tuple[EffectTest, ...] = (),
     ) -> Result:
         """The result of a solution and its assessment.
 
@@ -332,6 +335,7 @@ class Result(Section):
             date: When its rows were measured; now if None.
             history: The runs before it.
             notes: Notes for a reader, a sentence each.
+            effects: What was found of the arm's effects, where it was to be chosen among them.
         """
         problem = solution.problem
         data, urdf, frames = problem.data, problem.robot.urdf, problem.variables.frames
@@ -356,6 +360,7 @@ class Result(Section):
             date=date or datetime.now(UTC).isoformat(timespec="seconds"),
             history=history,
             notes=notes,
+            effects=effects,
             carried=_carried(solution, job or {}),
             **_noise_factors(solution, goodness.kinds),
         )

@@ -112,6 +112,7 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
         *section("Prediction of the test rows", *_prediction(result)),
         *_cross_validation(result),
         *expected_tool_error(result.expected_error),
+        *section("Effects beyond the geometry (folds: RMS of held-out blocks of joint positions)", *_effects(result)),
         *section(PARAMETERS, parameter_table(result)),
         *section(CURVES, _error_curves(result)),
         *section("Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)", _tolerances(result)),
@@ -248,6 +249,15 @@ def _cross_validation(result: Result) -> list[Section]:
     title = f"Cross-validation ({found.n} folds of configurations, each predicted without it; RMS)"
     columns = ("", "|unit", "held out|d", "before|q:.4f", "after|q:.4f", "specified noise|q:.4f")
     return section(title, table_of(columns, rows), *lines)
+
+
+def _effects(result: Result) -> Iterator[str]:
+    """What was found of each effect that was tried."""
+    for one in result.effects:
+        where = f" of joints {', '.join(map(str, one.joints))}" * bool(one.joints)
+        rms = f"{figure(one.folds_before, one.unit, '.3g')} -> {in_words(one.folds_after, one.unit)}"
+        outcome = "kept" if one.kept else f"left, {one.reason}"
+        yield f"{one.effect.replace('_', ' ')}{where}: p {max(one.p_value, 1e-300):.0e}, folds {rms}: {outcome}"
 
 
 def expected_tool_error(expected: prediction.ExpectedError | None) -> list[Section]:
