@@ -103,10 +103,11 @@ class Pool(Brief):
     def posterior(self, poses: Integers) -> Posterior:
         """Posterior with some poses, given ones included, after the earlier ones, as a calibration would report it."""
         here, measured = self.problem, [] if self.before is None else [self.before]
-        if len(poses) or not measured:
+        if len(poses):
             new = true_problem(self.robot, self.select_tables(poses), here.options, places_of(here, here.start))
             measured += [new] * bool(new.rows.parts or not measured)  # one end of a pair measures nothing
         rows = [rows_in_columns_of(problem, here) for problem in measured]
+        rows = rows or [unknown_prior_rows(here.variables, here.start)[1]]
         if len(measured) == 2:  # priors of landmarks are in the rows of earlier measurements, and count once
             rows[1] = rows[1][len(unknown_prior_rows(new.variables, new.start)[0]) :]
         return Posterior(here, np.vstack(rows), sum(map(count_measurements, measured)))
@@ -161,8 +162,9 @@ def rows_in_columns_of(before: Problem, problem: Problem) -> Floats:
 
 
 def _columns_by_name(variables: Variables, unknowns: Landmarks) -> dict[tuple[str, str], Integers]:
-    """Columns of each variable: of the core's by its symbol, of landmarks by letter and name."""
-    found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in variables.items}
+    """Columns of each variable: of the core's and of curves by their symbols, of landmarks by letter and name."""
+    own = (*variables.items, *(v for v in variables.nuisance if v.kind == "curve"))
+    found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in own}
     for letter, name in unknowns.keys:
         place = coordinates_of(variables, unknowns, (letter, name))
         if place is not None:

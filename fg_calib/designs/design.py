@@ -230,6 +230,7 @@ def design_from_pool(
         raise InputError("candidates", "none at which anything is measured", "some")
     system = build_system(pool.rows, pool.known, task.quadratic_form(pool.problem)).with_known(pool.given)
     chooser = Chooser(system.select(measurable), criterion, _error_of_formed_pairs(pool, task, measurable))
+    chooser.of_curves = pool.posterior(pool.given).error_of_curves(task)
     parallel.tell("choosing")
     wanted = max(1, min((n or N_POSES) - len(pool.references), len(measurable)))
     found = chooser.best(wanted, generator) if target is None else chooser.reaching(target)
@@ -238,6 +239,7 @@ def design_from_pool(
     ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
     poses = np.concatenate([pool.given, ordered])
     posterior, tables = pool.posterior(poses), pool.select_tables(ordered)
+    chooser.of_curves = posterior.error_of_curves(task)
     configurations = _configurations_of(pool, ordered, tables)
     data = pool.problem.data
     names, readings = [data.names[k] for k in configurations], data.readings[configurations]

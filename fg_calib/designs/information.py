@@ -64,6 +64,9 @@ class PoseRows(FrozenArrays):
 def gather_rows(problem: Problem, pose_of: Integers, references: Integers, *, alone: bool) -> PoseRows:
     """Gather the rows of a problem by pose.
 
+    Where nothing was measured before, error curves count as noise of each pose by their priors: a design has few poses
+    for hundreds of coefficients.
+
     Args:
         problem: The problem, linearised at its start.
         pose_of: The pose of each configuration, shape (n_configurations,); below 0 for none and for a reference.
@@ -73,7 +76,8 @@ def gather_rows(problem: Problem, pose_of: Integers, references: Integers, *, al
     v = problem.variables
     n_columns, n_poses = v.n_columns + v.n_nuisance, int(pose_of.max(initial=-1)) + 1
     whole, private, which = _derivatives(problem, pose_of, references)
-    n_shared = whole.shape[1] - n_columns
+    n_shared, of_curves = whole.shape[1] - n_columns, slice(v.n_columns, v.n_columns + v.n_curves * alone)
+    private = np.hstack([private, whole[:, of_curves] * v.all_scales[of_curves]])
     stacked = _stack(np.hstack([whole, private]), which, n_poses)
     J, L = np.split(stacked, [whole.shape[1]], axis=2)  # whitened by the covariance 1 + L L^T of a pose's rows
     rows = np.linalg.solve(np.linalg.cholesky(np.eye(J.shape[1]) + L @ np.swapaxes(L, 1, 2)), J)
@@ -82,6 +86,7 @@ def gather_rows(problem: Problem, pose_of: Integers, references: Integers, *, al
         fixed.append(unknown_prior_rows(v, problem.start)[1])
     of_references = whole[which < 0] if alone else whole[:0]
     wide = np.vstack([*(np.pad(one, ((0, 0), (0, n_shared))) for one in fixed), of_references])
+    rows[:, :, of_curves] = wide[:, of_curves] = 0.0
     errors = np.hstack([np.zeros((n_shared, n_columns)), np.eye(n_shared)])
     scales = np.append(v.all_scales, np.ones(n_shared))
     return PoseRows(rows, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns)
@@ -245,10 +250,21 @@ class Posterior(Brief):
 
     @cached_property
     def covariance(self) -> statistics.TangentCovariance:
-        """Covariance of the core."""
+        """Covariance of the core, and of error curves."""
         v = self.problem.variables
         left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_columns)
-        return statistics.covariance_of_rows(v, self.problem.start, left.A)
+        own = left.inverse[: v.n_curves]
+        curves = np.hstack([left.follow[: v.n_curves], np.linalg.cholesky(own @ own.T)])
+        return replace(statistics.covariance_of_rows(v, self.problem.start, left.A), curves=curves)
+
+    def error_of_curves(self, task: Task) -> float:
+        """RMS error of the tool over a task by error curves, were all else known, [m]."""
+        if not self.problem.variables.n_curves:
+            return 0.0
+        known = {name: np.zeros_like(getattr(self.covariance, name))
+                 for name in ("tangent", "undetermined", "undetermined_at_nominal")}  # fmt: skip
+        base, fitted = prediction.errors_at(replace(self.covariance, **known), task.readings)
+        return (fitted if task.fitted else base).position or 0.0
 
     def error(self, task: Task) -> prediction.PoseRms:
         """Expected errors of the tool over a task."""

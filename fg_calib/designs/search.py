@@ -97,7 +97,12 @@ class Chooser:
         system: The candidates.
         criterion: Minimised value.
         error: Expected RMS error with some candidates, [m], where the system does not give it; inf if not determined.
+
+    Attributes:
+        of_curves: What error curves add to the error, [m].
     """
+
+    of_curves = 0.0
 
     def __init__(self, system: System, criterion: Criterion, error: Callable[[Integers], float] | None = None) -> None:
         self.system, self._exact = system, error
@@ -111,7 +116,7 @@ class Chooser:
             return float("inf")
         if self._exact is not None:
             return self._exact(chosen)
-        return float(np.sqrt(self._error.value(self.system.information(chosen))))
+        return float(np.hypot(np.sqrt(self._error.value(self.system.information(chosen))), self.of_curves))
 
     def value(self, chosen: Integers) -> float:
         """The criterion with some candidates."""

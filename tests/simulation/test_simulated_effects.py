@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from oracle import tool_poses
 from scenarios import SIGMA, TOLERANCE, WALL
-from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Pairing, Robot, assess, build_problem, design, read_job, simulate, solve
+from fg_calib.prediction import errors_at
 from fg_calib.robot import Backlash, Compliance, Coupling, ErrorCurve, Gain, Harmonics, Mass, Thermal
-from fg_calib.simulation import Errors, Instrument, RandomReadings, Scenario, write_simulation
+from fg_calib.simulation import Errors, GivenReadings, Instrument, RandomReadings, Scenario, write_simulation
+from fg_calib.statistics import spread_of
 
 ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
 MASSES = (Mass(2, 12.0, (0.2, 0.0, 0.1)), Mass(4, 5.0, (0.0, 0.0, 0.1)))
@@ -29,31 +30,22 @@ def scenario(*effects, **changes):
 @pytest.mark.parametrize("instruments", [(), (BOARD,)])
 def test_true_data_follow_the_columns_and_the_order_of_the_table(side, instruments, tmp_path):
     """The board is not seen from all configurations: sides are by those that are in the table."""
-    effects, n = (Backlash([1, 2], side=side), Thermal(lengths=False, zeros=True)), 60
-    of = scenario(*effects, instruments=instruments, frame="base", job={} if instruments else {"model": "pose"})
-    s = simulate(replace(of, validation=RandomReadings(9)), 1, exact=True)
+    more = {"instruments": instruments, "frame": "base", "job": {} if instruments else {"model": "pose"}}
+    of = scenario(Backlash([1, 2], side=side), Thermal(lengths=False, zeros=True), validation=RandomReadings(9), **more)
+    s = simulate(replace(of, errors=Errors("values", {"backlash": 2e-3, "drift": 1e-4})), 1, exact=True)
     write_simulation(tmp_path, s)
     m = read_job(tmp_path / "calibration.yaml").tables[0].measurements
-    first = np.sort(np.unique(m.ids, return_index=True)[1])
-    assert (len(first) < n) == bool(instruments)
-    true, T, b = s.true_robot, m.context["temperature"], m.context[side][:, :2]
-    drift, backlash = ([true.nominal[true.index(f"theta{i}.{kind}")] for i in of] for kind, of in
-                       (("drift", (1, 2, 3, 4)), ("backlash", (1, 2))))  # fmt: skip
-    stood = m.readings + np.outer(T - 20.0, drift)
-    stood[:, :2] += b * backlash
+    T, b, first = m.context["temperature"], m.context[side][:, :2], np.sort(np.unique(m.ids, return_index=True)[1])
+    assert (len(first) < 69) == bool(instruments)
+    stood = m.readings + 1e-4 * (T[:, None] - 20.0)
+    stood[:, :2] += 2e-3 * b
     if side == "moves":
-        q = m.readings[first, :2]
-        assert b[first] == pytest.approx(np.sign(np.diff(q, axis=0, prepend=q[:1])))
+        assert b[first] == pytest.approx(np.sign(np.diff(m.readings[first, :2], axis=0, prepend=m.readings[:1, :2])))
     assert set(b[len(m.ids) // len(first) :].ravel()) == {-1.0, 1.0}
-    assert abs(b.mean()) < 0.5
-    assert T.min() == pytest.approx(12.5, abs=0.5)
-    assert T.max() == pytest.approx(20.5, abs=0.5)
-    tool = tool_poses(true.geometry, stood)
-    rotation, wall = tool[:, :3, :3], WALL["wall"]
-    p = np.einsum("nji,nj->ni", rotation, wall.position - tool[:, :3, 3]) if instruments else tool[:, :3, 3]
-    R = np.swapaxes(rotation, 1, 2) @ wall.rotation if instruments else rotation
-    assert m.position == pytest.approx(p, abs=1e-12)  # rounding of a file of 17 digits
-    assert Rotation.from_matrix(np.swapaxes(R, 1, 2) @ m.rotation).magnitude().max() < 1e-7
+    assert [T.min(), T.max()] == pytest.approx([12.5, 20.5], abs=0.5)
+    tool = tool_poses(s.true_robot.geometry, stood)
+    seen = np.einsum("nji,nj->ni", tool[:, :3, :3], WALL["wall"].position - tool[:, :3, 3])
+    assert m.position == pytest.approx(seen if instruments else tool[:, :3, 3], abs=1e-12)  # rounding of 17 digits
 
 
 CURVE = ErrorCurve(knots=9, sigma=2e-3)
@@ -85,3 +77,13 @@ def test_a_design_for_compliance_takes_poses_with_torque():
     chosen, pool = (effect.values(of.robot.geometry, q, {}, np.zeros(4))[:, 1:3, 0] for q in
                     (plan.readings, plan.pool.readings))  # fmt: skip
     assert (np.sqrt(np.mean(chosen**2, axis=0)) > 1.3 * np.sqrt(np.mean(pool**2, axis=0))).all()
+
+
+def test_a_design_expects_what_a_calibration_with_error_curves_then_finds():
+    of = scenario(ErrorCurve(knots=24, sigma=5e-4), errors=Errors("values", {}))
+    plan = design(of, n=15, seed=0)
+    s = simulate(replace(of, configurations=GivenReadings(plan.readings)), exact=True)
+    spread = spread_of(solve(build_problem(s.robot, s.tables)))
+    found = errors_at(spread, plan.task.readings)[plan.task.fitted].position
+    assert plan.expected.position == pytest.approx(found, rel=1e-3)  # second order of the start of the frame
+    assert plan.random == pytest.approx(found, rel=0.05)
