@@ -104,13 +104,6 @@ class SchurComplement(Record):
         return b - L.T @ solve(L @ b) if of_rows else solve(b)
 
     @cached_property
-    def triangle(self) -> Floats:
-        """U, upper triangular, with U^T U = S."""
-        S = (self.loadings.T @ self.loadings).toarray()
-        U: Floats = scipy.linalg.cholesky(np.eye(self.n_states) + S, overwrite_a=True, check_finite=False)
-        return U
-
-    @cached_property
     def variances(self) -> Floats:
         """Posterior variances of the states, the diagonal of S^-1, shape (n_states,); many take a solution each."""
         out = np.empty(self.n_states)
@@ -275,9 +268,8 @@ class WhitenedBlock(Brief):
                 out[rows, :, at.columns[places[rows]]] = J[rows, :, n + k]
             flat = out.reshape(r.size, -1)
             if at.curves is not None:
-                flat[:, n : n + len(at.curves.sigma)] = curve_columns(
-                    residuals.rows_of(block, chunk), chain, at.curves
-                ).toarray()
+                of_curves = curve_columns(residuals.rows_of(block, chunk), chain, at.curves).sparse()
+                flat[:, n : n + of_curves.shape[1]] = of_curves.toarray()
             yield flat
 
     def reduce(self, at: State) -> Iterator[Floats]:
@@ -291,8 +283,40 @@ class WhitenedBlock(Brief):
         yield out
 
 
-def curve_columns(block: Block, chain: Chain, curves: Curves) -> Sparse:
-    """Derivatives of a block in the coefficients of error curves, shape (rows, n_curves): of joints, times splines."""
+class CurveColumns(NamedTuple):
+    """Derivatives of measurements in the few coefficients of error curves that each depends on.
+
+    Attributes:
+        values: Shape (n, residual_dim, k).
+        columns: Numbers of the coefficients, shape (n, k).
+        n_curves: How many there are.
+    """
+
+    values: Floats
+    columns: Integers
+    n_curves: int
+
+    def sparse(self) -> Sparse:
+        """The derivatives row by row, shape (n residual_dim, n_curves)."""
+        n, h, k = self.values.shape
+        places = np.repeat(self.columns, h, axis=0).ravel()
+        out = Sparse((self.values.flatten(), places, np.arange(n * h + 1) * k), shape=(n * h, self.n_curves))
+        out.sum_duplicates()  # in place
+        return out
+
+    def gram(self) -> Floats:
+        """Their Gram matrix, shape (n_curves, n_curves): rows of a measurement depend on the same few coefficients."""
+        n = self.n_curves
+        total = np.zeros(n * n)
+        for some in (slice(start, start + BATCH) for start in range(0, len(self.columns), BATCH)):
+            values, columns = self.values[some], self.columns[some]
+            places = columns[:, :, None] * n + columns[:, None]
+            total += np.bincount(places.ravel(), (values.transpose(0, 2, 1) @ values).ravel(), n * n)
+        return total.reshape(n, n)
+
+
+def curve_columns(block: Block, chain: Chain, curves: Curves) -> CurveColumns:
+    """Derivatives of a block in the coefficients of error curves: those in joints, times splines."""
     chain = chain.without_columns().with_turn_columns()
     J = residuals.linearise(block, chain)[1]
     columns, values = [np.zeros((block.n, 0), dtype=np.int64)], [J[:, :, :0]]
@@ -302,12 +326,7 @@ def curve_columns(block: Block, chain: Chain, curves: Curves) -> Sparse:
             knots, weights = found[joint]
             columns.append(first + knots)
             values.append(J[:, :, [end * chain.n_joints + joint]] * weights[:, None])
-    data = np.concatenate(values, axis=2)
-    n, h, k = data.shape
-    places = np.repeat(np.hstack(columns), h, axis=0)
-    out = Sparse((data.ravel(), places.ravel(), np.arange(n * h + 1) * k), shape=(n * h, len(curves.sigma)))
-    out.sum_duplicates()  # in place
-    return out
+    return CurveColumns(np.concatenate(values, axis=2), np.hstack(columns), len(curves.sigma))
 
 
 class WhitenedRows(Brief):
@@ -357,8 +376,11 @@ class WhitenedRows(Brief):
         """Change of each row per 1 sigma of each coefficient of error curves, shape (n_rows, n_curves)."""
         if at.curves is None:
             return Sparse((sum(part.n_rows for part in self.parts), 0))
-        each = [curve_columns(part.at(at), at.chains[part.table], at.curves) for part in self.parts]
-        return Sparse(_stacked(each) * at.curves.sigma)
+        return Sparse(_stacked([of.sparse() for of in self._of_curves(at)]) * at.curves.sigma)
+
+    def _of_curves(self, at: State) -> list[CurveColumns]:
+        assert at.curves is not None
+        return [curve_columns(part.at(at), at.chains[part.table], at.curves) for part in self.parts]
 
     def without_curves(self, at: State, variance: float = 1.0) -> Eliminated:
         """The rows with error curves eliminated, where no errors are shared.
@@ -369,13 +391,13 @@ class WhitenedRows(Brief):
             at: The state.
             variance: Of the rows, in units of that by which they were whitened.
         """
-        curves = at.curves
+        curves, y = at.curves, self.private(at.without_curves()) / np.sqrt(variance)
         assert curves is not None
-        y = self.private(at.without_curves()) / np.sqrt(variance)
-        L = Sparse(self.curve_loadings(at) / np.sqrt(variance))
-        before, states = curves.values / curves.sigma, SchurComplement(L)
+        each, scale = self._of_curves(at), curves.sigma / np.sqrt(variance)
+        L, before = Sparse(_stacked([of.sparse() for of in each]) * scale), curves.values / curves.sigma
         y[:, -1] -= L @ before
-        U = states.triangle
+        S = np.eye(len(scale)) + scale[:, None] * sum(of.gram() for of in each) * scale
+        U = scipy.linalg.cholesky(S, overwrite_a=True, check_finite=False)
         Z = scipy.linalg.cho_solve((U, False), L.T @ y, check_finite=False)
         rows = _reduced(y.shape[1], [np.concatenate([y - L @ Z, Z])])
         inverse = curves.sigma[:, None] * scipy.linalg.lapack.dtrtri(U)[0]

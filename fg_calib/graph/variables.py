@@ -496,4 +496,6 @@ def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats
     columns = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v, _, _ in found)])
     x = np.concatenate([np.zeros(0), *(parameters[v.places] - mean for v, mean, _ in found)])
     sigma = np.concatenate([np.ones(0), *(s for _, _, s in found)])
-    return x / sigma, np.eye(variables.n_columns + variables.n_nuisance)[columns] / sigma[:, None]
+    J = np.zeros((len(x), variables.n_columns + variables.n_nuisance))
+    J[np.arange(len(x)), columns] = 1.0 / sigma
+    return x / sigma, J

@@ -195,7 +195,7 @@ class RowModel:
             found = np.flatnonzero(column >= 0)
             P[found, :, column[found]] = J[found, :, at.n_columns + k]
         if at.curves is not None:
-            columns = curve_columns(noise.rows_at(rows), self.chain(number), at.curves).toarray()
+            columns = curve_columns(noise.rows_at(rows), self.chain(number), at.curves).sparse().toarray()
             P[:, :, at.n_columns : at.n_columns + columns.shape[1]] = columns.reshape(*P.shape[:2], columns.shape[1])
         if not noise.block.kind.is_contact:
             P[self._nowhere[nuisances].any(axis=1)] = np.nan
