@@ -201,16 +201,10 @@ def assess(solution: graph.Solution) -> Assessment:
     verdict = diagnostics.judge(solution, spread, fit, identifiability)
     spread = spread.inflated(verdict.variance)
     whole = statistics.with_left_out(solution, spread)
-    assessment = Assessment(
-        robot=problem.robot.with_values(solution.parameters[problem.variables.robot_span]),
-        estimates=statistics.estimates_at(solution, spread, whole, identifiability.observability),
-        names=whole.variables.names[: whole.variables.n_robot_columns],
-        covariance=whole.named(),
-        spread=spread,
-        whole=whole,
-        fit=fit,
-        identifiability=identifiability,
-        verdict=verdict,
-        expected_error=None if problem.evaluated else expected_error(problem, whole),
-    )
+    robot = problem.robot.with_values(solution.parameters[problem.variables.robot_span])
+    estimates = statistics.estimates_at(solution, spread, whole, identifiability.observability)
+    names = whole.variables.names[: whole.variables.n_robot_columns]
+    expected = None if problem.evaluated else expected_error(problem, whole)
+    found = (spread, whole, fit, identifiability, verdict, expected)
+    assessment = Assessment(robot, estimates, names, whole.named(), *found)
     return assessment.with_held_out((), solution)

@@ -137,20 +137,11 @@ def summarise(order: Order) -> JobSummary:
     result, not_accepted = found.result, found.not_accepted
     rows = "test" if result.rms_after("test") else "train"
     rms = result.rms_after(rows)
-    return JobSummary(
-        name=order.name,
-        job=str(order.job),
-        verdict="doubtful" if result.findings else "not accepted" if not_accepted else "good",
-        findings=result.findings,
-        not_accepted=not_accepted,
-        robot=result.robot,
-        n_configurations=result.n_configurations,
-        rms=rms,
-        rows=rows,
-        units={kind: result.unit_of(kind) for kind in rms},
-        reduced_chi2=result.reduced_chi2,
-        seconds=time.perf_counter() - clock,
-    )
+    verdict: Verdict = "doubtful" if result.findings else "not accepted" if not_accepted else "good"
+    units = {kind: result.unit_of(kind) for kind in rms}
+    about = (None, result.findings, not_accepted, result.robot, result.n_configurations, rms, rows, units)
+    seconds = time.perf_counter() - clock
+    return JobSummary(order.name, str(order.job), verdict, *about, result.reduced_chi2, seconds)
 
 
 def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) -> list[JobSummary]:
@@ -180,13 +171,9 @@ def jobs_document(jobs: Sequence[JobSummary], seconds: float) -> dict[str, Any]:
         jobs: The summary of each job.
         seconds: Duration of all of them together, [s].
     """
-    return {
-        "schema": "fg-calib/jobs/1",
-        "n": {verdict: sum(job.verdict == verdict for job in jobs) for verdict in get_args(Verdict)},
-        "exit_code": exit_code(jobs),
-        "seconds": seconds,
-        "jobs": [asdict(job) for job in jobs],
-    }
+    counts = {verdict: sum(job.verdict == verdict for job in jobs) for verdict in get_args(Verdict)}
+    head = {"schema": "fg-calib/jobs/1", "n": counts, "exit_code": exit_code(jobs), "seconds": seconds}
+    return {**head, "jobs": [asdict(job) for job in jobs]}
 
 
 def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None:

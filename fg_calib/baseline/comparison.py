@@ -194,16 +194,11 @@ def compare(job: Job) -> Comparison:
         except CalibrationError as error:
             return Estimate(name, None, {}, False, f"could not run: {error}")
 
-    return Comparison(
-        job=job,
-        estimates=(judged("graph", solution, assessed), *map(without_priors, list(ESTIMATORS)[1:])),
-        errors_before=errors(job.robot.with_values(solution.before[solution.problem.variables.robot_span])),
-        rms_before=rms(solution, "before"),
-        judged_on=judged_on,
-        n_judged=len(readings),
-        findings=assessed.verdict.errors,
-        units={family: assessed.fit.residuals.unit(family) for family in assessed.fit.residuals.families},
-    )
+    estimates = (judged("graph", solution, assessed), *map(without_priors, list(ESTIMATORS)[1:]))
+    before = errors(job.robot.with_values(solution.before[solution.problem.variables.robot_span]))
+    units = {family: assessed.fit.residuals.unit(family) for family in assessed.fit.residuals.families}
+    about = (judged_on, len(readings), assessed.verdict.errors, units)
+    return Comparison(job, estimates, before, rms(solution, "before"), *about)
 
 
 def _predicted(fit: LeastSquares, readings: Floats) -> tuple[PoseRms, PoseRms]:

@@ -120,15 +120,10 @@ def fit_least_squares(
     system = _System(robot, data, [i for i, p in enumerate(robot.parameters) if p.name in wanted], start, weighted)
     fit, weights = system.solve()
     m, (r, J), parameters = len(wanted), system.evaluate(fit.x, weights), system.parameters(fit.x)
-    return LeastSquares(
-        robot=robot.with_values(parameters[: len(robot.parameters)]),
-        names=tuple(p.name for p in robot.parameters if p.name in wanted),
-        parameters=parameters,
-        covariance=claimed_covariance(r, J, weighted)[:m, :m],
-        n_rows=len(r),
-        **{key: getattr(fit, key) for key in ("converged", "message", "iterations")},
-        seconds=time.perf_counter() - clock,
-    )
+    kept = tuple(p.name for p in robot.parameters if p.name in wanted)
+    arm, covariance = robot.with_values(parameters[: len(robot.parameters)]), claimed_covariance(r, J, weighted)[:m, :m]
+    about = (len(r), fit.converged, fit.message, fit.iterations, time.perf_counter() - clock)
+    return LeastSquares(arm, kept, parameters, covariance, *about)
 
 
 Evaluate = Callable[[Floats], tuple[Floats, Floats]]

@@ -248,27 +248,15 @@ def design_from_pool(
     error = np.inf if expected.position is None else expected.position
     before = pool.posterior(pool.given).error(task) if len(pool.given) or pool.before is not None else None
     used = [t for t in tables if t.measurements.n_configurations]
+    measured = tuple(rename_configurations(t, dict(zip(names, ids, strict=True))) for t in used)
+    after_fit = None if task.fitted else posterior.error(replace(task, fitted=True))
+    errors = (expected, after_fit, posterior.with_known_tool().error(task), before, curve[-1].random[1])
+    curve = (*curve[:-1], replace(curve[-1], designed=error))
+    asked = (n if target is None else None, target, target is None or error <= target * _JUST)
+    group, known = pool.groups_of(configurations), (posterior.observability, chooser.system.unknown)
+    travel = (joint_travel(pool.robot, readings), joint_travel(pool.robot, pool.readings[chosen]))
     return Design(
-        pool=pool,
-        tables=tuple(rename_configurations(t, dict(zip(names, ids, strict=True))) for t in used),
-        criterion=criterion,
-        task=task,
-        readings=readings,
-        ids=np.array(ids),
-        group=pool.groups_of(configurations),
-        expected=expected,
-        after_fit=None if task.fitted else posterior.error(replace(task, fitted=True)),
-        known_tool=posterior.with_known_tool().error(task),
-        before=before,
-        random=curve[-1].random[1],
-        curve=(*curve[:-1], replace(curve[-1], designed=error)),
-        asked=n if target is None else None,
-        target=target,
-        reached=target is None or error <= target * _JUST,
-        observability=posterior.observability,
-        unknown=chooser.system.unknown,
-        travel=joint_travel(pool.robot, readings),
-        travel_before=joint_travel(pool.robot, pool.readings[chosen]),
+        pool, measured, criterion, task, readings, np.array(ids), group, *errors, curve, *asked, *known, *travel
     )
 
 

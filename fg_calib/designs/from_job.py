@@ -76,17 +76,10 @@ def scenario_of(problem: graph.Problem, configurations: Configurations | None = 
             expected = "candidates from the job's own rows: --candidates rows"
             raise InputError(f"{source}: {table.measurements.source}", "custom measurements", expected)
         instruments.append(_instrument_of(problem, number, names[-1], configurations))
-    return Scenario(
-        robot=problem.robot.with_values(problem.start[problem.variables.robot_span]),
-        errors=Errors("values", {}),
-        configurations=configurations or RandomReadings(1),
-        noise=measurements.Noise(joint=tuple(problem.sigma_joint.tolist())),
-        frame="base",
-        job={"gauge": problem.options.gauge},
-        name=source,
-        source=source,
-        instruments=tuple(instruments),
-    )
+    robot = problem.robot.with_values(problem.start[problem.variables.robot_span])
+    noise = measurements.Noise(joint=tuple(problem.sigma_joint.tolist()))
+    none, at, job = Errors("values", {}), configurations or RandomReadings(1), {"gauge": problem.options.gauge}
+    return Scenario(robot, none, at, noise, "base", job=job, name=source, source=source, instruments=tuple(instruments))
 
 
 def _instrument_of(problem: graph.Problem, number: int, name: str, configurations: Configurations | None) -> Instrument:

@@ -173,21 +173,16 @@ def inspect_job(job: Job) -> Inspection:
     at_nominal = unsolved(problem)
     spread = spread_of(at_nominal)
     n_directions = spread.rank + problem.system.left.rank
-    found = Inspection(
-        robot=job.robot.name,
-        tables=tuple(_survey(problem, number, table) for number, table in enumerate(tables)),
-        joints=_joints(problem, job.robot),
-        setups=tuple(setups),
-        disagreements=() if misread else _disagreements(job),
-        identifiability=identifiability_of(problem.whole or problem, problem.start, "practical"),
-        expected_error=None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread)),
-        n_residuals=problem.n_residuals,
-        n_priors=problem.n_priors,
-        n_unknowns=problem.variables.n_columns + problem.variables.n_nuisance,
-        dof=problem.n_independent + problem.n_priors - n_directions,
-        n_excluded={reason: n for reason, n in problem.n_excluded.items() if n},
-        evaluated=problem.evaluated,
-    )
+    surveys = tuple(_survey(problem, number, table) for number, table in enumerate(tables))
+    disagreements = () if misread else _disagreements(job)
+    identifiability = identifiability_of(problem.whole or problem, problem.start, "practical")
+    expected = None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread))
+    n_unknowns = problem.variables.n_columns + problem.variables.n_nuisance
+    dof = problem.n_independent + problem.n_priors - n_directions
+    counts = (problem.n_residuals, problem.n_priors, n_unknowns, dof)
+    excluded = {reason: n for reason, n in problem.n_excluded.items() if n}
+    rows = (surveys, _joints(problem, job.robot), tuple(setups), disagreements)
+    found = Inspection(job.robot.name, *rows, identifiability, expected, *counts, excluded, problem.evaluated)
     statements = [statement for check in CHECKS for statement in check(found, job)]
     cautions = (*texts(statements, "warning"), *texts(statements, "note"))
     return replace(found, findings=texts(statements, "error"), cautions=cautions)

@@ -453,16 +453,11 @@ def fit_board(
     taken = 6.0 + (0.0 if given else len(INTRINSICS) / len(fits))
     squares, n = (sum(of) for of in zip(*((fit.squares, len(fit.J)) for fit in fits.values()), strict=True))
     variance = squares / (n - taken * len(fits))
-    return BoardFit(
-        board=board,
-        size=size,
-        camera=camera,
-        camera_sigma=None if given else _camera_sigmas(camera, points, fits, variance),
-        views=tuple(_view(one, fits[one.name], variance, taken) for one in found if one.name in fits),
-        without_pose=tuple(one.name for one in found if one.name not in fits),
-        rms=float(np.sqrt(squares / n)),
-        sigma=float(np.sqrt(variance)),
-    )
+    sigmas = None if given else _camera_sigmas(camera, points, fits, variance)
+    views = tuple(_view(one, fits[one.name], variance, taken) for one in found if one.name in fits)
+    without = tuple(one.name for one in found if one.name not in fits)
+    rms, sigma = float(np.sqrt(squares / n)), float(np.sqrt(variance))
+    return BoardFit(board, size, camera, sigmas, views, without, rms, sigma)
 
 
 def _camera_sigmas(

@@ -161,16 +161,11 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
         if of_kind:
             units[kind] = there.pop() if there else _guess_unit(table, kind, of_kind)
     present = tuple(name for name in every if name not in joints)
-    return _Recognised(
-        path=path,
-        model=None if is_pairs else _find_model(set(present)),
-        present=present,
-        columns={name: table.columns[k] for name, k in every.items() if name != table.columns[k]},
-        units=units,
-        unused=tuple(c for k, c in enumerate(table.columns) if k not in every.values()),
-        skip_lines=skip_lines,
-        repeats=bool(joints) and table.frame[:, list(joints.values())].is_duplicated().any(),
-    )
+    model = None if is_pairs else _find_model(set(present))
+    columns = {name: table.columns[k] for name, k in every.items() if name != table.columns[k]}
+    unused = tuple(c for k, c in enumerate(table.columns) if k not in every.values())
+    repeats = bool(joints) and table.frame[:, list(joints.values())].is_duplicated().any()
+    return _Recognised(path, model, present, columns, units, unused, skip_lines, repeats)
 
 
 def _lines_before_header(path: Path) -> int:

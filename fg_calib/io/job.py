@@ -292,16 +292,10 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
     )
     camera, fixed = camera_in(file.camera if entry.camera == "fixed" else entry.camera, f"{place}: camera", folder)
     options = INSTRUMENTS[model].options
-    return Table(
-        measurements,
-        model,
-        pairing_of(entry.pairing, f"{place}: pairing"),
-        entry.frame,
-        known=_known_points(file, model, of_job),
-        offset="offset" in options and entry.offset == "estimate",
-        camera=camera if "camera" in options else None,
-        fixed_camera="camera" in options and (fixed or "fixed" in (entry.camera, file.camera)),
-    )
+    known, offset = _known_points(file, model, of_job), "offset" in options and entry.offset == "estimate"
+    fixed = "camera" in options and (fixed or "fixed" in (entry.camera, file.camera))
+    pairing, camera = pairing_of(entry.pairing, f"{place}: pairing"), camera if "camera" in options else None
+    return Table(measurements, model, pairing, entry.frame, (), known, offset, camera, fixed)
 
 
 def _known_points(file: Any, model: Model, place: str) -> dict[str, KnownPoint]:

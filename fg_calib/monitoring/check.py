@@ -172,23 +172,12 @@ def _judge(
         verdict, reasons = "not_evaluated", [f"a limit of {unjudged[0]}, and fewer than {LEAST} rows to judge it by"]
     explained = bool(likely) and likely[0].explains
     alone = len(likely) == 1 and likely[0].hypothesis.kind != "row"
-    made = Check(
-        verdict=verdict,
-        reasons=tuple(reasons),
-        cautions=tuple(cautions),
-        n=sum(len(s.train) for s in at.placed.problem.data.blocks),
-        chi2=at.chi2,
-        dof=at.dof,
-        p_value=p_value,
-        rms={kind: one.after for kind, one in rms.items()},
-        noise=noise,
-        limits=limit,
-        explanations=_explanations(found, likely),
-        gross_rows=tuple(gross),
-        deploy=verdict == "pass" or (verdict == "fail" and alone and explained),
-        detectable=_detectable(calibrated, found),
-        advice=hypotheses.advise_configurations(at, likely),
-    )
+    n = sum(len(s.train) for s in at.placed.problem.data.blocks)
+    tested = (verdict, tuple(reasons), tuple(cautions), n, at.chi2, at.dof, p_value)
+    sizes = ({kind: one.after for kind, one in rms.items()}, noise, limit)
+    deploy = verdict == "pass" or (verdict == "fail" and alone and explained)
+    detectable, advice = _detectable(calibrated, found), hypotheses.advise_configurations(at, likely)
+    made = Check(*tested, *sizes, _explanations(found, likely), tuple(gross), deploy, detectable, advice)
     return made if explained or verdict != "fail" else _unless_misread(made, at)
 
 
@@ -262,19 +251,12 @@ def _explanations(found: Sequence[HypothesisTest], likely: Sequence[HypothesisTe
 
     def explanation(f: HypothesisTest) -> Explanation:
         excluded = {g.hypothesis.names: hypotheses.excludes(f, g, scale) for g in shown if g is not f}
-        sized = f.hypothesis.kind != "row"
-        return Explanation(
-            parameters=f.hypothesis.names,
-            kind=f.hypothesis.kind,
-            change=tuple(map(float, f.change)) if sized else (),
-            sigma=tuple(float(s) if np.isfinite(s) else None for s in f.sigma) if sized else (),
-            units=f.hypothesis.units if sized else (),
-            chi2_drop=f.drop,
-            p_value=f.p_value,
-            likely=f.hypothesis.names in names,
-            told_apart_from=tuple(other for other, out in excluded.items() if out),
-            not_told_apart_from=tuple(other for other, out in excluded.items() if not out and other in names),
-            same=f.hypothesis.same,
-        )
+        h, sized = f.hypothesis, f.hypothesis.kind != "row"
+        change = tuple(map(float, f.change)) if sized else ()
+        sigma = tuple(float(s) if np.isfinite(s) else None for s in f.sigma) if sized else ()
+        tests = (f.drop, f.p_value, h.names in names)
+        told = tuple(other for other, out in excluded.items() if out)
+        not_told = tuple(other for other, out in excluded.items() if not out and other in names)
+        return Explanation(h.names, h.kind, change, sigma, h.units if sized else (), *tests, told, not_told, h.same)
 
     return tuple(map(explanation, shown))

@@ -177,18 +177,10 @@ def observability_of_rows(
     may_be_off = np.array([s if p.tolerance is None else p.tolerance for p, s in zip(parameters, scales, strict=True)])
     with np.errstate(divide="ignore", invalid="ignore"):
         gap = float(s[rank - 1] / s[rank]) if 0 < rank < n else np.inf
-    return Observability(
-        names=tuple(names),
-        singular_values=s,
-        rank=rank,
-        gap=gap,
-        classes=tuple(classes),
-        relative=groups,
-        null_space=null,
-        indices=observability_indices(s[:rank], n_measurements),
-        condition_number=float(s[0] / s[rank - 1]) if rank else np.inf,
-        **_accuracy(jacobian[:, kept] * may_be_off[kept], [names[i] for i in kept], may_be_off[kept]),
-    )
+    accuracy = _accuracy(jacobian[:, kept] * may_be_off[kept], [names[i] for i in kept], may_be_off[kept])
+    condition = float(s[0] / s[rank - 1]) if rank else np.inf
+    found = (s, rank, gap, tuple(classes), groups, null)
+    return Observability(tuple(names), *found, observability_indices(s[:rank], n_measurements), condition, **accuracy)
 
 
 def observability_indices(singular_values: Floats, n_measurements: int) -> dict[str, float]:

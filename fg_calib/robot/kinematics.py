@@ -139,19 +139,9 @@ class Chain(Brief):
     @cached_property
     def arrays(self) -> ChainArrays:
         """Arguments of the kernels."""
-        return ChainArrays(
-            axis=self.axis,
-            value=self.value,
-            cosine=np.cos(self.value),
-            sine=np.sin(self.value),
-            sign=self.sign,
-            joint=self.joint,
-            column=self.column,
-            n_columns=self.n_columns,
-            n_own=self.n_joints if self.joint_columns else 0,
-            turns=self._turns,
-            basis=self.basis,
-        )
+        cos, sin, n_own = np.cos(self.value), np.sin(self.value), self.n_joints if self.joint_columns else 0
+        walk = (self.sign, self.joint, self.column, self.n_columns, n_own, self._turns, self.basis)
+        return ChainArrays(self.axis, self.value, cos, sin, *walk)
 
     @cached_property
     def _turns(self) -> NDArray[np.bool_]:

@@ -186,16 +186,10 @@ class Measuring:
     def rows(self, k: Integers | None = None, **measured: Any) -> Measurements:
         """Measurements at the configurations, or at those that rows are of."""
         visits = self.visits if k is None else self.visits.select(k)
-        return Measurements(
-            readings=visits.readings,
-            ids=visits.ids,
-            test=visits.test,
-            sigma_joint=joint_sigma(self.scenario.specified_noise or self.scenario.noise, self.scenario.robot),
-            source=f"{self.name}.csv",
-            named=True,
-            context={name: values if k is None else values[k] for name, values in self.context.items()},
-            **measured,
-        )
+        noise, source = self.scenario.specified_noise or self.scenario.noise, f"{self.name}.csv"
+        measured |= {"sigma_joint": joint_sigma(noise, self.scenario.robot), "source": source, "named": True}
+        context = {name: values if k is None else values[k] for name, values in self.context.items()}
+        return Measurements(visits.readings, visits.ids, visits.test, context=context, **measured)
 
     def nominal(self) -> Poses:
         """Nominal poses of the tool at the train configurations."""
@@ -388,14 +382,11 @@ class Measuring:
         k, which = np.nonzero((b[:, :, 2] > 0.0) & faced)
         self._require_seen(k)
         n = len(k)
-        m = self.rows(
-            k,
-            labels={"board": Labels(tuple(boards), which)},
-            rotation=Rotation.from_rotvec(self.noise("orientation", n, 3)).as_matrix() @ R[k, which],
-            position=b[k, which] + self.noise("position", n, 3),
-            sigma_orientation=self.sigma("orientation", n, 3),
-            sigma_position=self.sigma("position", n, 3),
-        )
+        rotation = Rotation.from_rotvec(self.noise("orientation", n, 3)).as_matrix() @ R[k, which]
+        position = b[k, which] + self.noise("position", n, 3)
+        sigmas = {f"sigma_{kind}": self.sigma(kind, n, 3) for kind in ("orientation", "position")}
+        labels = {"board": Labels(tuple(boards), which)}
+        m = self.rows(k, labels=labels, rotation=rotation, position=position, **sigmas)
         return Table(m, "board"), {"boards": boards}
 
     def pixels(self) -> tuple[Table, Truth]:

@@ -281,17 +281,11 @@ def judge_fit(solution: Solution, spread: Spread, table: ResidualTable) -> Goodn
     with np.errstate(invalid="ignore"):
         suspect, outlier = np.abs(rows.studentised) > levels, rows.weight < OUTLIER_WEIGHT
     which = {"excluded": table.reason_code != 0, "test": table.test, "outlier": outlier, "suspect": suspect}
-    return Goodness(
-        kinds=kinds,
-        leverage=rows.leverage,
-        studentised=rows.studentised,
-        weight=rows.weight,
-        flag=np.select(list(which.values()), [np.int8(FLAGS.index(name)) for name in which], np.int8(0)),
-        level=level,
-        suspect=(table.reason_code == 0) & (suspect | (outlier & table.used)),
-        configurations=rows.fitted.suspect_configurations() if not rows.robust else (),
-        test=rows.fit_predicted(),
-    )
+    flag = np.select(list(which.values()), [np.int8(FLAGS.index(name)) for name in which], np.int8(0))
+    suspect = (table.reason_code == 0) & (suspect | (outlier & table.used))
+    configurations = rows.fitted.suspect_configurations() if not rows.robust else ()
+    by_row = (rows.leverage, rows.studentised, rows.weight, flag)
+    return Goodness(kinds, *by_row, level, suspect, configurations, rows.fit_predicted())
 
 
 class JudgedRows(Record):
@@ -446,18 +440,12 @@ class RowStatistics:
         else:
             chi2, expected, nu = float(np.sum(part.squares)), float(n), part.degrees(chosen)
         of_noise = self._degrees_of_noise(np.arange(len(self.fitted.rows)))
-        return PredictedFit(
-            kinds=tuple(self._fit_kinds(part, np.zeros(len(table.groups)), known=True)),
-            n_rows=n,
-            n=len(chosen),
-            n_measurements=n_measurements,
-            n_outliers=n_measurements - n_judged,
-            n_unknown=int(np.sum(~np.isfinite(self.leverage[test]))),
-            chi2=chi2,
-            expected=expected,
-            p_value=upper_probability(chi2 / expected, nu, of_noise) if n else 1.0,
-            configurations=part.suspect_configurations() if not self.robust else (),
-        )
+        kinds = tuple(self._fit_kinds(part, np.zeros(len(table.groups)), known=True))
+        n_unknown = int(np.sum(~np.isfinite(self.leverage[test])))
+        p_value = upper_probability(chi2 / expected, nu, of_noise) if n else 1.0
+        configurations = part.suspect_configurations() if not self.robust else ()
+        counts = (n, len(chosen), n_measurements, n_measurements - n_judged, n_unknown)
+        return PredictedFit(kinds, *counts, chi2, expected, p_value, configurations)
 
     def _degrees_of_noise(self, fitted: Integers) -> float:
         """Degrees of freedom by which some fitted rows estimated their noise; infinite where it is specified."""
@@ -477,21 +465,12 @@ class RowStatistics:
             of_noise = np.inf if part is self.fitted else self._degrees_of_noise(self.fitted.of_kind(code))
             enough = expected >= 1.0
             variance, specified = (float(np.mean(v)) for v in (table.sigma[rows] ** 2, self._specified_variance[rows]))
-            factor = float(np.sqrt(variance / specified))
-            fit = KindFit(
-                kind=family,
-                unit=table.unit(family),
-                n=len(rows),
-                specified_sigma_rms=float(np.sqrt(specified)),
-                factor=factor,
-                observed_over_specified=factor * float(np.sqrt(total / expected)) if enough else np.nan,
-                chi2=total,
-                expected=max(float(expected), 0.0),
-                p_value=upper_probability(total / mean, degrees, of_noise) if enough and known else None,
-                typical=float(np.nanmedian(size)) / _MEDIAN if enough else np.nan,
-                degrees=degrees,
-                table=number,
-            )
+            sigma, factor = float(np.sqrt(specified)), float(np.sqrt(variance / specified))
+            ratio = factor * float(np.sqrt(total / expected)) if enough else np.nan
+            p_value = upper_probability(total / mean, degrees, of_noise) if enough and known else None
+            typical = float(np.nanmedian(size)) / _MEDIAN if enough else np.nan
+            tests = (total, max(float(expected), 0.0), p_value, typical, degrees)
+            fit = KindFit(family, table.unit(family), len(rows), sigma, factor, ratio, *tests, number)
             yield replace(fit, n_beyond=int(np.sum(size > fit.level(len(rows)))))
 
     @cached_property
