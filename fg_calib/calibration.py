@@ -29,7 +29,7 @@ from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
 from fg_calib.prediction import Correction, PredictedErrors, correct_targets, predict_errors, predict_poses
 from fg_calib.report import Drawing, ReportData, draw, format_result, judged, notebook_html, notes_of, pages_of, summary
-from fg_calib.robot import Robot, names_of
+from fg_calib.robot import Context, Robot, names_of
 from fg_calib.selection import select_effects
 from fg_calib.statistics import CrossValidation, ParameterEstimate, TangentCovariance, cross_validate
 
@@ -515,11 +515,14 @@ class Calibration(Record, repr=False, eq=False):
         return self.result.trustworthy
 
     @parallel.single_threaded
-    def predict(self, readings: ArrayLike, *, world: bool = False, table: int | None = None) -> PredictedPoses:
+    def predict(
+        self, readings: ArrayLike, context: Context | None = None, *, world: bool = False, table: int | None = None
+    ) -> PredictedPoses:
         """Predict the true tool poses at joint readings, with their uncertainty.
 
         Args:
             readings: Shape (n, n_joints), or (n_joints,) of one configuration, [rad] (prismatic: [m]).
+            context: What effects depend on besides, a row each: see `Robot.trig`.
             world: Whether the poses are wanted in the measurement frame, instead of in the base frame.
             table: Number of the table whose measurement frame it is, from 0; there must be one if there are several.
 
@@ -527,7 +530,7 @@ class Calibration(Record, repr=False, eq=False):
             InputError: The readings are of other joints, or there is no measurement frame.
         """
         q = _as_readings("readings", readings, self.robot)
-        return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table, world=world)))
+        return PredictedPoses(*predict_poses(self.posterior, q, self.table_in_world(table, world=world), context))
 
     def table_in_world(self, number: int | None, *, world: bool) -> int | None:
         """The number of the table whose estimated measurement frame is meant; None without `world`: the base frame.
@@ -563,6 +566,7 @@ class Calibration(Record, repr=False, eq=False):
 def predict(
     calibration: Calibration | Path | str,
     readings: ArrayLike | None = None,
+    context: Context | None = None,
     *,
     limit: float | None = None,
     measured: ArrayLike | None = None,
@@ -576,6 +580,7 @@ def predict(
             measured, as a calibration just made does.
         readings: Configurations, shape (n, n_joints), or (n_joints,) of one, [rad] (prismatic: [m]); drawn all over the
             workspace if None.
+        context: What effects depend on besides at `readings`, a row each: see `Robot.trig`.
         limit: Limit of position errors, [m].
         measured: Readings of the measured configurations, shape (m, n_joints), of a calibration that was loaded.
 
@@ -595,7 +600,8 @@ def predict(
     at = None if readings is None else _possible_readings("readings", readings, found.robot)
     sigma = found.result.sigma_joint if np.any(found.result.sigma_joint > 0.0) else None
     fitted = found.result.free_of_frame
-    return predict_errors(found.robot, found.posterior, there, at, sigma_joint=sigma, fitted=fitted, limit=limit)
+    more: dict[str, Any] = {"fitted": fitted, "limit": limit, "context": context}
+    return predict_errors(found.robot, found.posterior, there, at, sigma_joint=sigma, **more)
 
 
 def _as_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:

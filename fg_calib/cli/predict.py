@@ -23,8 +23,8 @@ def predict(
     if out is not None:
         io.require_writable(out)
     arm = calibration.Calibration.load(result)
-    ids, readings = ((), None) if at is None else io.read_joint_table(at, arm.robot, units)
-    found = predict_tool(arm, readings, limit=limit)
+    ids, readings, context = ((), None, {}) if at is None else io.read_joint_table(at, arm.robot, units)
+    found = predict_tool(arm, readings, context, limit=limit)
     if out is not None:
         report.write_prediction(out, found, arm.result, arm.robot, ids, units)
     show_result(

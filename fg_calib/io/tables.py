@@ -24,7 +24,7 @@ from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import ANGLES, LENGTHS, Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
 from fg_calib.measurements import Column as ColumnSet
-from fg_calib.robot import Robot
+from fg_calib.robot import Context, Robot
 
 if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
     import polars as pl
@@ -574,8 +574,10 @@ def read_ids(table: Table, *, repeated: bool) -> NDArray[np.str_]:
 
 def read_joint_table(
     path: Path | str | Any, robot: Robot, units: Units | None = None
-) -> tuple[tuple[str, ...], Floats]:
-    """Names of configurations, and their joint values, shape (n, n_joints), [rad] (prismatic: [m]).
+) -> tuple[tuple[str, ...], Floats, Context]:
+    """Names of configurations, their joint values, and what effects depend on besides where the table has it.
+
+    Joint values have the shape (n, n_joints), [rad] (prismatic: [m]).
 
     Args:
         path: The table: a file, or a frame of polars or pandas.
@@ -587,7 +589,15 @@ def read_joint_table(
     """
     table = read_table(path, robot)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units or Units())
-    return tuple(read_ids(table, repeated=True).tolist()), readings
+    context = [effect.context(robot, readings, partial(_numbers_if_any, table)) for effect in robot.effects]
+    given = {name: values for one in context for name, values in one.items() if not np.isnan(values).all()}
+    return tuple(read_ids(table, repeated=True).tolist()), readings, given
+
+
+def _numbers_if_any(table: Table, columns: Sequence[str]) -> Floats:
+    """Columns of a table as `Table.numbers` gives them, nan if it lacks any."""
+    there = set(columns) <= set(table.frame.columns)
+    return table.numbers(columns) if there else np.full((table.n_rows, len(columns)), np.nan)
 
 
 class Targets(FrozenArrays):
