@@ -1,5 +1,6 @@
 """The door to all formats: a calibration or a robot, and the text that others read."""
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, field, fields
 from hashlib import sha256
@@ -15,8 +16,8 @@ from fg_calib.exports import dh
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
 from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, printable, shown
-from fg_calib.io import Units, joint_origins, require_absent, robot_text, urdf_text, write_text
-from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, frame_values
+from fg_calib.io import Units, effects_mapping, joint_origins, require_absent, robot_text, urdf_text, write_text
+from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, build_chain, frame_values, spline
 
 ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
 ToolOfZeros = Literal["nominal", "calibrated"]
@@ -44,6 +45,7 @@ class Export(Record):
         findings: Why the calibration is not to be trusted; empty if it is, or of a robot.
         not_accepted: The limits of `accept` that it does not keep to.
         details: The same as figures: see `document`.
+        effects: Text of the files that hold the effects that the format cannot hold, by how their names end.
     """
 
     to: str
@@ -53,17 +55,20 @@ class Export(Record):
     findings: tuple[str, ...] = ()
     not_accepted: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    effects: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     @checked
     def write(self, path: Path | str) -> None:
-        """Write the file, whole or not at all.
+        """Write the file, whole or not at all, and next to it what of effects it cannot hold.
 
         Raises:
-            InputError: The file is there already, or cannot be written.
+            InputError: A file is there already, or cannot be written.
         """
         path = Path(path)
-        require_absent(path.parent, [path.name])
-        write_text(path, self.text)
+        texts = {path: self.text} | {path.with_name(path.stem + end): text for end, text in self.effects.items()}
+        require_absent(path.parent, [one.name for one in texts])
+        for one, text in texts.items():
+            write_text(one, text)
 
     def document(self) -> dict[str, Any]:
         """The document of `--json`.
@@ -71,6 +76,7 @@ class Export(Record):
         { "schema": "fg-calib/export/1", "version", "to", "robot", "text", "notes": [text], "findings": [text],
           "not_accepted": [text],
           of tables: "convention", "exact", "reasons": [text], "error": {errors},
+          "effects": {end of a file's name: text},
           of zeros: "zeros": {joint: {see `Zero`}}, "before", "after": {"workspace": {errors}, "measured": ...},
           of ur: "base", "hash", "tool0_T_tool": [[...]], of tesseract: "joints": [names] }
 
@@ -128,8 +134,12 @@ def export(
     kinds = [(joint.name, joint.prismatic) for joint in robot.joints]
     if nominal is not None and [(joint.name, joint.prismatic) for joint in nominal.joints] != kinds:
         raise InputError("nominal", f"{nominal.name} has other joints", ", ".join(name for name, _ in kinds))
+    left_out, files = list[str](), dict[str, str]()
+    if robot.effects and not (to == "yaml" and robot.convention in CONVENTIONS):
+        left_out, files = _left_out(robot, to, arm.measured if isinstance(arm, Calibration) else None)
+        robot = robot.geometry
     comments = [f"by fg-calib {__version__}", *(f"NOT TO BE TRUSTED: {finding}" for finding in doubts[0])]
-    comments += [f"not accepted: {reason}" for reason in doubts[1]]
+    comments += [*(f"not accepted: {reason}" for reason in doubts[1]), *left_out]
     formats: dict[str, Callable[[], _Content]] = {
         "urdf": lambda: _urdf(robot, comments),
         "ur": lambda: _ur(robot, ur_base, ur_hash),
@@ -140,7 +150,28 @@ def export(
     text, notes, details = formats[to]() if to in formats else _table(robot, to, far)
     if to != "urdf":
         text = "".join(f"# {printable(comment)}\n" for comment in (*comments, *notes)) + text
-    return Export(to, robot.name, text, tuple(notes), *doubts, details)
+    return Export(to, robot.name, text, (*left_out, *notes), *doubts, details, files)
+
+
+def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str], dict[str, str]]:
+    """A note on the effects of an arm, with the error without them, and the files that hold them, in SI units."""
+    mapping, where = effects_mapping(robot), "over the joint limits" if measured is None else "where it was measured"
+    values = {name: value for name, value in mapping.pop("values", {}).items() if not name.endswith(".curve")}
+    error = dh.errors(robot.geometry, robot, dh.drawn(robot, dh.N_JUDGED, 1) if measured is None else measured)
+    note = f"it cannot hold {', '.join(mapping)}, without which the tool is off {where}: {_error_words(error)}"
+    if to == "zeros":  # which are fitted to the arm with them
+        return [note], {}
+    rows, files, angle = list[str](), dict[str, str](), np.radians(np.arange(-180.0, 180.0, 0.5))
+    for joint, _, values_of_curve in build_chain(robot).curves:
+        knots, weights = spline(angle, len(values_of_curve))
+        turns = np.sum(weights * values_of_curve[knots], axis=1)
+        name = json.dumps(robot.joints[joint].name, ensure_ascii=False)
+        rows += [f"{name},{q:.9g},{turn:.9g}" for q, turn in zip(angle, turns, strict=True)]
+    if rows:
+        files["_curves.csv"] = "\n".join(["joint,angle,correction", *rows, ""])
+    if mapping.keys() - {"error_curve"}:
+        files["_effects.yaml"] = dumped({"effects": mapping | {"values": values}})
+    return [f"{note}; next to it: {', '.join(f'*{end}' for end in files)} in rad and SI units"], files
 
 
 _Content = tuple[str, Sequence[str], dict[str, Any]]

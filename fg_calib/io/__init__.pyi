@@ -12,6 +12,7 @@ from .atomic import (
     require_writable,
     write_text,
 )
+from .effects import effects_mapping
 from .job import (
     NOISE_UNITS,
     UNSPECIFIED,
@@ -123,6 +124,7 @@ __all__ = [
     "configuration_frame",
     "corners_of",
     "decoded",
+    "effects_mapping",
     "exists",
     "fill_folder",
     "first_misfit",

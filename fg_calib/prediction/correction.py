@@ -6,6 +6,10 @@ pose for which its own model finds these joint values.
 An arm of fewer than six joints, or at a limit, may reach the point of a target but not its orientation. Then the point
 is kept, and the orientation is brought as near as the remaining freedom allows, by least squares in which the point
 counts far more.
+
+Controllers know nothing of effects: their model is the nominal geometry. An arm with effects is inverted from the
+readings that its geometry has at the target: effects change slowly with these, so that steps by the geometry's
+derivatives are a fixed point that gains some two digits each.
 """
 
 from functools import cached_property
@@ -95,6 +99,7 @@ def correct_targets(
     Raises:
         InputError: Targets or joint values are not of such a shape, not finite, or outside the limits.
     """
+    nominal = nominal.geometry
     target, turned, start = _check_targets(nominal, position, rotation, near)
     if table is not None:
         target, turned = _in_base(posterior, target, turned, table)
@@ -170,6 +175,12 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats,
     Returns:
         Within the joint limits; the miss of a point that is itself out of reach is not 0.
     """
+    if robot.effects:
+        first = reach(robot.geometry, position, rotation, near, anywhere=anywhere).readings
+        found = solve_inverse(robot, position, rotation, near=first, n_starts=1)
+        q, rows = found.readings.copy(), np.flatnonzero(~found.reached)
+        q[rows] = solve_inverse(robot, position[rows], near=first[rows], n_starts=1).readings
+        return Inverse(q, *misses(robot, q, position, rotation))
 
     def solve(rows: Integers, near: Floats | None, n_starts: int) -> Inverse:
         turned = None if rotation is None else rotation[rows]

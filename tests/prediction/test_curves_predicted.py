@@ -5,11 +5,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
-from fg_calib import Calibration, InputError, Measurements, Options, Robot, build_problem, calibrate, predict, solve
+from fg_calib import (
+    Calibration,
+    InputError,
+    Measurements,
+    Options,
+    Robot,
+    build_problem,
+    calibrate,
+    correct,
+    export,
+    predict,
+    read_robot,
+    solve,
+)
 from fg_calib.graph.problem import square_root
+from fg_calib.io import read_joint_table
 from fg_calib.prediction import errors_at, predict_poses, workspace
-from fg_calib.robot import Compliance, ErrorCurve, Gain, Mass, build_chain, forward
+from fg_calib.robot import Backlash, Compliance, ErrorCurve, Gain, Mass, Thermal, build_chain, forward, spline
 from fg_calib.statistics import spread_of, with_left_out
 
 ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
@@ -159,3 +174,48 @@ def test_damaged_curves_are_named_in_one_line(calibrated, tmp_path, change, mess
         Calibration.load(tmp_path)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_commands_count_effects_and_poses_for_the_controller_do_not(calibrated):
+    found = calibrated[2]
+    q = np.random.default_rng(5).uniform(-1.2, 1.2, (5, 4))
+    target = forward(build_chain(found.nominal.geometry), found.nominal.geometry.trig(q)).position
+    points = correct(found, target, near=q)
+    assert points.reached.all()
+    there = forward(build_chain(found.robot), found.robot.trig(points.readings)).position
+    assert np.linalg.norm(there - target, axis=1).max() < 1e-9
+    controller = forward(build_chain(found.nominal.geometry), found.nominal.geometry.trig(points.readings)).position
+    assert np.linalg.norm(controller - points.position, axis=1).max() < 1e-12
+    assert np.linalg.norm(controller - target, axis=1).min() > 1e-5
+
+
+def test_exports_without_effects_write_them_next_to_the_file(calibrated, tmp_path):
+    found = calibrated[2]
+    made, q = export(found, "hayati"), found.measured
+    at, without = (forward(build_chain(r), r.trig(q)).position for r in (found.robot, found.robot.geometry))
+    rms = 1e3 * np.sqrt(np.square(at - without).sum(axis=1).mean())
+    assert "cannot hold error_curve, compliance, gain, without" in made.notes[0]
+    assert f"off where it was measured: position {rms:.4g} mm RMS" in made.notes[0]
+    made.write(tmp_path / "arm.yaml")
+    geometry = read_robot(tmp_path / "arm.yaml")
+    assert not geometry.effects
+    assert forward(build_chain(geometry), geometry.trig(q)).position == pytest.approx(without, abs=1e-9)
+    rows = [line.split(",") for line in (tmp_path / "arm_curves.csv").read_text().splitlines()]
+    assert rows[0] == ["joint", "angle", "correction"]
+    coefficients = np.array([found.parameters[f"theta3.curve[{k}]"].estimate for k in range(8)])
+    for _, angle, turn in [row for row in rows[1:] if row[0] == '"q3"'][::90]:
+        which, weights = spline(np.array([float(angle)]), 8)
+        assert float(turn) == pytest.approx(weights[0] @ coefficients[which[0]], rel=1e-6, abs=1e-12)
+    values = yaml.safe_load((tmp_path / "arm_effects.yaml").read_text())["effects"]["values"]
+    assert values["theta2.compliance"] == found.parameters["theta2.compliance"].estimate
+    assert not any("curve" in name for name in values)
+    assert export(found, "yaml").effects == {}
+    assert export(found, "zeros").effects == {}
+
+
+def test_tables_to_predict_at_may_have_what_effects_depend_on(tmp_path):
+    robot = Robot.from_dh(ROWS, "dh").with_effects(Thermal(lengths=False, zeros=True), Backlash([2], side="side"))
+    (tmp_path / "at.csv").write_text("q1,q2,q3,q4,temperature\n0,0,0,0,30\n0,1,0,0,31\n")
+    _, readings, context = read_joint_table(tmp_path / "at.csv", robot)
+    assert {name: values.tolist() for name, values in context.items()} == {"temperature": [30.0, 31.0]}
+    assert robot.trig(readings, context)[:, robot.n_joints :, 0].T.tolist() == [[10.0, 11.0]] * 4 + [[0.0, 0.0]]
