@@ -482,7 +482,8 @@ def _lacking(robot: Robot, readings: Floats) -> tuple[list[str], Integers, Float
     has, loaded = {p.name for p in robot.parameters}, set[tuple[int, int]]()
     for effect in robot.effects:
         if isinstance(effect, Compliance):
-            loaded |= {(t.owner, k) for t in effect.terms(arm) for k in np.flatnonzero(effect.gravity).tolist()}
+            gravity = np.ones(3) if effect.gravity == "estimate" else effect.gravity
+            loaded |= {(t.owner, k) for t in effect.terms(arm) for k in np.flatnonzero(gravity).tolist()}
     for name, effect in _effects_of_joints(arm):
         terms = effect.terms(arm)
         if isinstance(effect, Compliance):

@@ -87,9 +87,9 @@ def random_problem(
         robot: The robot; its joints move as `random_readings` says.
         model: Which measurements take part; pairs are chained. Noise is assumed as `Robot.scale_of` says.
         frame: Whether the measurement frame is estimated too.
-        n_configurations: How many; 0 for ten for every parameter, 300 at least.
+        n_configurations: How many; 0 for ten for every parameter but those of error curves, 300 at least.
         seed: Of the random configurations.
     """
-    n = n_configurations or max(300, 10 * len(robot.parameters))
+    n = n_configurations or max(300, 10 * sum(p.kind != "curve" for p in robot.parameters))
     somewhere = Measurements.at(robot, random_readings(robot, n, np.random.default_rng(seed)))
     return predicted_problem(robot, somewhere, model, frame=frame, pairing=Pairing("chain"), pair_errors="independent")

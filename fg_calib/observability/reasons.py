@@ -10,7 +10,7 @@ other. Random configurations may show what the user's do not: the arm goes there
 predicts.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 
 import numpy as np
@@ -21,7 +21,8 @@ from fg_calib.measurements import INSTRUMENTS, LANDMARKS, Instrument
 from fg_calib.observability.indices import Observability
 from fg_calib.observability.predicted import random_problem
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import build_chain, forward, random_readings
+from fg_calib.robot import EFFECT_KINDS, Axis, Compliance, build_chain, forward, random_readings
+from fg_calib.robot.effects import GRAVITY
 
 
 class ObservedQuantities(Record):
@@ -149,6 +150,12 @@ NO_CAUSE = "no simple cause found"
 NOT_EXCITED = "not excited by these configurations"
 BASE = "the measurement is blind to the base: the whole arm moves as one body"
 
+GIVEN = {"backlash": "the side of approach", "expansion": "the temperature", "drift": "the temperature"}
+"""Kinds of effects that follow what the rows say besides readings, and what that is."""
+
+NO_TORQUE = 1e-7
+"""Torque, or moment, that is rounding, [N m] or of a unit first moment [m/s^2]."""
+
 _NOTHING = 1e-7
 """A motion below this part of what its members do one by one is none: relations are rounded to nine digits, and what
 `SUPPORT_TOLERANCE` left out of them may move as much as it could."""
@@ -207,7 +214,10 @@ class _Motion:
         self.robot, self._parameters, self._seen = robot, problem.estimated, seen
         columns = {robot.index(p.name): k for k, p in enumerate(self._parameters)}
         chain = build_chain(robot, columns).with_joint_columns()
-        poses = forward(chain, robot.trig(random_readings(robot, N_RANDOM, np.random.default_rng(0))))
+        trig = robot.trig(random_readings(robot, N_RANDOM, np.random.default_rng(0)))
+        self._data, self._trig = problem.data, trig
+        poses = forward(chain, trig)
+        self._axes = poses.jacobian[:, :3, len(columns) :]
         self._R, self._p = poses.rotation, poses.position
         self._J = poses.jacobian[:, :, : len(columns)]
         self._scales = np.array([robot.scale_of(p.unit) for p in self._parameters])
@@ -227,9 +237,11 @@ class _Motion:
         in_itself = _constant(np.einsum("nji,nj->ni", self._R, w)) and not (moves and seen.position)
         pairs_alone = not seen.custom and all(one.uses_pairs for one in seen.instruments)
         of_what = "" if all(p.name.startswith("tool.") for p in members) else on_last_axis
+        of_effects = self._of_effects({p.name: p.kind for p in members if p.kind in EFFECT_KINDS})
         causes = (
+            (bool(of_effects), of_effects),
             (still and units == {"m"}, f"{parallel}: only the sum of the shifts along them acts"),
-            (still and units == {"rad"}, "only their sum turns about the same axis"),
+            (still and units in ({"rad"}, {"rad/(N m)"}), "only their sum turns about the same axis"),
             (still, "together they do not move the tool"),
             (not (seen.orientation or moves), f"{on_last_axis}the tool only turns about {about}, unseen by {seen}"),
             (not (seen.position or turns) and units == {"rad"}, f"{parallel}: only the sum of their turns is seen"),
@@ -238,6 +250,29 @@ class _Motion:
             (pairs_alone and in_itself, f"{of_what}the tool frame turns by the same in itself everywhere"),
         )
         return next((words for applies, words in causes if applies), NO_CAUSE)
+
+    def _of_effects(self, kinds: Mapping[str, str]) -> str:
+        """Why effects are not seen, by kind, if what they are multiplied by is the same everywhere; else empty."""
+        if not kinds:
+            return ""
+        given, terms = set(kinds.values()) <= set(GIVEN), [t for terms in self.robot.terms for t in terms]
+        own, n = [t for t in terms if t.name in kinds], self.robot.n_joints
+        places = zip(self._data.trigs(self.robot), self._data.places, strict=True)
+        trig = np.concatenate([at[self._data.fitted[place]] for at, place in places]) if given else self._trig
+        values = trig[:, [n + terms.index(t) for t in own], 0]
+        down = [e.gravity for e in self.robot.effects if isinstance(e, Compliance)]
+        gravity = [np.array(GRAVITY if g == "estimate" else g) for g in down]
+        torques = [np.cross(self._axes[:, :, t.owner - 1], g) for t in own for g in gravity]
+        causes = (
+            (not _constant(values), ""),
+            (given, f"{GIVEN.get(next(iter(kinds.values())))} does not vary, or is not given"),
+            (float(np.abs(values).max()) > NO_TORQUE, "its load is the same everywhere"),
+            ("tilt" in kinds.values(), "it acts through compliances, which are 0 here"),
+            (any(t.axis != Axis.RZ for t in own), "no mass has a moment about its axis"),
+            (float(np.abs(torques).max(initial=0.0)) < NO_TORQUE, "its axis is along gravity: no torque"),
+            (True, "no mass beyond it is off its axis: no torque"),
+        )
+        return next(words for applies, words in causes if applies)
 
     def of_base(self, direction: Floats) -> bool:
         """Whether a direction moves the arm as if the base alone had moved, and nothing seen says where the base is."""

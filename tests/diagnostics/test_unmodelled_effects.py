@@ -106,6 +106,7 @@ def test_what_a_robot_has_is_no_candidate():
     hung = regress(with_curves(np.random.default_rng(1), gravity=(9.81, 0.0, 0.0))).names.tolist()
     assert sum(name.startswith("3 side load") for name in hung) == 2 * 3  # along y alone, of joints that turn
     assert sum(name.startswith("1 gravity") for name in hung) == 2 * 3
+    assert not any("load" in name for name in regress(with_curves(np.random.default_rng(1), gravity="estimate")).names)
 
 
 def test_curves_are_eliminated_as_dense_columns_with_their_priors_would_be():

@@ -1,11 +1,14 @@
 """Structural and practical identifiability of arms whose answer is known, with the reason for every lost direction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated import measure, paper_robot
 
 from fg_calib import Robot, observe_configurations, observe_structure
 from fg_calib.observability.reasons import NO_CAUSE, NOT_EXCITED
+from fg_calib.robot import Backlash, Bending, Compliance, Mass, Thermal
 
 MODELS = ("distance", "rotation", "distance-rotation", "position", "pose")
 OFF_AXIS = {"x": 0.1, "y": 0.05, "z": 0.2, "roll": 0.3}
@@ -106,3 +109,35 @@ def test_configurations_that_do_not_move_a_joint_are_named_as_the_reason():
     found = observe_configurations(robot, measure(robot, 60, rng, readings=q), "pose")
     assert found.observability.rank == 24
     assert {lost.reason for lost in found.lost} == {NOT_EXCITED}
+
+
+LATERAL = Compliance([Mass(2, 10.0, (0.2, 0.0, 0.1)), Mass(6, 2.0, (0.0, 0.0, 0.05))], lateral=True)
+
+
+@pytest.mark.parametrize(
+    ("effect", "expected"),
+    [
+        (LATERAL, {"theta1.compliance": "its axis is along gravity: no torque",
+                   "theta6.compliance": "no mass beyond it is off its axis: no torque",
+                   "theta1.compliance_x": None}),
+        (Compliance(None, [1, 2]), {"theta1.load3x": "its axis is along gravity: no torque", "theta2.load3x": None}),
+        (Compliance(None, [1], gravity=(0, 9.81, 0)), {"theta1.load1x": None}),
+        (replace(LATERAL, gravity="estimate"), {"base.tilt_x": "it acts through compliances, which are 0 here"}),
+        (Bending([Mass(0, 5.0, (0.1, 0.0, 0.1))]), {"base.bending": "no mass has a moment about its axis"}),
+        (Thermal(zeros=True), {"theta3.drift": "the temperature does not vary, or is not given"}),
+        (Backlash([2]), {"theta2.backlash": "the side of approach does not vary, or is not given"}),
+    ],
+)  # fmt: skip
+def test_effects_that_nothing_excites_are_explained_by_what_they_follow(effect, expected):
+    found = reasons(ur10(OFF_AXIS).with_effects(effect), "pose", frame="unknown")
+    assert {name: found.get((name,)) for name in expected} == expected
+
+
+@pytest.mark.parametrize("spread", [0.0, 5.0])
+def test_a_temperature_that_does_not_vary_is_the_reason_for_drift(spread):
+    rng = np.random.default_rng(2)
+    m = measure(ur10(OFF_AXIS), 60, rng)
+    m = replace(m, context={"temperature": 25.0 + spread * rng.normal(size=60)})
+    found = observe_configurations(ur10(OFF_AXIS).with_effects(Thermal(lengths=False, zeros=True)), m, "pose")
+    drifts = {lost.reason for lost in found.lost if any(name.endswith(".drift") for name in lost.relation)}
+    assert drifts == (set() if spread else {"the temperature does not vary, or is not given"})
