@@ -365,9 +365,10 @@ def regress(solution: Solution) -> Regression:
     columns[list(offsets)] = n_core + plain.n_nuisance + np.arange(len(offsets))
     wide = replace(plain, chains=variables.at(values).chains, n_columns=n_core, columns=columns)
     wide = replace(wide, n_nuisance=plain.n_nuisance + len(offsets))
-    names, of_joints = zip(*(_of_joints(problem, part, at) for part in rows.parts), strict=True)
+    names = _lacking(problem.robot, problem.data.readings[:1])[0]
+    of_joints = [_of_joints(problem, part, at, len(names)) for part in rows.parts]
     private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
-    all_names = [*names[0], *(name if name.startswith(LINK) else "" for name in variables.names)]
+    all_names = [*names, *(name if name.startswith(LINK) else "" for name in variables.names)]
     all_names += [""] * plain.n_nuisance + [f"{OFFSET}{table}," for table in offsets.values()]
     more, J, r = np.array(all_names) != "", private[:, :-1], private[:, -1]
     if solution.problem.state.weights is not None:
@@ -449,15 +450,14 @@ def with_link_motions(problem: Problem, at: Floats) -> tuple[Variables, Floats]:
     return build_variables(wide, unknown, problem.variables.priors), values
 
 
-def _of_joints(problem: Problem, part: WhitenedBlock, at: State) -> tuple[list[str], Floats]:
-    """Names of effects of joints, and a block's derivatives in them before errors are shared, shape (n_rows, m)."""
+def _of_joints(problem: Problem, part: WhitenedBlock, at: State, m: int) -> Floats:
+    """Derivatives of a block in the m effects of joints that the robot lacks, before errors are shared: (n_rows, m)."""
     J = residuals.linearise(part.at(at), at.chains[part.table].without_columns().with_turn_columns())[1]
-    readings, n = problem.data.tables[part.table].measurements.readings, problem.robot.n_joints
-    names, moved = list[str](), np.zeros(())
+    readings, n, moved = problem.data.tables[part.table].measurements.readings, problem.robot.n_joints, np.zeros(m)
     for k, rows in enumerate(part.block.ends.T):
-        names, joints, values = _lacking(problem.robot, readings[rows])
+        _, joints, values = _lacking(problem.robot, readings[rows])
         moved = moved + J[:, :, k * n + joints] * values[:, None]
-    return names, moved.reshape(J[:, :, 0].size, len(names))
+    return np.broadcast_to(moved, (*J.shape[:2], m)).reshape(part.n_rows, m)
 
 
 def _effects_of_joints(robot: Robot) -> list[tuple[str, Effect]]:

@@ -9,8 +9,9 @@ from reported import format_report
 from scipy.stats import binom, kstest
 from simulated import measure, plus, small_arm, true_robot
 from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
+from touches import corners, touch
 
-from fg_calib import Measurements, assess, build_problem, calibrate, solve
+from fg_calib import Measurements, Table, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics.unmodelled_effects import (
     LIKE_NOISE,
     LINK,
@@ -121,6 +122,13 @@ def test_curves_are_eliminated_as_dense_columns_with_their_priors_would_be():
     assert regression.fit.dof == len(r) - Q.shape[1]
     curves = regression.fit.r[problem.n_residuals :][: len(r_1)]  # a state is minus its coefficient
     assert np.corrcoef(curves, r_1)[0, 1] < -0.99
+
+
+def test_rows_between_landmarks_alone_follow_no_effect_of_a_joint():
+    robot, rng = small_arm(tolerance={"a": 1e-3}), np.random.default_rng(1)
+    m = touch(robot, corners(robot, 4, rng), 20, rng, sigma=1e-4, distances=[(0, 1, 1e-5), (1, 2, 1e-5)])
+    regression = regress(solve(build_problem(robot, Table(m, "distance"))))
+    assert not np.any(regression.named("1", "2 position", "3")[-2:])
 
 
 @pytest.mark.parametrize("loss", ["none", "gnc"])
