@@ -460,36 +460,25 @@ def _of_joints(problem: Problem, part: WhitenedBlock, at: State, m: int) -> Floa
     return np.broadcast_to(moved, (*J.shape[:2], m)).reshape(part.n_rows, m)
 
 
-def _effects_of_joints(robot: Robot) -> list[tuple[str, Effect]]:
-    """Effects that act at single joints, after the beginning of the names of their columns."""
-    n, slides = robot.n_joints, [k for k, joint in enumerate(robot.joints, 1) if joint.prismatic]
-    found: list[tuple[str, Effect]] = [("2 position", Gain(slides))]
-    if len(slides) < n:
-        loads = [Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, n)]
-        along = zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), strict=True)
-        found += [(name, Compliance(masses, gravity=g)) for name, g in along for masses in loads]
-        found.append(("2 position", Harmonics()))
-    return found
-
-
 def _lacking(robot: Robot, readings: Floats) -> tuple[list[str], Integers, Floats]:
-    """Terms of the effects of single joints that a robot lacks: their names, their joints, and their values.
+    """Terms of effects of single joints that a robot lacks: their names, their joints, and their values.
 
     It has the loads in a direction at joints that are compliant under a gravity that is not across it. An error curve
     holds harmonics and gain of its joint.
     """
-    arm, names, joints, values = robot.geometry, list[str](), list[int](), [np.zeros((len(readings), 0))]
-    has, loaded = {p.name for p in robot.parameters}, set[tuple[int, int]]()
-    for effect in robot.effects:
-        if isinstance(effect, Compliance):
-            gravity = np.ones(3) if effect.gravity == "estimate" else effect.gravity
-            loaded |= {(t.owner, k) for t in effect.terms(arm) for k in np.flatnonzero(gravity).tolist()}
-    for name, effect in _effects_of_joints(arm):
-        terms = effect.terms(arm)
-        if isinstance(effect, Compliance):
-            new = [k for k, t in enumerate(terms) if (t.owner, int(np.argmax(effect.gravity))) not in loaded]
-        else:
-            new = [k for k, t in enumerate(terms) if has.isdisjoint((t.name, f"{t.name.rpartition('.')[0]}.curve[0]"))]
+    arm, n, names, joints, values = robot.geometry, robot.n_joints, list[str](), list[int](), list[Floats]()
+    slides, has = [k for k, joint in enumerate(robot.joints, 1) if joint.prismatic], {p.name for p in robot.parameters}
+    loads = ([Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, n)]) if len(slides) < n else ()
+    compliant = [(e.terms(arm), e.gravity) for e in robot.effects if isinstance(e, Compliance)]
+    loaded = [{t.owner for terms, g in compliant for t in terms if g == "estimate" or g[k]} for k in range(3)]
+    candidates: list[tuple[str, Effect, set[int]]] = [("2 position", Gain(slides), set())]
+    candidates += [("2 position", Harmonics(), set())] * bool(loads)
+    for name, g, owners in zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), loaded, strict=True):
+        candidates += [(name, Compliance(masses, gravity=g), owners) for masses in loads]
+    for name, effect, owners in candidates:
+        terms, own = effect.terms(arm), set() if name != "2 position" else has
+        keys = [(t.name, f"{t.name.rpartition('.')[0]}.curve[0]") for t in terms]
+        new = [k for k, t in enumerate(terms) if t.owner not in owners and own.isdisjoint(keys[k])]
         names += [f"{name} {terms[k].owner - 1}," for k in new]
         joints += [terms[k].owner - 1 for k in new]
         values.append(effect.values(arm, readings, {}, np.zeros(len(terms)))[:, new, 0])
