@@ -214,7 +214,7 @@ class _Choice:
             problem = graph.subsampled(problem, MAX_RESIDUALS / problem.n_residuals)
         self.robot, self.n, v, parts = robot, problem.n_residuals, problem.variables, problem.rows.parts
         of_curves = (robot.parameters[i].name for one in v.nuisance if one.kind == "curve" for i in one.parameters)
-        names = [*v.names, *of_curves, *(v.n_nuisance - v.n_curves) * ("",)]
+        names = [*v.names, *of_curves, *(v.n_nuisance - v.n_curves) * ("landmark",)]
         effect_of = {t.name: i for i, e in enumerate(robot.effects) for t in e.terms(robot.geometry)}
         scale_of = {p.name: p.scale for p in robot.parameters}
         self.effect = np.array([effect_of.get(name, -1) for name in names])

@@ -254,7 +254,7 @@ def _cross_validation(result: Result) -> list[Section]:
 def _effects(result: Result) -> Iterator[str]:
     """What was found of each effect that was tried."""
     for one in result.effects:
-        where = f" of joints {', '.join(map(str, one.joints))}" * bool(one.joints)
+        where = f" of joint{'s' * (len(one.joints) > 1)} {', '.join(map(str, one.joints))}" * bool(one.joints)
         rms = f"{figure(one.folds_before, one.unit, '.3g')} -> {in_words(one.folds_after, one.unit)}"
         outcome = "kept" if one.kept else f"left, {one.reason}"
         yield f"{one.effect.replace('_', ' ')}{where}: p {max(one.p_value, 1e-300):.0e}, folds {rms}: {outcome}"
