@@ -228,9 +228,11 @@ def design_from_pool(
     measurable = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
     if not len(measurable):
         raise InputError("candidates", "none at which anything is measured", "some")
-    system = build_system(pool.rows, pool.known, task.quadratic_form(pool.problem)).with_known(pool.given)
+    after = pool.before is not None
+    form = task.quadratic_form(pool.problem, curves=after)
+    system = build_system(pool.rows, pool.known, form).with_known(pool.given)
     chooser = Chooser(system.select(measurable), criterion, _error_of_formed_pairs(pool, task, measurable))
-    chooser.of_curves = pool.posterior(pool.given).error_of_curves(task)
+    chooser.of_curves = 0.0 if after else pool.posterior(pool.given).error_of_curves(task)
     parallel.tell("choosing")
     wanted = max(1, min((n or N_POSES) - len(pool.references), len(measurable)))
     found = chooser.best(wanted, generator) if target is None else chooser.reaching(target)
@@ -239,14 +241,14 @@ def design_from_pool(
     ordered = chosen[order_by_nearest(pool.robot, pool.readings[chosen])]
     poses = np.concatenate([pool.given, ordered])
     posterior, tables = pool.posterior(poses), pool.select_tables(ordered)
-    chooser.of_curves = posterior.error_of_curves(task)
+    chooser.of_curves = 0.0 if after else posterior.error_of_curves(task)
     configurations = _configurations_of(pool, ordered, tables)
     data = pool.problem.data
     names, readings = [data.names[k] for k in configurations], data.readings[configurations]
     ids = names if pool.scenario is None else _new_names(len(names), pool)
     expected, curve = posterior.error(task), chooser.curve(found, generator, len(pool.references))
     error = np.inf if expected.position is None else expected.position
-    before = pool.posterior(pool.given).error(task) if len(pool.given) or pool.before is not None else None
+    before = pool.posterior(pool.given).error(task) if len(pool.given) or after else None
     used = [t for t in tables if t.measurements.n_configurations]
     measured = tuple(rename_configurations(t, dict(zip(names, ids, strict=True))) for t in used)
     after_fit = None if task.fitted else posterior.error(replace(task, fitted=True))

@@ -50,14 +50,12 @@ class PoseRows(FrozenArrays):
             has fewer rows than others, shape (n_poses, h, n_columns).
         always: Rows that hold whatever is measured: priors, and shared errors of 1 sigma, shape (m, n_columns).
         scales: A change of ordinary size in each column, shape (n_columns,).
-        n_core: Number of columns, the first ones, that are the core's.
-        n_arm: Number of these, the first ones, that are the arm's; the others are of measurement frames.
+        n_arm: Number of columns, the first ones, that are the arm's.
     """
 
     rows: Floats
     always: Floats
     scales: Floats
-    n_core: int
     n_arm: int
 
 
@@ -89,7 +87,7 @@ def gather_rows(problem: Problem, pose_of: Integers, references: Integers, *, al
     rows[:, :, of_curves] = wide[:, of_curves] = 0.0
     errors = np.hstack([np.zeros((n_shared, n_columns)), np.eye(n_shared)])
     scales = np.append(v.all_scales, np.ones(n_shared))
-    return PoseRows(rows, np.vstack([wide, errors]), scales, v.n_columns, v.n_robot_columns)
+    return PoseRows(rows, np.vstack([wide, errors]), scales, v.n_robot_columns)
 
 
 def _derivatives(problem: Problem, pose_of: Integers, references: Integers) -> tuple[Floats, Floats, Integers]:
@@ -184,9 +182,9 @@ def build_system(poses: PoseRows, given: Floats, task: Floats) -> System:
     Args:
         poses: Their rows.
         given: Rows that were measured already, shape (m, n_columns).
-        task: Mean square error of the task as a quadratic form of the core, shape (n_core, n_core).
+        task: Mean square error of the task as a quadratic form of the first n columns, shape (n, n).
     """
-    scales, n, n_arm = poses.scales, poses.n_core, poses.n_arm
+    scales, n, n_arm = poses.scales, len(task), poses.n_arm
     rows, before = poses.rows * scales, np.vstack([poses.always, given]) * scales
     # By singular values: those of the information itself are lost in rounding where noise is tiny.
     _, s, Vt = np.linalg.svd(np.linalg.qr(np.vstack([before, rows.reshape(-1, len(scales))]), mode="r"))
@@ -220,15 +218,16 @@ class Task(FrozenArrays):
     fitted: bool
     lever: float = 0.0
 
-    def quadratic_form(self, problem: Problem) -> Floats:
-        """W, in the columns of a problem's core, shape (n_columns, n_columns), [m^2]."""
+    def quadratic_form(self, problem: Problem, *, curves: bool = False) -> Floats:
+        """W, in the columns of a problem's core and, if asked, of its error curves, shape (n, n), [m^2]."""
         v = problem.variables
-        at = robot.forward(v.chains[0].at(problem.start), problem.robot.trig(self.readings))
-        rotation, position = at.jacobian[:, :3].copy(), at.jacobian[:, 3:].copy()
-        for derivative in (rotation, position):
-            derivative[:, :, v.n_robot_columns :] = 0.0
+        own = np.eye(v.n_columns + v.n_curves * curves)[v.n_columns :]
+        none = np.zeros((0, v.n_columns))
+        columns = statistics.TangentCovariance(v, problem.start, none, none, none, curves=own)
+        points, motion, _ = prediction.tool_derivatives(columns, prediction.base_chain(columns), self.readings)
+        rotation, position = motion[:, :3], motion[:, 3:]
         if self.fitted:
-            position, rigid = robot.without_rigid_motion(at.position, position)
+            position, rigid = robot.without_rigid_motion(points, position)
             rotation = rotation - rigid
         n = position.shape[2]
         flat = np.vstack([position.reshape(-1, n), self.lever * rotation.reshape(-1, n)])

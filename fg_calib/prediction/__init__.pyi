@@ -4,11 +4,13 @@ from .tool_pose import (
     PoseRms,
     ToolErrors,
     ToolPoseUncertainty,
+    base_chain,
     errors_at,
     expected_error,
     judged_configurations,
     pose_rms,
     predict_poses,
+    tool_derivatives,
 )
 from .workspace import PredictedErrors, Responsible, WorstConfiguration, predict_errors, summed_up
 
@@ -21,6 +23,7 @@ __all__ = [
     "ToolErrors",
     "ToolPoseUncertainty",
     "WorstConfiguration",
+    "base_chain",
     "correct_targets",
     "errors_at",
     "expected_error",
@@ -29,4 +32,5 @@ __all__ = [
     "predict_errors",
     "predict_poses",
     "summed_up",
+    "tool_derivatives",
 ]

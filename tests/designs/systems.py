@@ -31,7 +31,7 @@ def random_poses(rng, n_candidates=15, lost=True):
         rows = rows - (rows @ u)[..., None] * u
     always = np.diag([0.0, 1.0 / 2e-3, 0.0, 0.0, 0.0])[1:2]
     v = rng.normal(size=(20, 3))
-    return PoseRows(rows, always, scales, 3, 3), direction, v.T @ v / 20
+    return PoseRows(rows, always, scales, 3), direction, v.T @ v / 20
 
 
 def system_with_less(rng) -> System:

@@ -115,7 +115,7 @@ def test_the_task_counts_in_its_own_units_and_without_what_none_determines(lost)
     C = np.linalg.pinv(A.T @ A, rcond=1e-12, hermitian=True)[:3, :3] * np.outer(poses.scales[:3], poses.scales[:3])
     found = Measure("I", system).value(system.information(chosen))
     assert system.rows.shape == (15, 2, 4 if lost else 5)
-    exact = PoseRows(1e12 * poses.rows, poses.always, poses.scales, 3, 3)  # what is lost is lost at any noise
+    exact = PoseRows(1e12 * poses.rows, poses.always, poses.scales, 3)  # what is lost is lost at any noise
     assert build_system(exact, given, W).rows.shape == system.rows.shape
     assert found == pytest.approx(np.trace(W @ C), rel=1e-4)
     share = 0.0

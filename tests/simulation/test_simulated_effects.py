@@ -87,3 +87,9 @@ def test_a_design_expects_what_a_calibration_with_error_curves_then_finds():
     found = errors_at(spread, plan.task.readings)[plan.task.fitted].position
     assert plan.expected.position == pytest.approx(found, rel=1e-3)  # second order of the start of the frame
     assert plan.random == pytest.approx(found, rel=0.05)
+
+
+def test_a_design_after_a_calibration_counts_what_is_known_of_error_curves(tmp_path):
+    write_simulation(tmp_path, simulate(scenario(Harmonics(), ErrorCurve(knots=12, sigma=1e-3)), 1))
+    plan = design(read_job(tmp_path / "calibration.yaml"), n=4)
+    assert plan.expected.position < plan.random < plan.before.position
