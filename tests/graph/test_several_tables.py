@@ -259,22 +259,6 @@ def test_pairs_measured_again_are_not_the_same():
         build_problem(robot, [Table(m, "distance"), Table(m, "distance-rotation")])
 
 
-@pytest.mark.parametrize(("keys", "said"), [
-    ({"measurements": []}, "job.yaml: measurements: found [], expected a path, or a list of tables"),
-    ({"measurements": [{"table": "tracker.csv"}]}, "job.yaml: measurement 1: missing key 'model'"),
-    ({"measurements": [{"model": "position"}]}, "job.yaml: measurement 1: missing key 'table'"),
-    ({"pairs": "lengths.csv"}, "job.yaml: pairs: next to a list of tables, expected the key in the table's own entry"),
-    ({"measurements": [{"table": "tracker.csv", "model": "position", "loss": "huber"}]},
-     "job.yaml: measurement 1: unknown key 'loss'"),
-])  # fmt: skip
-def test_a_mistake_in_the_list_of_tables_is_named(fg_calib, tmp_path, keys, said):
-    robot, _, tables = mixture(13)
-    ended = fg_calib("calibrate", write_tables(tmp_path, robot, tables, **keys))
-    assert ended.code == 1
-    assert ended.err.startswith(f"error: {said}")
-    assert ended.err.count("\n") == 1
-
-
 @pytest.mark.slow
 def test_a_loss_that_drops_a_whole_table_is_a_finding():
     rng = np.random.default_rng(3)

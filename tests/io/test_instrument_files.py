@@ -7,7 +7,7 @@ from instruments import CAMERA, measured_by
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Noise, calibrate, calibrate_job, read_job
-from fg_calib.io import read_camera, read_measurements, write_csv, write_robot
+from fg_calib.io import read_measurements, write_csv, write_robot
 from fg_calib.measurements.kinds.board import COVARIANCE
 
 INTRINSICS = {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2")}
@@ -129,31 +129,6 @@ def test_a_cell_that_cannot_be_used_is_named(model, text, message, tmp_path):
     with pytest.raises(InputError) as error:
         read_measurements(tmp_path / "t.csv", robot, model=model, noise=Noise(distance=1e-3))
     assert str(error.value) == message
-
-
-@pytest.mark.parametrize(("given", "message"), [
-    ({"fx": 1}, "camera.yaml: missing keys 'fy', 'cx', 'cy'"),
-    (INTRINSICS | {"fx": -1}, "camera.yaml: fx: found -1, expected 1 to 1e+06 px"),
-    (INTRINSICS | {"k4": 0}, "camera.yaml: unknown key 'k4', expected one of fx, fy, cx, cy, k1, k2, p1, p2, k3"),
-])  # fmt: skip
-def test_a_camera_that_is_none_is_named(given, message, tmp_path):
-    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(given))
-    with pytest.raises(InputError) as error:
-        read_camera(tmp_path / "camera.yaml")
-    assert str(error.value).startswith(message)
-
-
-@pytest.mark.parametrize(("key", "value", "message"), [
-    ("anchors", {"a0": {"x": 1, "y": 2}}, "job.yaml: anchors: a0: missing key 'z'"),
-    ("tolerance", {"anchor": 1},
-     "job.yaml: tolerance: unknown key 'anchor', expected one of estimate, targets, anchors"),
-])  # fmt: skip
-def test_a_key_that_cannot_be_used_is_named(key, value, message, tmp_path):
-    robot, _, table = measured_by("anchors", np.random.default_rng(26))
-    path = write_files(tmp_path, robot, table, {key: value})
-    with pytest.raises(InputError) as error:
-        read_job(path)
-    assert str(error.value).startswith(message)
 
 
 @pytest.mark.parametrize(("column", "word"), [("anchor", "NA"), ("plane", "nan"), ("station", "-"), ("target", "None")])

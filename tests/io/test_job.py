@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from fg_calib import InputError, Options, Pairing, read_job
+from fg_calib import Options, Pairing, read_job
 
 ROBOT = """\
 convention: mdh
@@ -122,30 +122,6 @@ def test_a_robot_may_be_a_file_or_stand_in_the_job(folder, robot, files):
     job = read(folder, f"robot: {robot}\nmeasurements: one.csv\nmodel: pose\n")
     assert [joint.name for joint in job.robot.joints] == ["j"]
     assert list(job.inputs) == ["calibration.yaml", *files, "one.csv"]
-
-
-MISTAKES = [
-    ("robot: a\n", "calibration.yaml: missing key 'measurements'"),
-    (JOB + "pairing: stars\n",
-     "calibration.yaml: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}; "
-     "did you mean star?"),
-    (JOB + "noise: {joint: -1}\n", "calibration.yaml: noise: joint 1: found -1, expected a number not below 0"),
-    (JOB + "noise: {joint: [0, 0, 0]}\n",
-     "calibration.yaml: noise: joint: 3 values, expected one for all or 2, one a joint"),
-    (JOB + "noise: 1\n", "calibration.yaml: noise: found 1, expected a mapping"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "message"), MISTAKES, ids=range(len(MISTAKES)))
-def test_a_mistake_is_named_in_one_line(folder, text, message):
-    with pytest.raises(InputError) as caught:
-        read(folder, text)
-    assert str(caught.value) == message
-
-
-def test_a_missing_file_of_a_job_is_named(folder):
-    with pytest.raises(InputError, match=r"robots/nowhere\.yaml: no such file$"):
-        read(folder, JOB.replace("robots/robot.yaml", "robots/nowhere.yaml"))
 
 
 def test_a_simulated_job_knows_the_truth(folder):

@@ -9,7 +9,8 @@ import datetime
 import pytest
 
 from fg_calib import InputError, Robot, read_job, read_robot
-from fg_calib.io import read_measurements
+from fg_calib.inputs import ORDINARY
+from fg_calib.io import read_camera, read_measurements
 
 # fmt: off
 HEAD = "convention: dh\njoints:\n"
@@ -89,11 +90,34 @@ JOBS = [
     (JOB.replace("poses", "groups") + "columns: {id: {name: id, scale: 2}}\n", "groups.csv: columns: id: scale or zero of a column of names, expected name alone"),
     (JOB+"tolerance: {targets: 1}\n", "job.yaml: tolerance: targets: of no use without the key targets, expected no such key"),
     ("robot: robot.yaml\nmeasurements: [{table: poses.csv, model: pose, offset: estimate}]\n", "job.yaml: measurement 1: offset: of no use to model pose, expected no such key"),
+    (JOB.replace("robot.yaml", "nowhere.yaml"), "{folder}/nowhere.yaml: no such file"),
+    ("robot: a\n", "job.yaml: missing key 'measurements'"),
+    (JOB+"pairing: stars\n", "job.yaml: pairing: found 'stars', expected one of star, chain, all, {random: N, seed: S}; did you mean star?"),
+    (JOB+"noise: {joint: -1}\n", "job.yaml: noise: joint 1: found -1, expected a number not below 0"),
+    (JOB+"noise: {joint: [0, 0, 0]}\n", "job.yaml: noise: joint: 3 values, expected one for all or 2, one a joint"),
+    (JOB+"noise: 1\n", "job.yaml: noise: found 1, expected a mapping"),
+    (JOB.replace("pose\n", "anchor\n")+"anchors: {a0: {x: 1, y: 2}}\n", "job.yaml: anchors: a0: missing key 'z' ..."),
+    (JOB+"tolerance: {anchor: 1}\n", "job.yaml: tolerance: unknown key 'anchor', expected one of estimate, targets, anchors ..."),
+    ("robot: robot.yaml\nmeasurements: []\n", "job.yaml: measurements: found [], expected a path, or a list of tables ..."),
+    ("robot: robot.yaml\nmeasurements: [{table: poses.csv}]\n", "job.yaml: measurement 1: missing key 'model' ..."),
+    ("robot: robot.yaml\nmeasurements: [{model: position}]\n", "job.yaml: measurement 1: missing key 'table' ..."),
+    ("robot: robot.yaml\nmeasurements: [{table: poses.csv, model: pose}]\npairs: pairs.csv\n", "job.yaml: pairs: next to a list of tables, expected the key in the table's own entry ..."),
+    ("robot: robot.yaml\nmeasurements: [{table: poses.csv, model: position, loss: huber}]\n", "job.yaml: measurement 1: unknown key 'loss' ..."),
 ]
-
-
+CAMERAS = [
+    ("{fx: 1}", "camera.yaml: missing keys 'fy', 'cx', 'cy' ..."),
+    ("{fx: -1, fy: 905, cx: 640, cy: 480}", "camera.yaml: fx: found -1, expected 1 to 1e+06 px ..."),
+    ("{fx: 900, fy: 905, cx: 640, cy: 480, k4: 0}", "camera.yaml: unknown key 'k4', expected one of fx, fy, cx, cy, k1, k2, p1, p2, k3 ..."),
+]
 XYZ = "q1,q2,x,y,z\n"
+ROWS = XYZ + "0.1,0.2,1,2,3\n0.4,0.5,4,5,6\n"
 POSES = [
+    (ROWS.encode("utf-16"), "poses.csv:1: a null character, expected UTF-8 text; is it UTF-16, Latin-1 or Windows text? save it as UTF-8"),
+    (ROWS.replace("0.2", '"0.2'), "poses.csv:2: a quote that is not closed, expected whole cells in quotes, or none"),
+    ("\n\n" + ROWS.replace("0.2", ""), "poses.csv:4: q2: found an empty cell, expected a finite number"),
+    (ROWS.replace("0.2", "1e200"), f"poses.csv:2: q2: found '1e200', expected {ORDINARY}"),
+    (ROWS + ",,,,7\n", "poses.csv:4: q1: found an empty cell, expected a finite number"),
+    (ROWS.replace("\n", "\r").replace("0.2", "?"), "poses.csv:2: q2: found '?', expected a finite number"),
     ("q1,q2\n−0.5,0\n", "poses.csv:2: q1: found '−0.5', expected a finite number; its minus is another character, a dash; write -"),
     (XYZ + "0,0,1,2,3\n\n0,0,x,2,3\n", "poses.csv:4: x: found 'x', expected a finite number"),
     (XYZ + "180,0,1,2,3\n", "poses.csv:2: q1 = 180 rad is outside [-2, 2]; widen the joint's limits if the reading is right; are the columns in the joints' order?"),
@@ -124,63 +148,34 @@ FRAMES = [
 ARM = Robot.from_dh([[0.5, 0.1, 0.2, 0.0], [0.4, 0.2, 0.1, 0.0]], convention="dh", limits=[[-2.0, 2.0], None])
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A folder with files that others name."""
-    folder = tmp_path_factory.mktemp("malformed")
-    for name, text in {
-        "robot.yaml": TWO_JOINTS,
-        "other.yaml": ONE_JOINT,
-        "poses.csv": "q1,q2,x,y,z\n0,0,0,0,0\n10,20,1000,0,0\n",
-        "groups.csv": GROUPS,
-    }.items():
-        (folder / name).write_text(text)
-    return folder
+FILES = {
+    "robot.yaml": (ROBOTS, read_robot),
+    "arm.urdf": (URDFS, read_robot),
+    "job.yaml": (JOBS, read_job),
+    "camera.yaml": (CAMERAS, read_camera),
+    "poses.csv": (POSES, lambda file: read_measurements(file, ARM)),
+    "pairs.csv": (PAIRS, lambda file: read_measurements(file.with_name("groups.csv"), ARM, pairs=file)),
+}
+CASES = {f"{name} {k}": (name, *case) for name, (cases, _) in FILES.items() for k, case in enumerate(cases)}
 
 
-def cases(table):
-    """Parameters of a table, named by their rows."""
-    return pytest.mark.parametrize(("given", "message"), table, ids=range(len(table)))
-
-
-def refuses(folder, name, given, read, message):
-    """Whether a reader says this of a file; `{folder}` stands for the folder, ` ...` for what other libraries add."""
-    file = folder / name
-    file.write_bytes(given if isinstance(given, bytes) else given.encode())
+@pytest.mark.parametrize("case", CASES)
+def test_a_file_is_refused_in_one_line(tmp_path, case):
+    """`{folder}` stands for the folder, ` ...` for what is said behind it."""
+    others = {"robot.yaml": TWO_JOINTS, "other.yaml": ONE_JOINT, "groups.csv": GROUPS}
+    for name, text in (others | {"poses.csv": "q1,q2,x,y,z\n0,0,0,0,0\n10,20,1000,0,0\n"}).items():
+        (tmp_path / name).write_text(text)
+    name, given, message = CASES[case]
+    (tmp_path / name).write_bytes(given if isinstance(given, bytes) else given.encode())
     with pytest.raises(InputError) as caught:
-        read(file)
-    said, (start, others, _) = str(caught.value).replace(str(folder), "{folder}"), message.partition(" ...")
+        FILES[name][1](tmp_path / name)
+    said, (start, others, _) = str(caught.value).replace(str(tmp_path), "{folder}"), message.partition(" ...")
     assert said.startswith(start) if others else said == message
     assert said.isprintable()
 
 
-@cases(ROBOTS)
-def test_robots(folder, given, message):
-    refuses(folder, "damaged.yaml", given, read_robot, message.replace("robot.yaml", "damaged.yaml"))
-
-
-@cases(URDFS)
-def test_urdfs(folder, given, message):
-    refuses(folder, "arm.urdf", given, read_robot, message)
-
-
-@cases(JOBS)
-def test_jobs(folder, given, message):
-    refuses(folder, "job.yaml", given, read_job, message)
-
-
-@cases(POSES)
-def test_poses(tmp_path, given, message):
-    refuses(tmp_path, "poses.csv", given, lambda file: read_measurements(file, ARM), message)
-
-
-@cases(FRAMES)
+@pytest.mark.parametrize(("given", "message"), FRAMES, ids=range(len(FRAMES)))
 def test_frames(given, message):
     with pytest.raises(InputError) as caught:
         read_measurements(given, ARM)
     assert str(caught.value) == message
-
-
-@cases(PAIRS)
-def test_pairs(folder, given, message):
-    refuses(folder, "pairs.csv", given, lambda file: read_measurements(folder / "groups.csv", ARM, pairs=file), message)
