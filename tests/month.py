@@ -8,7 +8,9 @@ from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, true_robot
 
-from fg_calib import Robot, calibrate, simulate
+from fg_calib import Measurements, Robot, Table, calibrate, simulate
+from fg_calib.measurements.dataset import Labels
+from fg_calib.robot import pose
 from fg_calib.simulation.scenario import Errors
 
 SIGMA = (5e-5, 1e-4)
@@ -32,6 +34,17 @@ def measured(true, n, rng, *, frame=None, q=None, sigma=SIGMA, ids=""):
     readings = rng.uniform(-2.5, 2.5, (n, true.n_joints)) if q is None else q
     found = measure(true, n, rng, sigma=sigma, frame=frame, readings=readings)
     return replace(found, ids=np.array([f"{ids}{i}" for i in range(n)]))
+
+
+def seen(true, spots, rng, n, ids):
+    """Positions of targets on the tool."""
+    q = rng.uniform(-2.5, 2.5, (n, 6))
+    of = np.arange(n) % len(spots)
+    poses = pose(true, q)
+    at = np.array(list(spots.values()))[of]
+    p = poses.position + np.einsum("nij,nj->ni", poses.rotation, at) + SIGMA[0] * rng.normal(size=(n, 3))
+    rows = Measurements.from_arrays(q, position=p, sigma_position=SIGMA[0], ids=[f"{ids}{i}" for i in range(n)])
+    return Table(replace(rows, labels={"target": Labels(tuple(spots), of)}), "position")
 
 
 def slipped(true, **changes):

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import Measurements, Robot, Table
 from fg_calib.io import Units, write_csv, write_robot
-from fg_calib.robot import pose
+from fg_calib.measurements import Pairs
+from fg_calib.robot import pose, rotation_angle
 from fg_calib.simulation import table_columns
 
 PAPER_A = [0, 0, 0, 5, 5, 0, 0]
@@ -58,6 +59,17 @@ def plus(array, rows, amount):
     changed = array.copy()
     changed[rows] += amount
     return changed
+
+
+def pairs_between(true, q, ends, rng, *, sigma=(1e-3, 5e-4), source="measurements") -> Pairs:
+    """Distances, and angles if they have a sigma, of the true arm between joint values q measured directly."""
+    (a, b), at, n = ends, pose(true, q), len(ends[0])
+    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma[0] * rng.normal(size=n)
+    angle = of_angle = np.full(n, np.nan)
+    if sigma[1]:
+        angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + sigma[1] * rng.normal(size=n)
+        of_angle = np.full(n, sigma[1])
+    return Pairs(a, b, distance, angle, np.full(n, sigma[0]), of_angle, np.zeros(n, dtype=bool), source)
 
 
 def measure(true, n, rng, *, sigma=(1e-3, 2e-4), sigma_joint=0.0, frame=None, n_test=0, readings=None) -> Measurements:

@@ -36,8 +36,8 @@ def corners(robot, n, rng):
     return pose(robot, 0.4 + 0.15 * rng.normal(size=(n, robot.n_joints))).position
 
 
-def touch(true, points, n_each, rng, sigma=SIGMA, distances=(), test=()):
-    """Touches of points with noise; `distances` are (a, b, sigma), measured with noise; `test` names test groups."""
+def touch(true, points, n_each, rng, sigma=SIGMA, distances=(), test=(), sigma_joint=0.0):
+    """Touches of points with noise, of joints too; `distances` (a, b, sigma) have noise, `test` names test groups."""
     index = np.repeat(np.arange(len(points)), n_each)
     q = reach(true, points[index] + sigma * rng.normal(size=(len(index), 3)), rng)
     pairs = no_pairs("pairs.csv")
@@ -49,7 +49,6 @@ def touch(true, points, n_each, rng, sigma=SIGMA, distances=(), test=()):
         pairs = Pairs(a, b, d, nothing, s, nothing, np.isin(a, test) | np.isin(b, test), "pairs.csv")
     groups = Groups(tuple(f"g{g}" for g in range(len(points))), index, pairs)
     ids, more = np.arange(len(q)).astype(str), {"sigmas": {"point": np.full(len(q), sigma or SIGMA)}}
-    of_poses = 4 * (None,)
-    return Measurements(
-        q, ids, np.isin(index, test), *of_poses, np.zeros(true.n_joints), groups=groups, source="poses.csv", **more
-    )
+    q, joint = q + sigma_joint * rng.normal(size=q.shape), np.full(true.n_joints, sigma_joint)
+    more |= {"groups": groups, "source": "poses.csv"}
+    return Measurements(q, ids, np.isin(index, test), *4 * (None,), joint, **more)

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from jobs import ur5e
 from scipy.spatial.transform import Rotation
-from simulated import TOOL, measure, true_robot
+from simulated import TOOL, measure, pairs_between, true_robot
 from sparing import diagonal
 
 from fg_calib import Table, build_problem, solve
 from fg_calib.diagnostics.setup_check import OTHER_TOOL, check_problem
-from fg_calib.measurements import Pairs
 
 TOLERANCE = {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.05, "beta": 0.05, "tool": 0.001}
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
@@ -24,10 +23,7 @@ def tracker(true, rng, **keys):
 def lengths(true, rng):
     """Lengths between configurations measured directly."""
     m = measure(true, 40, rng, sigma=(5e-5, 1e-4))
-    a, b = np.arange(0, 40, 2), np.arange(1, 40, 2)
-    distance = np.linalg.norm(m.position[b] - m.position[a], axis=1)
-    nothing, sigma = np.full(20, np.nan), np.full(20, 5e-5)
-    pairs = Pairs(a, b, distance, nothing, sigma, nothing, np.zeros(20, dtype=bool))
+    pairs = pairs_between(true, m.readings, (np.arange(0, 40, 2), np.arange(1, 40, 2)), rng, sigma=(5e-5, 0.0))
     return replace(m, position=None, rotation=None, sigma_position=None, sigma_orientation=None, pairs=pairs,
                    source="bar.csv")  # fmt: skip
 

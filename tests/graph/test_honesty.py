@@ -47,9 +47,7 @@ def small_motions(rng):
 def touches(rng):
     robot = small_arm(TOUCH_TOLERANCE, TOOL_POINT)
     true = true_robot(robot, rng)
-    m = touch(true, corners(true, 3, rng), 6, rng, distances=((0, 1, 1e-4),))
-    noise = 3e-4 * rng.normal(size=m.readings.shape)
-    return robot, true, replace(m, readings=m.readings + noise, sigma_joint=np.full(4, 3e-4))
+    return robot, true, touch(true, corners(true, 3, rng), 6, rng, distances=((0, 1, 1e-4),), sigma_joint=3e-4)
 
 
 PAIRS = {"model": "distance-rotation"}

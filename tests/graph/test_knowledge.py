@@ -87,8 +87,9 @@ def test_an_update_is_a_calibration_of_all_rows():
     m = table.measurements
     first, second = (replace(table, measurements=replace(m.select(rows), source=source))
                      for rows, source in ((np.arange(30), "first"), (np.arange(30, 48), "second")))  # fmt: skip
-    both = calibrate(robot, [first, second])
-    updated = calibrate(robot, [first]).update([replace(second, known={})], anchors_stay=True)
+    both, before, second = calibrate(robot, [first, second]), calibrate(robot, [first]), replace(second, known={})
+    updated, moved = (before.update([second], anchors_stay=stay) for stay in (True, False))
+    assert moved.parameters["a2"].sigma > 1.02 * updated.parameters["a2"].sigma
     for name in both.result.covariance.names:
         a, b = updated.parameters[name], both.parameters[name]
         assert abs(a.estimate - b.estimate) < 0.05 * b.sigma

@@ -10,14 +10,14 @@ from custom_kinds import lengths_to_anchors
 from dense import dense, priors
 from instruments import measured_by
 from scipy.spatial.transform import Rotation
-from simulated import TOOL, measure, small_arm, true_robot
+from simulated import TOOL, measure, pairs_between, small_arm, true_robot
 from sparing import as_case
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib import DistanceFactor, Pairing, RotationAngleFactor, Table, build_problem, solve
 from fg_calib.graph import JOINT_NOISE, joint_errors, relinearized_at
 from fg_calib.measurements import Pairs
-from fg_calib.robot import pose, rotation_angle
+from fg_calib.robot import pose
 
 TOLERANCE = dict.fromkeys(("a", "d", "alpha", "theta", "tool"), 2e-3)
 TOLERANCE |= {f"tool.{k}": 3e-3 for k in ("roll", "pitch", "yaw")}
@@ -45,22 +45,20 @@ def direct(rng, *, graph="star", joint=0.0):
         q = m.readings.copy()
         q[b[::4]] = q[a[::4]] + 1e-3 * rng.normal(size=(4, 4))
         m = replace(m, readings=q)
-    at, n = pose(true_robot(robot, rng), m.readings + joint * rng.normal(size=m.readings.shape)), len(a)
-    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + 1e-3 * rng.normal(size=n)
-    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + 5e-4 * rng.normal(size=n)
+    true, q = true_robot(robot, rng), m.readings + joint * rng.normal(size=m.readings.shape)
+    pairs = pairs_between(true, q, (a, b), rng)
+    distance, angle, n = pairs.distance.copy(), pairs.angle.copy(), len(a)
     distance[:: 4 if graph == "mixed" else 100] = 0.0 if graph == "mixed" else np.nan
     angle[: n if graph == "mixed" else 0 : 4] = np.nan
-    pairs = Pairs(a, b, distance, angle, np.full(n, 1e-3), np.full(n, 5e-4), np.zeros(n, bool))
-    return robot, replace(m, pairs=pairs, sigma_joint=np.full(4, joint))
+    return robot, replace(m, pairs=replace(pairs, distance=distance, angle=angle), sigma_joint=np.full(4, joint))
 
 
 def touches(rng, *, joint=0.0):
     """Touches of four points with two distances between them."""
     robot = small_arm(TOLERANCE, TOOL_POINT)
     true = true_robot(robot, rng)
-    m = touch(true, corners(true, 4, rng), 6, rng, distances=((0, 1, 1e-4), (2, 3, 1e-4)))
-    noise = joint * rng.normal(size=m.readings.shape)
-    return robot, replace(m, readings=m.readings + noise, sigma_joint=np.full(4, joint))
+    lengths = ((0, 1, 1e-4), (2, 3, 1e-4))
+    return robot, touch(true, corners(true, 4, rng), 6, rng, distances=lengths, sigma_joint=joint)
 
 
 def two_tables(rng, *, second="pairs", joint=3e-4):

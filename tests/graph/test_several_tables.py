@@ -9,13 +9,12 @@ import pytest
 import yaml
 from custom_kinds import lengths_to_anchors
 from scipy.spatial.transform import Rotation
-from simulated import measure, paper_robot, small_arm, true_robot
+from simulated import measure, pairs_between, paper_robot, small_arm, true_robot
 from touches import corners, touch
 
 from fg_calib import ProblemError, Table, assess, build_problem, solve
 from fg_calib.io import Units, write_csv, write_robot
-from fg_calib.measurements import Groups, Pairs, no_pairs
-from fg_calib.robot import pose
+from fg_calib.measurements import Groups, no_pairs
 from fg_calib.simulation import table_columns
 
 TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
@@ -26,11 +25,8 @@ SIGMA = (5e-4, 5e-4)
 
 def pairs_of(true, q, rng, sigma=2e-4):
     """Distances measured between each configuration and the next, at the true joint values q."""
-    p = pose(true, q).position
-    n = len(q) - 1
-    d = np.linalg.norm(np.diff(p, axis=0), axis=1) + sigma * rng.normal(size=n)
-    nothing, rows = np.full(n, np.nan), np.arange(n)
-    return Pairs(rows, rows + 1, d, nothing, np.full(n, sigma), nothing, np.zeros(n, bool), "lengths.csv")
+    rows = np.arange(len(q))
+    return pairs_between(true, q, (rows[:-1], rows[1:]), rng, sigma=(sigma, 0.0), source="lengths.csv")
 
 
 def mixture(seed, *, n=16, sigma_joint=0.0, shared=True):

@@ -6,14 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exported import UR10
-from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, slipped
+from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, seen, slipped
 from oracle import central_differences
 from scipy import stats
 from simulated import true_robot
 from sparing import as_case
 
 from fg_calib import InputError, Measurements, Robot, Table, calibrate
-from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 
 SMALL = 2.5e-4
@@ -221,22 +220,14 @@ def test_too_few_rows_are_not_judged(unknown):
 
 @pytest.mark.slow
 def test_a_target_keeps_its_place_and_what_is_known_of_it():
-    rng = np.random.default_rng(14)
-    robot = arm()
-    true, spot = true_robot(robot, rng), np.array([0.03, 0.08, 0.02])
-
-    def seen(n, at):
-        q = rng.uniform(-2.5, 2.5, (n, 6))
-        poses = pose(true, q)
-        p = poses.position + poses.rotation @ at + SIGMA[0] * rng.normal(size=(n, 3))
-        rows = Measurements.from_arrays(q, position=p, sigma_position=SIGMA[0])
-        return Table(replace(rows, labels={"target": Labels(("a",), np.zeros(n, int))}), "position")
-
-    calibration = calibrate(robot, seen(40, spot))
-    healthy = calibration.check(seen(6, spot))
+    rng, robot, spot = np.random.default_rng(14), arm(), np.array([0.03, 0.08, 0.02])
+    true = true_robot(robot, rng)
+    calibration = calibrate(robot, seen(true, {"a": spot}, rng, 40, "x"))
+    healthy = calibration.check(seen(true, {"a": spot}, rng, 6, "y"))
     assert healthy.verdict == "pass"
     assert healthy.dof == 18  # nothing is fitted: the target is known
-    assert calibration.check(seen(6, spot + np.array([1e-3, 0, 0]))).verdict == "fail"
+    moved = {"a": spot + np.array([1e-3, 0, 0])}
+    assert calibration.check(seen(true, moved, rng, 6, "z")).verdict == "fail"
 
 
 def test_rows_of_another_robot_are_refused(known):

@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from month import arm, calibrated, measured, placed, slipped
+from month import arm, calibrated, measured, placed, seen, slipped
 from simulated import true_robot
 
 from fg_calib import InputError, Measurements, Table, calibrate, export
-from fg_calib.measurements.dataset import Labels
-from fg_calib.robot import pose
 
 FINE = (5e-8, 1e-7)
 """Noise so small that all is linear: a thousandth of an instrument's."""
@@ -62,17 +60,6 @@ def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
         calibrate(robot, old, gauge="none").update(new)
 
 
-def seen(true, spots, rng, n, ids):
-    """Positions of targets on the tool."""
-    q = rng.uniform(-2.5, 2.5, (n, 6))
-    of = np.arange(n) % len(spots)
-    poses = pose(true, q)
-    at = np.array(list(spots.values()))[of]
-    p = poses.position + np.einsum("nij,nj->ni", poses.rotation, at) + 5e-5 * rng.normal(size=(n, 3))
-    rows = Measurements.from_arrays(q, position=p, sigma_position=5e-5, ids=[f"{ids}{i}" for i in range(n)])
-    return Table(replace(rows, labels={"target": Labels(tuple(spots), of)}), "position")
-
-
 @pytest.mark.slow
 def test_targets_stay_known_although_a_month_does_not_see_them():
     """Two targets, of which the second table sees one; the third sees the other again."""
@@ -96,32 +83,6 @@ def fine_arm(**more):
     robot = arm(**more)
     tolerance = {p.name: 1e-3 * p.tolerance for p in robot.parameters if p.tolerance}
     return replace(robot, parameters=tuple(replace(p, tolerance=tolerance.get(p.name)) for p in robot.parameters))
-
-
-def lengths(true, anchors, rng, n, ids):
-    q = rng.uniform(-2.5, 2.5, (n, 6))
-    of = np.arange(n) % len(anchors)
-    d = np.linalg.norm(pose(true, q).position - np.array(list(anchors.values()))[of], axis=1)
-    d = d + 2e-8 * rng.normal(size=n)
-    rows = Measurements.from_arrays(q, ids=[f"{ids}{i}" for i in range(n)])
-    labels = {"anchor": Labels(tuple(anchors), of)}
-    return Table(replace(rows, labels=labels, columns={"distance": d}, sigmas={"distance": np.full(n, 2e-8)}), "anchor")
-
-
-@pytest.mark.slow
-def test_anchors_are_those_of_before_only_where_that_is_said():
-    rng = np.random.default_rng(5)
-    robot = fine_arm()
-    true = true_robot(robot, rng)
-    anchors = {"a": [1.5, 0, 0.2], "b": [-0.8, 1.2, 0.5], "c": [0.2, -1.4, 1.0]}
-    old, new = (lengths(true, anchors, rng, n, i) for n, i in ((90, "x"), (45, "y")))
-    calibration = calibrate(robot, old)
-    off, of_sigma = difference(calibration.update(new, anchors_stay=True), calibrate(robot, [old, new]))
-    assert max(off, of_sigma) < 1e-5
-    labels = {"anchor": Labels(("d", "e", "f"), new.measurements.labels["anchor"].index)}
-    others = replace(new.measurements, labels=labels)
-    off, of_sigma = difference(calibration.update(new), calibrate(robot, [old, replace(new, measurements=others)]))
-    assert max(off, of_sigma) < 1e-5
 
 
 def test_an_update_at_odds_with_what_was_known_points_to_the_check():

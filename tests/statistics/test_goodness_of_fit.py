@@ -7,14 +7,13 @@ import pytest
 from oracle import central_differences
 from reported import format_report
 from scipy.stats import kstest
-from simulated import measure, plus, small_arm, true_robot
+from simulated import measure, pairs_between, plus, small_arm, true_robot
 from touches import SIGMA, TOOL_POINT, corners, touch
 
 from fg_calib import Pairing, Table, assess, build_problem, calibrate, solve
 from fg_calib.graph import NoiseState
 from fg_calib.graph import problem as problem_module
-from fg_calib.measurements import Pairs
-from fg_calib.robot import pose, rotation_angle
+from fg_calib.robot import pose
 from fg_calib.statistics import FLAGS, KindFit, estimate_noise
 from fg_calib.statistics import variance_components as noise
 
@@ -24,10 +23,7 @@ TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 def measured_directly(m, robot, rng, a, b, sigma=(1e-3, 5e-4), sigma_joint=0.0):
     """Pairs of the true robot measured directly, with noise; the joint errors are those of each configuration."""
     q = m.readings + sigma_joint * rng.normal(size=m.readings.shape)
-    at, n = pose(robot, q), len(a)
-    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma[0] * rng.normal(size=n)
-    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + sigma[1] * rng.normal(size=n)
-    pairs = Pairs(a, b, distance, angle, np.full(n, sigma[0]), np.full(n, sigma[1]), np.zeros(n, dtype=bool))
+    pairs = pairs_between(robot, q, (a, b), rng, sigma=sigma)
     return replace(m, position=None, rotation=None, pairs=pairs, sigma_joint=np.full(robot.n_joints, sigma_joint))
 
 
@@ -162,11 +158,10 @@ def touched(robot, rng, n_each=8, sigma_joint=0.0):
     """Five points touched: of 0, 1 and 2 some touches are test rows, of 3 and 4 all but two."""
     true = true_robot(robot, rng)
     distances = ((0, 1, 1e-4), (0, 3, 1e-4), (3, 4, 1e-4))
-    m = touch(true, corners(true, 5, rng), n_each, rng, distances=distances, test=(3, 4))
-    noise = sigma_joint * rng.normal(size=m.readings.shape)
+    m = touch(true, corners(true, 5, rng), n_each, rng, distances=distances, test=(3, 4), sigma_joint=sigma_joint)
     row = np.arange(len(m.test))
     test = m.test & (row % n_each > 1) | np.isin(row, [n_each - 2, n_each - 1, 2 * n_each - 2])
-    return replace(m, readings=m.readings + noise, sigma_joint=np.full(robot.n_joints, sigma_joint), test=test)
+    return replace(m, test=test)
 
 
 def predicted(name, rng):

@@ -6,13 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 from dense import dense
-from scipy.optimize import minimize
-from simulated import measure, small_arm, true_robot
+from simulated import measure, pairs_between, small_arm, true_robot
 from touches import TOOL_POINT, corners, touch
 
 from fg_calib import Measurements, Pairing, Table, assess, build_problem, solve
 from fg_calib.graph import JOINT_NOISE, prior_rows, relinearized_at, whitener_of
-from fg_calib.measurements import Pairs
 from fg_calib.robot import pose
 from fg_calib.statistics import variance_components as estimation
 from fg_calib.statistics.variance_components import NoiseComponents, estimate_noise, noise_components
@@ -37,15 +35,12 @@ def specified(m, own, joint):
 def tracker_and_bar(true, rng, n=30):
     """Positions, and lengths between the same configurations measured directly: their joint noise is the same."""
     q = rng.uniform(-np.pi, np.pi, (n, true.n_joints))
-    p = pose(true, q + SIGMA_JOINT * rng.normal(size=q.shape)).position
-    a = np.tile(np.arange(n), 2)
-    b = np.concatenate([np.roll(np.arange(n), 1), np.roll(np.arange(n), 3)])
-    length = np.linalg.norm(p[b] - p[a], axis=1) + 5e-4 * rng.normal(size=len(a))
-    sigma, none = np.full(len(a), 5e-4), np.full(len(a), np.nan)
+    stood = q + SIGMA_JOINT * rng.normal(size=q.shape)
+    ends = np.tile(np.arange(n), 2), np.concatenate([np.roll(np.arange(n), 1), np.roll(np.arange(n), 3)])
+    pairs = pairs_between(true, stood, ends, rng, sigma=(5e-4, 0.0))
     same = {"readings": q, "ids": np.arange(n).astype(str), "test": np.zeros(n, dtype=bool), "named": True}
     same |= {"rotation": None, "sigma_orientation": None, "sigma_joint": np.full(true.n_joints, SIGMA_JOINT)}
-    p = p + SIGMA[0] * rng.normal(size=p.shape)
-    pairs = Pairs(a, b, length, none, sigma, none, np.zeros(len(a), dtype=bool))
+    p = pose(true, stood).position + SIGMA[0] * rng.normal(size=(n, 3))
     return (
         Measurements(position=p, sigma_position=np.full((n, 3), SIGMA[0]), source="tracker.csv", **same),
         Measurements(position=None, sigma_position=None, pairs=pairs, source="bar.csv", **same),
@@ -56,9 +51,7 @@ def touched(true, rng):
     """Touches of five points and the lengths between these, with joint noise."""
     points = corners(true, 5, rng)
     between = tuple((a, b, 1e-4) for a in range(5) for b in range(a))
-    m = touch(true, points, 12, rng, sigma=1e-3, distances=between)
-    readings = m.readings + SIGMA_JOINT * rng.normal(size=m.readings.shape)
-    return replace(m, readings=readings, sigma_joint=np.full(true.n_joints, SIGMA_JOINT))
+    return touch(true, points, 12, rng, sigma=1e-3, distances=between, sigma_joint=SIGMA_JOINT)
 
 
 CHOICES = {name: {"model": "pose"} for name in ("pose", "no joint noise", "joints drowned")}
@@ -143,26 +136,6 @@ def test_components_are_those_of_the_dense_covariance(name):
     assert found.expected == pytest.approx(expected, rel=1e-5)
     ratio = np.sqrt(squares / expected)
     assert found.information == pytest.approx(information / np.outer(ratio, ratio), rel=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["pose", "frame unknown"])
-def test_factors_are_the_most_likely_ones(name):
-    """Restricted maximum likelihood by Nelder-Mead on the dense linear model: the least of it is at the factors."""
-    problem, _ = draw(name, np.random.default_rng(17), n=20)
-    solution = estimate_noise(problem)
-    assert solution.converged
-    assert len(solution.estimated_noise) == 3
-    J, r, parts, rows, residual = dense_model(solution)
-
-    def unlikely(logarithms):
-        W = np.linalg.inv(np.linalg.cholesky(sum(np.exp(2.0 * x) * V for x, V in zip(logarithms, parts, strict=True))))
-        A, b = np.vstack([W @ J, rows]), np.concatenate([W @ r, residual])
-        left = b - A @ np.linalg.lstsq(A, b, rcond=1e-12)[0]
-        return -2.0 * np.log(np.diag(W)).sum() + np.linalg.slogdet(A.T @ A)[1] + left @ left
-
-    likely = minimize(unlikely, np.full(3, 0.1), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-11}).x
-    assert likely == pytest.approx(0.0, abs=1e-4)
 
 
 def test_without_joint_noise_the_components_are_sums_of_squares_and_redundancies_of_kinds():
