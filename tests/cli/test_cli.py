@@ -1,6 +1,7 @@
 """Commands in process: exit codes, files, messages, and what results promise."""
 
 import csv
+import hashlib
 import json
 import re
 import shutil
@@ -62,12 +63,14 @@ def calibrate(fg_calib, job, *arguments):
     return json.loads(ended.out, parse_constant=_refuse)
 
 
-def test_calibrating_the_example_ends_well_and_writes_its_files(calibrated):
+def test_calibrating_the_example_ends_well_and_writes_its_files(calibrated, result):
     folder, ended = calibrated
     assert (ended.exit_code, ended.stderr) == (0, "")
     assert ended.stdout.startswith("space-robot: distance-rotation, pairs: star\nGOOD: converged")
     assert {f.name for f in (folder / "result").iterdir()} == OUTPUTS
     assert {f.name for f in folder.iterdir()} == {JOB, POSES, ROBOT, TRUTH, "result"}
+    hashes = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in (JOB, ROBOT, POSES, TRUTH)}
+    assert result["inputs"] == hashes
 
 
 def test_a_result_has_every_key_of_its_schema(result):
@@ -152,13 +155,6 @@ def test_the_calibrated_robot_holds_the_estimates(calibrated, result):
     assert robot.joints == nominal.joints
 
 
-def test_inputs_are_named_with_their_hashes(calibrated, result):
-    import hashlib
-
-    contents = {name: (calibrated[0] / name).read_bytes() for name in (JOB, ROBOT, POSES, TRUTH)}
-    assert result["inputs"] == {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-
-
 # --- how the commands end --------------------------------------------------------------------------------------------
 
 
@@ -213,22 +209,6 @@ def test_the_example_is_written_and_its_next_step_named(fg_calib, tmp_path):
 
 
 # --- what must not matter, and other forms of input ------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_test_rows_never_touch_the_estimate(fg_calib, example):
-    first = calibrate(fg_calib, example / JOB)
-    rows = (example / POSES).read_text().splitlines(keepends=True)
-    wrong = [",".join([*row.split(",")[:8], "9,-7,5,1,0,0,0,test\n"]) if "test" in row else row for row in rows]
-    (example / POSES).write_text("".join(wrong))
-    ended = fg_calib("calibrate", example / JOB, "--json")
-    second = json.loads(ended.out)
-    assert ended.code == 3
-    assert "test rows" in ended.err
-    assert second["residual_rms"]["test"] != first["residual_rms"]["test"]
-    for key in ("parameters", "covariance", "chi2", "dof", "observability"):
-        assert second[key] == first[key]
-    assert second["residual_rms"]["train"] == first["residual_rms"]["train"]
 
 
 def test_a_urdf_gives_a_calibrated_urdf_that_reads_back_to_the_estimates(fg_calib, tmp_path):

@@ -8,7 +8,6 @@ import yaml
 from fg_calib.report import inspection_document
 
 JOB = "calibration.yaml"
-NUMBER = (int, float)
 
 
 @pytest.fixture(autouse=True)
@@ -75,7 +74,7 @@ def test_json_has_every_key_and_nothing_else_is_on_stdout(fg_calib, example):
     assert found["tables"][0]["n_rows"] == 102
     assert set(found["residuals"][0]) == {"table", "kind", "unit", "size", "expected", "excess", "n"}
     assert set(found["joints"][0]) == {"name", "unit", "least", "most", "limits", "share", "still", "n_outside"}
-    assert isinstance(found["expected_error"]["base"]["position"], NUMBER)
+    assert isinstance(found["expected_error"]["base"]["position"], int | float)
     assert set(found["inputs"]) == {JOB, "poses.csv", "robot_nominal.yaml", "robot_true.yaml"}
     assert all(f'"{key}"' in (inspection_document.__doc__ or "") for key in found)
 

@@ -48,7 +48,7 @@ def place(tmp_path_factory):
     return folder
 
 
-def test_a_table_is_read_as_the_job_read_its_own(place):
+def test_a_table_is_read_as_the_job_read_its_own_and_a_job_may_stand_in_its_place(place):
     code, out = run("check", place / "result", place / "healthy.csv", "--json")
     found = json.loads(out)
     assert code == 0
@@ -56,6 +56,10 @@ def test_a_table_is_read_as_the_job_read_its_own(place):
     assert found["verdict"] == "pass"
     assert found["dof"] == 48
     assert found["rms"]["position"] < 3 * SIGMA[0]
+    job = yaml.safe_load((place / "job.yaml").read_text()) | {"measurements": "healthy.csv"}
+    (place / "healthy.yaml").write_text(yaml.safe_dump(job))
+    code, out = run("check", place / "result", place / "healthy.yaml", "--json")
+    assert (code, json.loads(out)["dof"]) == (0, 48)
 
 
 @pytest.mark.slow
@@ -71,10 +75,3 @@ def test_a_slip_fails_is_named_and_is_mended_by_an_update(place):
     assert run("report", place / "second")[0] == 0
     assert run("compare", place / "result", place / "second")[0] == 0
     assert read_result(place / "second").options == read_result(place / "result").options
-
-
-def test_a_job_may_stand_in_place_of_a_table(place):
-    job = yaml.safe_load((place / "job.yaml").read_text()) | {"measurements": "healthy.csv"}
-    (place / "healthy.yaml").write_text(yaml.safe_dump(job))
-    code, out = run("check", place / "result", place / "healthy.yaml", "--json")
-    assert (code, json.loads(out)["dof"]) == (0, 48)

@@ -7,13 +7,12 @@ import sys
 
 import pytest
 
-from fg_calib import Calibration, InputError, calibrate_job, simulate
+from fg_calib import Calibration, calibrate_job, simulate
 from fg_calib.simulation import read_scenario, write_simulation
 
 STEERING = "\x1b[31m\x07\b\x9b2J\x7f\u202e\u2066[/red]"
 """What turns a terminal red, rings, goes back, clears the screen, deletes, and turns the direction of reading."""
 
-SHOWN = r"\x1b[31m\x07\x08\x9b2J\x7f\u202e\u2066[/red]"
 """The same as it is shown."""
 
 ROBOT = """
@@ -101,13 +100,6 @@ def test_a_notebook_a_saved_result_and_reprs_are_clean(found, tmp_path):
     shown += [repr(found.robot), repr(found.parameters), repr(found.assessment), repr(found.solution)]
     shown += [repr(found.solution.problem), repr(found.solution.problem.measurements)]
     assert [text for text in shown if not clean(text)] == []
-
-
-def test_errors_and_warnings_are_clean(fg_calib, folder, tmp_path):
-    message = str(InputError(f"a{STEERING}\nb", "found \x1b", "\x07"))
-    assert message == rf"a{SHOWN} b: found \x1b, expected \x07"
-    ended = fg_calib("calibrate", tmp_path / "a\x1b[31m\nb")
-    assert ended == (1, "", f"error: {tmp_path}/a\\x1b[31m b: no such file\n")
 
 
 def run(arguments, **options):

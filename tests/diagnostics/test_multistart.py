@@ -7,51 +7,29 @@ from scipy.stats import chi2
 from simulated import nees, small_arm, true_robot
 from touches import reach_faces
 
-from fg_calib import Measurements, Table, assess, build_problem, calibrate, read_job, read_robot, solve
+from fg_calib import Job, Measurements, Options, Pairing, Robot, Table, assess, build_problem, calibrate, solve
 from fg_calib.assessment import solve_job
 from fg_calib.diagnostics.multistart import multistart
 from fg_calib.graph import problem_of, solver
 from fg_calib.robot import pose
 
-ROBOT = """\
-name: pointer
-convention: dh
-joints:
-  - {{a: 0.1, alpha: 1.5707963267948966, d: 0, theta: 0}}
-  - {{a: 0, alpha: 0, d: {d}, theta: 0}}
-fixed: [a1, alpha1, d1, theta1, a2, alpha2, theta2]
-tolerance: {{d2: {tolerance}}}
-"""
-JOB = """\
-robot: robot.yaml
-measurements: poses.csv
-model: distance
-pairing: chain
-noise: {position: 1.0e-5}
-gauge: prior
-"""
+SIGMA = 1e-5
 
 
-def pointer(folder, *, nominal, true, tolerance=0.02, job=JOB, n=40, seed=0):
-    """A pointer, 100 mm long, its tip `true` aside: distances see its radius, so the square of that."""
-    text = ROBOT.format(d=nominal, tolerance=tolerance)
-    (folder / "robot.yaml").write_text(text)
-    robot = read_robot(folder / "robot.yaml")
-    rng = np.random.default_rng(seed)
-    q = rng.uniform(-np.pi, np.pi, (n, 2))
-    values = robot.nominal
+def pointer(*, nominal, true, tolerance=0.02, model="distance"):
+    """A job on a pointer, 100 mm long, its tip `true` aside: distances see its radius, so the square of that."""
+    robot = Robot.from_dh([[0.1, np.pi / 2, 0, 0], [0, 0, nominal, 0]], "dh", tolerance={"d2": tolerance})
+    robot, rng = robot.with_estimated(["d2"]), np.random.default_rng(0)
+    q, values = rng.uniform(-np.pi, np.pi, (40, 2)), robot.nominal
     values[robot.index("d2")] = true
-    position = pose(robot.with_values(values), q).position
-    position = position + 1e-5 * rng.normal(size=position.shape)
-    rows = [",".join(f"{v:.12g}" for v in (*angle, *p)) for angle, p in zip(q, position, strict=True)]
-    (folder / "poses.csv").write_text("\n".join(["q1,q2,x,y,z", *rows]) + "\n")
-    (folder / "job.yaml").write_text(job)
-    return folder / "job.yaml"
+    position = pose(robot.with_values(values), q).position + SIGMA * rng.normal(size=(40, 3))
+    m = Measurements.from_arrays(q, position=position, sigma_position=SIGMA)
+    return Job(None, robot, m, Options(model, pairing=Pairing("chain"), gauge="prior"))
 
 
-def test_the_best_of_two_optima_is_kept(tmp_path):
+def test_the_best_of_two_optima_is_kept():
     """One start ends 21 tolerances from nominal, where the mirror image is 19 away."""
-    problem = problem_of(read_job(pointer(tmp_path, nominal=1e-3, true=0.02, tolerance=1e-3)))
+    problem = problem_of(pointer(nominal=1e-3, true=0.02, tolerance=1e-3))
     i = problem.robot.index("d2")
     far = solver.solve(problem)
     wrong = solver.solve(problem, start=np.where(np.arange(len(problem.start)) == i, -0.02, far.parameters))
@@ -63,9 +41,9 @@ def test_the_best_of_two_optima_is_kept(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_start_between_two_optima_is_left(tmp_path):
+def test_a_start_between_two_optima_is_left():
     """At nominal 0 the derivative is 0: the descent stays there, with a chi-square of tens of thousands."""
-    problem = problem_of(job := read_job(pointer(tmp_path, nominal=0.0, true=0.02)))
+    problem = problem_of(job := pointer(nominal=0.0, true=0.02))
     assert solver.solve(problem).cost > 1e4
     solution = solve_job(job)
     i = problem.robot.index("d2")
@@ -75,22 +53,19 @@ def test_a_start_between_two_optima_is_left(tmp_path):
     assert any(finding.startswith(second) for finding in assess(solution).verdict.errors)
 
 
-def test_what_data_see_has_one_optimum_and_costs_nothing_more(tmp_path, monkeypatch):
+def test_what_data_see_has_one_optimum_and_costs_nothing_more(monkeypatch):
     """Positions see which side the tip is on: nothing is weak, nothing is solved again."""
-    path = pointer(tmp_path, nominal=1e-3, true=0.02, job=JOB.replace("distance", "position"))
 
     def never(*_):
         raise AssertionError("solved again although nothing is weak")
 
     monkeypatch.setattr("fg_calib.diagnostics.multistart._solve_from", never)
-    solution = solve_job(read_job(path))
+    solution = solve_job(pointer(nominal=1e-3, true=0.02, model="position"))
     assert solution.others == ()
     assert assess(solution).trustworthy
 
 
 # --- mirrored landmarks ------------------------------------------------------------------------------------------
-
-SIGMA = 1e-5
 
 
 def on_planes(rng, reading, n=48, n_planes=3):

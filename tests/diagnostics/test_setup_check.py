@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 from jobs import SIGMA, only, ur5e, write_job
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
@@ -195,16 +194,3 @@ def test_rows_that_are_not_there_say_nothing(tmp_path):
     assert check_setup(robot, replace(m, test=np.ones(50, dtype=bool)), "pose").residuals == ()
     bare = replace(m, position=None, rotation=None, sigma_position=None, sigma_orientation=None)
     assert check_setup(robot, bare, "distance", doubtful=True).residuals == ()
-
-
-@pytest.mark.slow
-def test_real_poses_raise_no_alarm(data_folder, tmp_path):
-    robot = data_folder / "ur10_tmac" / "robot.yaml"
-    job = {"robot": str(robot), "measurements": str(robot.parent / "series_b.csv"), "frame": "unknown"}
-    path = tmp_path / "job.yaml"
-    for model in ("pose", "distance-rotation"):
-        path.write_text(yaml.safe_dump(job | {"model": model, "noise": {"position": 1e-4, "orientation": 1e-4}}))
-        read = read_job(path)
-        check = check_setup(read.robot, read.measurements, read.options.model, read.options.frame, doubtful=True)
-        assert not check.far
-        assert check.explanations == ()

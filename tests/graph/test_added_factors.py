@@ -159,41 +159,34 @@ def without_last(problem):
 
 HESSIAN = gtsam.LinearContainerFactor(gtsam.HessianFactor(K3, np.eye(4), np.zeros(4), 0.0))
 EXACT = gtsam.PriorFactorVector(K3, np.zeros(4), gtsam.noiseModel.Constrained.All(4, 1e8))
+REMOVED = "problem.graph: factors removed or replaced, expected all 17 of the problem, in their places"
+WANTED = "expected a factor with a noise model of sigmas above 0, such as PriorFactorVector or CustomFactor"
+EVERY = "expected one for every variable of the graph, and no others"
+PRIOR = "problem.graph: added PriorFactorVector on K1"
+OTHER = "another value, expected"
 DAMAGES = {
-    "emptied": (lambda p: p.graph.resize(0), "problem.graph: factors removed or replaced, expected all 17 of the "
-                "problem, in their places"),
-    "one removed": (without_last, "problem.graph: factors removed or replaced, expected all 17 of the problem, in "
-                    "their places"),
-    "one replaced": (lambda p: p.graph.replace(0, prior(p)), "problem.graph: factors removed or replaced, expected "
-                     "all 17 of the problem, in their places"),
-    "longer": (lambda p: p.graph.resize(20), "problem.graph: an added NoneType, expected a factor with a noise "
-               "model of sigmas above 0, such as PriorFactorVector or CustomFactor"),
-    "no start": (lambda p: p.initial.erase(K1), "problem.initial: no value of K1, expected one for every variable of "
-                 "the graph, and no others"),
-    "a longer start": (with_value(K1, np.zeros(7)), "problem.initial: K(1): another value, expected 4 finite numbers"),
-    "a start of another type": (with_value(T0, np.zeros(6)), "problem.initial: T(0): another value, expected "
-                                "a gtsam.Pose3"),
-    "a start that is nan": (with_value(K1, np.full(4, np.nan)), "problem.initial: K(1): another value, "
-                            "expected 4 finite numbers"),
+    "emptied": (lambda p: p.graph.resize(0), REMOVED),
+    "one removed": (without_last, REMOVED),
+    "one replaced": (lambda p: p.graph.replace(0, prior(p)), REMOVED),
+    "longer": (lambda p: p.graph.resize(20), f"problem.graph: an added NoneType, {WANTED}"),
+    "no start": (lambda p: p.initial.erase(K1), f"problem.initial: no value of K1, {EVERY}"),
+    "a longer start": (with_value(K1, np.zeros(7)), f"problem.initial: K(1): {OTHER} 4 finite numbers"),
+    "a start of another type": (with_value(T0, np.zeros(6)), f"problem.initial: T(0): {OTHER} a gtsam.Pose3"),
+    "a start that is nan": (with_value(K1, np.full(4, np.nan)), f"problem.initial: K(1): {OTHER} 4 finite numbers"),
     "an added variable without a start": (with_factor(gtsam.PriorFactorPose3(ADDED, gtsam.Pose3(), UNIT(6))),
-                                          "problem.initial: no value of p7, expected one for every variable of "
-                                          "the graph, and no others"),
-    "a start without a factor": (lambda p: p.initial.insert(ADDED, np.ones(3)), "problem.initial: a value of p7, "
-                                 "expected one for every variable of the graph, and no others"),
-    "a factor of other size": (with_factor(gtsam.PriorFactorVector(K1, np.zeros(3), UNIT(3))), "problem.graph: added "
-                               "PriorFactorVector on K1: raised ValueError: NoiseModelFactor: NoiseModel has dimension "
-                               "3 instead of 4."),
-    "a factor at nan": (with_factor(gtsam.PriorFactorVector(K1, np.full(4, np.nan), UNIT(4))), "problem.graph: added "
-                        "PriorFactorVector on K1: an error of nan at the initial values, expected a finite one"),
+                                          f"problem.initial: no value of p7, {EVERY}"),
+    "a start without factor": (lambda p: p.initial.insert(ADDED, np.ones(3)),
+                               f"problem.initial: a value of p7, {EVERY}"),
+    "a factor of other size": (with_factor(gtsam.PriorFactorVector(K1, np.zeros(3), UNIT(3))), f"{PRIOR}: raised "
+                               "ValueError: NoiseModelFactor: NoiseModel has dimension 3 instead of 4."),
+    "a factor at nan": (with_factor(gtsam.PriorFactorVector(K1, np.full(4, np.nan), UNIT(4))),
+                        f"{PRIOR}: an error of nan at the initial values, expected a finite one"),
     "a factor that raises": (custom(fails), "problem.graph: added CustomFactor on K1: raised ZeroDivisionError: mine"),
     "a factor of no numbers": (custom(lambda *_: None), "problem.graph: added CustomFactor on K1: raised RuntimeError: "
                                "None is only valid for an optional Matrix pointer"),
-    "a factor without rows": (with_factor(HESSIAN), "problem.graph: an added LinearContainerFactor, expected a factor "
-                              "with a noise model of sigmas above 0, such as PriorFactorVector or CustomFactor"),
-    "an exact factor": (with_factor(EXACT), "problem.graph: an added PriorFactorVector, expected a factor with a "
-                        "noise model of sigmas above 0, such as PriorFactorVector or CustomFactor"),
-    "a sigma of 0": (lambda p: p.graph.add(prior(p, sigma=0.0)), "problem.graph: an added PriorFactorVector, expected "
-                     "a factor with a noise model of sigmas above 0, such as PriorFactorVector or CustomFactor"),
+    "a factor without rows": (with_factor(HESSIAN), f"problem.graph: an added LinearContainerFactor, {WANTED}"),
+    "an exact factor": (with_factor(EXACT), f"problem.graph: an added PriorFactorVector, {WANTED}"),
+    "sigma of 0": (lambda p: p.graph.add(prior(p, sigma=0.0)), f"problem.graph: an added PriorFactorVector, {WANTED}"),
 }  # fmt: skip
 
 

@@ -236,3 +236,24 @@ def test_an_unknown_file_is_named(write):
     with pytest.raises(InputError) as caught:
         read_measurements(write("", "poses.xlsx"), ARM)
     assert str(caught.value) == "poses.xlsx: ending '.xlsx', expected one of .csv, .parquet, .pq; save the sheet as CSV"
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet", "frame"])
+def test_a_column_is_no_pattern(tmp_path, ending):
+    """Polars takes * for all columns, and ^...$ for those that it matches."""
+    frame = pl.DataFrame({"*": [0.1], "^.*$": [0.2], "^a$": [9.0], "row of the file": [3]})
+    file = tmp_path / f"poses.{ending}"
+    if ending != "frame":
+        frame.write_csv(file) if ending == "csv" else frame.write_parquet(file)
+    given = frame if ending == "frame" else file
+    assert read_measurements(given, arm(Joint("*"), Joint("^.*$"))).readings.tolist() == [[0.1, 0.2]]
+
+
+def test_cells_of_several_types_are_all_read():
+    """None becomes an empty cell in silence."""
+    columns = {"q1": [1, 0.5], "q2": ["0.25", 1], "q3": [np.float32(0.5), 10**400], "id": [1, "b"]}
+    with pytest.raises(InputError, match=r"^frame: no table: "):
+        read_measurements(columns, ARM)
+    found = read_measurements(columns | {"q3": [0.5, 0.25]}, ARM)
+    assert found.readings.tolist() == [[1.0, 0.25, 0.5], [0.5, 1.0, 0.25]]
+    assert found.ids.tolist() == ["1", "b"]

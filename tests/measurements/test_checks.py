@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError, Measurements, Noise, Options, Robot
 from fg_calib.io import Units, read_measurements, write_csv
-from fg_calib.measurements.dataset import check_readings
+from fg_calib.measurements.dataset import _limit_hint, check_readings
 
 RNG = np.random.default_rng(3)
 N = 7
@@ -202,21 +202,16 @@ IDS = [f"p{i}" for i in range(N)]
 
 
 @pytest.mark.parametrize("make", [pl.DataFrame, pl.LazyFrame, dict])
-def test_pairs_may_be_a_frame(make):
+def test_pairs_may_be_a_frame_and_numbers_in_them_ids_or_row_numbers(make):
+    """The latter where ids are words."""
     found = Measurements.from_arrays(Q, ids=IDS, pairs=make(PAIRS)).pairs
     assert (found.a.tolist(), found.b.tolist(), found.distance.tolist()) == ([0, 1], [2, 6], [0.5, 0.25])
-
-
-@pytest.mark.parametrize("numbers", [[0, 1], np.array([0, 1]), pl.Series([0, 1])])
-def test_numbers_beside_ids_that_are_words_are_row_numbers(numbers):
-    pairs = Measurements.from_arrays(Q, ids=IDS, pairs={"a": numbers, "b": [2, 6], "angle": [0.1, 0.2]}).pairs
-    assert (pairs.a.tolist(), pairs.b.tolist()) == ([0, 1], [2, 6])
-
-
-def test_numbers_beside_ids_that_are_numbers_are_ids():
-    ids = np.arange(N) + 5
-    assert Measurements.from_arrays(Q, ids=ids, pairs={"a": [5], "b": [6], "angle": [0.1]}).pairs.a.tolist() == [0]
-    assert Measurements.from_arrays(Q, ids=ids, pairs={"a": ["5"], "b": ["6"], "angle": [0.1]}).pairs.a.tolist() == [0]
+    for numbers in ([0, 1], np.array([0, 1]), pl.Series([0, 1])):
+        pairs = Measurements.from_arrays(Q, ids=IDS, pairs={"a": numbers, "b": [2, 6], "angle": [0.1, 0.2]}).pairs
+        assert (pairs.a.tolist(), pairs.b.tolist()) == ([0, 1], [2, 6])
+    for five in (5, "5"):
+        pairs = Measurements.from_arrays(Q, ids=np.arange(N) + 5, pairs={"a": [five], "b": [6], "angle": [0.1]}).pairs
+        assert pairs.a.tolist() == [0]
 
 
 COLUMNS = {"q1": Q[:, 0], "q2": Q[:, 1]} | dict(zip("xyz", P.T, strict=True))
@@ -236,3 +231,18 @@ def test_whole_numbers_that_pandas_has_as_floats_are_names():
     assert found.ids.tolist() == [str(i) for i in range(N)]
     assert found.groups.names == tuple(str(i) for i in range(1, N))
     assert Measurements.from_arrays(Q, group=np.array(numbers, float)).groups.names == found.groups.names
+
+
+WIDEN = "widen the joint's limits if the reading is right; are the columns in the joints' order?"
+TWO = Robot.from_dh(np.zeros((2, 4)), types=["prismatic", "revolute"], limits=[(0.1, 0.9), (-1.2, 2.5)])
+
+
+@pytest.mark.parametrize(("joint", "unit", "readings", "said"), [
+    (0, "m", np.array([150.0, 850.0]), "is it in mm?"),
+    (1, "rad", np.rad2deg([-1.1, 2.4]), "is it in deg?"),
+    (1, "rad", np.rad2deg([-1.1, 2.6]), WIDEN),
+    (1, "rad", np.array([-1.1, 2.63]), WIDEN),  # just past the limit, within it as degrees
+    (1, "deg", np.rad2deg([-1.1, 2.4]), WIDEN),
+])  # fmt: skip
+def test_another_unit_is_suggested_only_where_it_explains_all_rows(joint, unit, readings, said):
+    assert _limit_hint(readings, TWO, joint, unit) == said

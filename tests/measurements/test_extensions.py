@@ -98,17 +98,12 @@ def test_a_new_instrument_and_a_new_effect_are_calibrated_and_reported(run):
 
 
 @pytest.mark.slow
-def test_what_a_new_instrument_can_identify_follows_from_its_kind(run):
+def test_a_new_instrument_is_observed_and_its_job_designed_further(run):
     text, _ = run("observe", "robot.yaml", "--model", "inclination", "--json")
     found = json.loads(text)
     assert {"theta2.gain", "theta3.gain", "theta2.square", "theta3.square"} <= set(found["independent"])
     assert set(found["ineffective"]) >= {"a1", "d1", "a2", "d2", "a3", "d3", "theta1"}
-
-
-@pytest.mark.slow
-def test_more_rows_of_a_new_instrument_are_designed_for_its_job(run):
-    text, _ = run("design", "simulated/calibration.yaml", "--n", "4", "--json")
-    assert json.loads(text)
+    assert json.loads(run("design", "simulated/calibration.yaml", "--n", "4", "--json")[0])
 
 
 @pytest.mark.slow

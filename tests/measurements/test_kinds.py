@@ -117,11 +117,6 @@ def test_predicted_data_leave_no_residuals(kind):
         assert kind.rows(at, data, nuisances).residual == pytest.approx(0.0, abs=rounding(10.0))
 
 
-def test_default_places_of_landmarks_of_two_coordinates_have_two():
-    kind = LandmarkKind("Z", "spot", "", "", units=("m", "m"), away=1.0)
-    assert kind.default_places(4, np.zeros(3), 1.0).shape == (4, 2)
-
-
 def test_the_mirror_image_of_an_anchor_is_as_far_from_points_in_a_plane():
     rng = np.random.default_rng(10)
     points, anchor = np.column_stack([rng.normal(size=(9, 2)), np.full(9, 0.3)]), np.array([0.2, 0.1, 1.3, 0.05])
@@ -240,7 +235,9 @@ def test_pack_keeps_lower_triangles():
 
 
 def test_where_nothing_is_measured_landmarks_stand_about_the_arm_as_far_away_as_they_say():
-    """Frames of landmarks are a rotation vector before the place."""
+    """Frames of landmarks are a rotation vector before the place; of two coordinates there are two."""
+    flat = LandmarkKind("Z", "spot", "", "", units=("m", "m"), away=1.0)
+    assert flat.default_places(4, np.zeros(3), 1.0).shape == (4, 2)
     for size, away in ((3, -2.0), (6, 1.5)):
         kind = LandmarkKind("Z", "z", "", "", units=("m",) * size, away=away)
         places = kind.default_places(5, np.array([3.0, 2.0, 1.0]), 0.8)

@@ -1,10 +1,9 @@
 """Covariance, chi-square and findings: closed forms, GTSAM's marginals, Monte Carlo."""
 
-import gtsam
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
+from simulated import measure, paper_robot, planar_robot, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
@@ -34,33 +33,6 @@ def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
     assert found["a1"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
     assert found["a2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
     assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
-
-
-@pytest.mark.parametrize(("model", "frame", "estimate"), [
-    ("distance-rotation", "known", []),
-    ("pose", "unknown", []),
-    ("pose", "known", TOOL),
-    ("pose", "known", ["tool.x"]),
-    ("position", "known", []),
-])  # fmt: skip
-def test_covariance_equals_gtsams_marginals_where_these_exist(model, frame, estimate):
-    rng = np.random.default_rng(0)
-    robot = paper_robot(tolerance=TOLERANCE, estimate=estimate)
-    measurements = measure(true_robot(robot, rng), 60, rng)
-    solution = solve(build_problem(robot, measurements, model=model, frame=frame))
-    uncertainty = assess(solution)
-    joint = gtsam.Marginals(solution.problem.graph, solution.values)
-    variables = solution.problem.variables
-    D = variables.named_derivative(solution.parameters)
-    for v in variables.items:
-        if v.kind == "frame":
-            sigma = np.sqrt(np.diag(joint.marginalCovariance(v.key)))
-            assert uncertainty.estimates.frame.sigma == pytest.approx(sigma, rel=1e-6)
-        else:
-            block = D[v.columns, v.columns]
-            expected = block @ joint.marginalCovariance(v.key) @ block.T
-            ours = uncertainty.covariance[v.columns, v.columns]
-            assert ours == pytest.approx(expected, rel=1e-6, abs=1e-6 * np.abs(expected).max())
 
 
 def test_without_priors_only_determined_parameters_have_a_sigma():

@@ -92,44 +92,24 @@ def test_the_hub_of_measured_pairs_is_never_held_out():
     assert found.of_pairs
 
 
-@pytest.mark.long
-def test_the_spread_is_sigma_where_measurements_determine_a_parameter():
-    """The mean square of spread / sigma: each is chi-square of 4 degrees of freedom over 4, parameters are correlated.
-
-    60 draws of 14 parameters; with as few as 60 independent figures the mean scatters by sqrt(2 / 4 / 60) = 9 %.
-    """
-    wide_open = dict.fromkeys(LARGE, 1.0)
-    squares = []
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        robot = small_arm(tolerance=wide_open, estimate=TOOL)
-        true = true_robot(small_arm(tolerance=LARGE, estimate=TOOL), rng)
-        m = measure(true, 100, rng, sigma=(1e-4, 1e-4))
-        result = calibrate(robot, m, model="pose", folds=5)
-        spread = result.result.folds.spread
-        known = (p for p in result.parameters.values() if p.identifiability == "independent")
-        squares += [(spread[p.name] / p.sigma) ** 2 for p in known]
-    assert np.mean(squares) == pytest.approx(1.0, abs=4 * 0.09)
-    assert np.mean(squares) > 0.85
-
-
 @pytest.mark.parametrize("n", [1, 0, -3, 2.5, True])
 def test_a_number_of_folds_that_cannot_be_is_one_line(n):
     with pytest.raises(InputError, match="folds: found"):
         Options.of(folds=n)
 
 
-def test_more_folds_than_configurations_are_refused():
+def test_jobs_of_which_no_fold_can_be_held_out_are_refused():
+    """Among them too many folds, and two poses without one of which no pair is left."""
     robot, m = poses(n=12)
-    with pytest.raises(InputError, match="folds: found 13, expected at most 12"):
-        cross_validate(job_of(robot, m), 13)
-
-
-def test_a_fold_that_leaves_too_little_is_named():
-    """Without one of two poses no pair is left."""
-    robot, m = poses(n=2)
-    with pytest.raises(ProblemError, match="folds: without fold 1 of 2: "):
-        cross_validate(job_of(robot, m, model="distance-rotation"), 2)
+    own = Table(m, "pose", own=(CustomMeasurements(Position(), data=m.position, sigma=1e-3),))
+    for job, n, said in (
+        (job_of(robot, m), 13, "found 13, expected at most 12"),
+        (job_of(*poses(n=2), model="distance-rotation"), 2, "without fold 1 of 2: "),
+        (job_of(robot, own), 5, "custom measurements"),
+        (job_of(robot, replace(m, test=np.ones(12, dtype=bool))), 5, "test rows alone"),
+    ):
+        with pytest.raises((InputError, ProblemError), match=f"^folds: {said}"):
+            cross_validate(job, n)
 
 
 def test_only_what_chance_does_not_explain_is_wide():
@@ -152,19 +132,6 @@ def test_an_anchor_that_few_lengths_go_to_is_never_held_out():
     assert (found.fold[of_few] == -1).all()
     assert (found.fold[~of_few] >= 0).all()
     assert found.kinds["distance"].after < 3.0 * found.kinds["distance"].noise
-
-
-def test_measurements_of_ones_own_are_refused():
-    robot, m = poses()
-    own = CustomMeasurements(Position(), data=m.position, sigma=1e-3)
-    with pytest.raises(InputError, match="folds: custom measurements"):
-        cross_validate(job_of(robot, Table(m, "pose", own=(own,))), 5)
-
-
-def test_test_rows_alone_have_nothing_to_hold_out():
-    robot, m = poses(n=20)
-    with pytest.raises(InputError, match="folds: test rows alone"):
-        cross_validate(job_of(robot, replace(m, test=np.ones(20, dtype=bool))), 5)
 
 
 def test_of_touches_the_train_rows_and_train_pairs_stay():
