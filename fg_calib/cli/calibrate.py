@@ -87,9 +87,8 @@ def _jobs_table(jobs: "Sequence[fg_calib.batch.JobSummary]", seconds: float) -> 
     kinds, rows = in_order(units), []
     for job in jobs:
         values = [job.rms.get(kind) for kind in kinds]
-        rows.append(
-            (job.name, job.verdict, job.rows, *values, job.reduced_chi2, job.seconds, "; ".join(job.reasons[:1]))
-        )
+        reason = "; ".join(job.reasons[:1])
+        rows.append((job.name, job.verdict, job.rows, *values, job.reduced_chi2, job.seconds, reason))
     columns = [f"{kind} {shown_in(units[kind]).unit}|{units[kind]}| " for kind in kinds]
     table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows, wrap=True)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())

@@ -36,18 +36,11 @@ def design(
     if out is not None:
         io.require_writable(out)
         io.require_absent(out, ["design.json"])  # before the search, which takes its time
-    choices: dict[str, Any] = {
-        "n": n,
-        "target": target,
-        "lever": lever or 0.0,
-        "fitted": None if error is None else error == "fitted",
-        "criterion": criterion,
-        "seed": seed,
-        "given": None if given is None else io.read_joint_table(given, robot, units)[1],
-        "task": None if task is None else io.read_joint_table(task, robot, units)[1],
-        **_candidates(candidates, robot, units),
-    }
-    found = designed(subject, **choices)
+    paths, fitted = {"given": given, "task": task}, None if error is None else error == "fitted"
+    choices: dict[str, Any] = {"n": n, "target": target, "lever": lever or 0.0, "criterion": criterion, "seed": seed}
+    for key, path in paths.items():
+        choices[key] = None if path is None else io.read_joint_table(path, robot, units)[1]
+    found = designed(subject, fitted=fitted, **choices, **_candidates(candidates, robot, units))
     names = report.write_design(out, found, units) if out is not None else ()
     show_result(as_json, lambda: report.design_document(found), lambda: report.build_design_report(found))
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")

@@ -225,11 +225,8 @@ def build_pool(
     among_given = np.array([name == "" and k < n_given for name, k in names])
     if n_given and not among_given.any():
         raise InputError("given", "configurations at which nothing is measured", "a job with what was touched")
-    formed = {
-        k: (i.model, i.pairing or Pairing())
-        for k, i in enumerate(scenario.instruments)
-        if i.model in PAIR_MODELS and i.sockets is None
-    }
+    own = [(k, i) for k, i in enumerate(scenario.instruments) if i.model in PAIR_MODELS and i.sockets is None]
+    formed = {k: (i.model, i.pairing or Pairing()) for k, i in own}
     more = {"scenario": scenario, "tables": tables, "found": found, "before": before, "formed": formed}
     pool = pool_of(problem, np.arange(len(names)), scenario.source, alone=before is None, **more)
     given_poses = pool.pose_of[among_given & (pool.pose_of >= 0)]

@@ -422,14 +422,11 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
     """
     path = Path(path)
     io.require_absent(path.parent, [path.name])
-    columns: dict[str, Any] = {
-        "id": np.array(stops.ids),
-        "begin": np.round(stops.interval[:, 0], 3),
-        "seconds": np.round(np.diff(stops.interval, axis=1)[:, 0], 3),
-        "samples": stops.samples.astype(np.int64),
-        **dict(zip(io.joint_columns(robot), stops.means["joint"].T, strict=True)),
-        **dict(zip("xyz", stops.means["position"].T, strict=True)),
-    }
+    begin, seconds = np.round(stops.interval[:, 0], 3), np.round(np.diff(stops.interval, axis=1)[:, 0], 3)
+    columns: dict[str, Any] = {"id": np.array(stops.ids), "begin": begin, "seconds": seconds}
+    columns |= {"samples": stops.samples.astype(np.int64)}
+    for names, kind in ((io.joint_columns(robot), "joint"), ("xyz", "position")):
+        columns |= dict(zip(names, stops.means[kind].T, strict=True))
     if "orientation" in stops.means:
         quaternion = Rotation.from_matrix(stops.means["orientation"]).as_quat(canonical=True)
         columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
@@ -615,11 +612,7 @@ def _sort(
     stamps, first = np.unique(stamps, return_index=True)
     if len(stamps) < 2:
         raise InputError(place, f"{len(stamps)} different stamps with finite values", "a recording")
-    found = {
-        **counts,
-        "with nan left out": np.sum(~finite),
-        "out of order put in order": np.sum(back > 0.0),
-        "with the stamp of another left out": len(values) - len(first),
-    }
+    found = {**counts, "with nan left out": np.sum(~finite), "out of order put in order": np.sum(back > 0.0)}
+    found["with the stamp of another left out"] = len(values) - len(first)
     notes += [f"{n} message{'s' * int(n != 1)} {what}" for what, n in found.items() if n]
     return stamps, values[first], Source(*topic, lag, tuple(notes))

@@ -247,13 +247,10 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     joint = float(f"{1e-4 / factors['angle']:.2g}") if any(table.repeats for table in tables) else 0.0
     arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
     tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
-    return _TEMPLATE.format(
-        robot=_path(found["robot"][0], out.parent),
-        notes=_NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool)),
-        entries="\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent)),
-        units=_flow(units),
-        noise=_flow({**noise, "joint": joint, "estimate": True}),
-    )
+    place, noises = _path(found["robot"][0], out.parent), _flow({**noise, "joint": joint, "estimate": True})
+    notes = _NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool))
+    entries = "\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent))
+    return _TEMPLATE.format(robot=place, notes=notes, entries=entries, units=_flow(units), noise=noises)
 
 
 def _sort(files: Sequence[Path]) -> dict[str, list[Path]]:

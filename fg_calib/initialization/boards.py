@@ -111,9 +111,8 @@ def _scaled(points: Floats) -> tuple[Floats, Floats]:
     """Points about their middle and of size 1 (Hartley 1997), and the matrix that makes them so."""
     middle = points.mean(axis=0)
     size = np.sqrt(2.0) / max(float(np.mean(np.linalg.norm(points - middle, axis=1))), 1e-300)
-    return (points - middle) * size, np.array(
-        [[size, 0.0, -size * middle[0]], [0.0, size, -size * middle[1]], [0.0, 0.0, 1.0]]
-    )
+    M = np.array([[size, 0.0, -size * middle[0]], [0.0, size, -size * middle[1]], [0.0, 0.0, 1.0]])
+    return (points - middle) * size, M
 
 
 def _two_poses(H: Floats, points: Floats, seen: Floats) -> list[Frame]:

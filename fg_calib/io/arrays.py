@@ -12,17 +12,9 @@ from fg_calib.io.tables import OF_CONFIGURATIONS, OF_PAIRS, ROUNDED, Table, meas
 from fg_calib.io.yaml import Units
 
 COLUMNS: Mapping[str, str] = {
-    "ids": "id",
-    "test": "split",
-    "position": "x",
-    "quaternion": "qx",
-    "roll_pitch_yaw": "roll",
-    "pixel": "u",
-    "corner": "corner_x",
-    "covariance": "cov_11",
-    "sigma_position": "sigma_x",
-    "sigma_orientation": "sigma_rx",
-    "sigma_pixel": "sigma_u",
+    **{"ids": "id", "test": "split", "position": "x", "quaternion": "qx", "roll_pitch_yaw": "roll"},
+    **{"pixel": "u", "corner": "corner_x", "covariance": "cov_11"},
+    **{"sigma_position": "sigma_x", "sigma_orientation": "sigma_rx", "sigma_pixel": "sigma_u"},
 }
 """First column of each array that holds several, or whose name is not that of its column."""
 

@@ -280,16 +280,10 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
     own, estimated = _noise(entry.noise, entry.units, robot, f"{place}: noise")
     if estimated:
         raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the job")
-    measurements = read_measurements(
-        folder / entry.table,
-        robot,
-        pairs=None if entry.pairs is None else folder / entry.pairs,
-        units=entry.units,
-        noise=noise.updated(**{key: own.get(key) for key in entry.noise or ()}),
-        model=model,
-        columns=entry.columns,
-        skip_lines=entry.skip_lines,
-    )
+    pairs = None if entry.pairs is None else folder / entry.pairs
+    noise = noise.updated(**{key: own.get(key) for key in entry.noise or ()})
+    how: dict[str, Any] = {"units": entry.units, "columns": entry.columns, "skip_lines": entry.skip_lines}
+    measurements = read_measurements(folder / entry.table, robot, pairs=pairs, noise=noise, model=model, **how)
     camera, fixed = camera_in(file.camera if entry.camera == "fixed" else entry.camera, f"{place}: camera", folder)
     options = INSTRUMENTS[model].options
     known, offset = _known_points(file, model, of_job), "offset" in options and entry.offset == "estimate"
@@ -442,15 +436,9 @@ def joint_noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[flo
 
 
 _INTRINSICS: dict[str, Any] = {f.name: (Number, ... if f.default is MISSING else f.default) for f in fields(Camera)}
-_Camera = create_model(
-    "_Camera",
-    __base__=Schema,
-    **_INTRINSICS,
-    width=(Count | None, None),
-    height=(Count | None, None),
-    sigma=(dict[str, NotNegative] | None, None),
-    fixed=(StrictBool, False),
-)
+_SIZE: dict[str, Any] = dict.fromkeys(("width", "height"), (Count | None, None))
+_KNOWN: dict[str, Any] = {"sigma": (dict[str, NotNegative] | None, None), "fixed": (StrictBool, False)}
+_Camera = create_model("_Camera", __base__=Schema, **_INTRINSICS, **_SIZE, **_KNOWN)
 """A camera's file: its intrinsics, the size of its images, and how well it is known."""
 
 

@@ -493,18 +493,10 @@ def measurements_of(
         between, of_groups = _read_pairs(pairs, (ids, test, groups), units, noise)
     if not groups.names:
         measured["sigmas"].pop("point", None)
-    return Measurements(
-        readings=readings,
-        ids=ids,
-        test=test,
-        sigma_joint=_joint_sigma(noise.joint, readings.shape[1]),
-        pairs=between,
-        source=table.name,
-        groups=Groups(groups.names, groups.index, of_groups) if groups.names else None,
-        named="id" in table.columns,
-        labels=labels,
-        **measured,
-    )
+    sigma_joint = _joint_sigma(noise.joint, readings.shape[1])
+    touched = Groups(groups.names, groups.index, of_groups) if groups.names else None
+    more: dict[str, Any] = {"pairs": between, "source": table.name, "groups": touched, "named": "id" in table.columns}
+    return Measurements(readings, ids, test, sigma_joint=sigma_joint, labels=labels, **more, **measured)
 
 
 def _joint_sigma(given: float | tuple[float, ...], n_joints: int) -> Floats:
@@ -543,13 +535,10 @@ def find_joint_columns(table: Table, robot: Robot) -> tuple[str, ...]:
     if {name for name in found if re.fullmatch(r"q\d+", name)} == set(numbered):
         return numbered
     expected = "q1" if len(numbered) == 1 else f"q1 to {numbered[-1]}"
-    raise InputError(
-        table.name,
-        f"{len(found)} joint columns ({', '.join(found)})" if found else "no joint columns",
-        f"{expected} for the robot's {robot.n_joints} joints"
-        + (f", or their names {', '.join(names)}" if names not in {(), numbered} else ""),
-        f"the columns are {', '.join(table.columns)}",
-    )
+    what = f"{len(found)} joint columns ({', '.join(found)})" if found else "no joint columns"
+    by_name = f", or their names {', '.join(names)}" if names not in {(), numbered} else ""
+    wanted = f"{expected} for the robot's {robot.n_joints} joints{by_name}"
+    raise InputError(table.name, what, wanted, f"the columns are {', '.join(table.columns)}")
 
 
 def read_readings(table: Table, columns: Sequence[str], robot: Robot, units: Units) -> Floats:

@@ -247,9 +247,8 @@ def _rows_of(table: Table) -> tuple[Integers, dict[str, Floats]]:
         ends = np.sort(np.stack([pairs.a, pairs.b], axis=1), axis=1)
         values = {name: getattr(pairs, name) for name in instrument.noise}
     at = np.hstack([m.readings[k] for k in ends.T])
-    return ends, {
-        name: np.hstack([at, v.reshape(len(at), math.prod(v.shape[1:]))]) for name, v in values.items() if v is not None
-    }
+    rows = {name: v.reshape(len(at), math.prod(v.shape[1:])) for name, v in values.items() if v is not None}
+    return ends, {name: np.hstack([at, v]) for name, v in rows.items()}
 
 
 def _check_known(tables: Sequence[Table]) -> None:
@@ -340,9 +339,8 @@ def start_frames(robot: Robot, data: Dataset, tool: Frame, free: Booleans) -> Fr
     start = FrameStart(tool, free, data.landmarks.start)
     chain, trigs = build_chain(robot), data.trigs(robot)
     of_model = [(n, table, INSTRUMENTS[table.model]) for n, table in enumerate(data.tables) if table.model is not None]
-    for number, table, one in sorted(
-        of_model, key=lambda of: -of[2].is_pose * (of[2].sees_position + of[2].sees_orientation)
-    ):
+    of_model = sorted(of_model, key=lambda of: -of[2].is_pose * (of[2].sees_position + of[2].sees_orientation))
+    for number, table, one in of_model:
         flange = forward(chain, trigs[number])
         start.begin(number, table.unknown_frame, (flange.rotation, flange.position))
         one.start_frames(start, table, [block for block in data.blocks if block.table == number], data.landmarks)

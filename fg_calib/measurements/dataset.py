@@ -214,9 +214,8 @@ class Measurements(FrozenArrays):
 
     def select(self, rows: Integers) -> "Measurements":
         """Some rows, with what was measured at them; nothing that was measured between configurations."""
-        rows_of: dict[str, Any] = {
-            name: v[rows] for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "sigma_joint"
-        }
+        arrays = {name: v for name, v in vars(self).items() if isinstance(v, np.ndarray) and name != "sigma_joint"}
+        rows_of: dict[str, Any] = {name: v[rows] for name, v in arrays.items()}
         names = "columns", "sigmas", "context"
         named: dict[str, Any] = {of: {k: v[rows] for k, v in getattr(self, of).items()} for of in names}
         labels = {name: of.of(rows) for name, of in self.labels.items()}

@@ -163,9 +163,8 @@ def _judge(
     p_value = upper_probability(at.chi2 / at.dof, at.dof, of_noise) if at.dof > 0 else None
     reasons, cautions = ([few], []) if few else _reasons(at, p_value, likely, rms, limit)
     if gross:
-        cautions.insert(
-            0, f"gross errors at {', '.join(gross)}: left out here; delete them before update, measure again"
-        )
+        left_out = "left out here; delete them before update, measure again"
+        cautions.insert(0, f"gross errors at {', '.join(gross)}: {left_out}")
     unjudged = [kind for kind in limit if kind not in rms or rms[kind].n < LEAST]
     verdict: Verdict = "not_evaluated" if few else "fail" if reasons else "pass"
     if verdict == "pass" and unjudged:

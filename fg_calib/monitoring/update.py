@@ -98,10 +98,8 @@ def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequenc
     kinds = {p.name: tolerance_kind(p) or "" for p in known.robot.parameters}
     names, free = known.variables.names, dict.fromkeys(known.robot.own_names(changed), 1.0)
     of_kinds = sorted({kinds[name] for name in names if kinds[name]})
-    for key, given, possible in (
-        ("growth", growth, [*names, *of_kinds]),
-        ("changed", free, list(named_changes(known.variables))),
-    ):
+    changes = list(named_changes(known.variables))
+    for key, given, possible in (("growth", growth, [*names, *of_kinds]), ("changed", free, changes)):
         for name in given:
             if name not in possible:
                 hint = did_you_mean(name, possible, NEAR)

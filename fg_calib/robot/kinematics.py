@@ -194,21 +194,13 @@ def build_chain(
             elements += _tangent(base_tangent)
     elements += _tangent(tool_tangent)
     n_columns = len(columns) + 6 * sum(t is not None for t in (tool_tangent, base_tangent, frame_tangent))
-    chain = Chain(
-        axis=np.array([e.axis for e, _, _ in elements], dtype=np.int8),
-        constant=np.array([e.constant for e, _, _ in elements]),
-        sign=np.array([float(e.sign) for e, _, _ in elements]),
-        source=np.array([source for _, source, _ in elements], dtype=np.int64),
-        value=np.zeros(len(elements)),
-        joint=np.array([_joint_of(e) for e, _, _ in elements], dtype=np.int64),
-        basis=np.array(
-            [-1 if e.basis is None else robot.n_joints + e.basis.term for e, _, _ in elements], dtype=np.int64
-        ),
-        column=np.array([column for _, _, column in elements], dtype=np.int64),
-        n_columns=n_columns,
-        n_joints=robot.n_joints,
-        curves=_curves(robot),
-    )
+    terms = [-1 if e.basis is None else robot.n_joints + e.basis.term for e, _, _ in elements]
+    numbers = zip(*((k, _joint_of(e), term, c) for (e, k, c), term in zip(elements, terms, strict=True)), strict=True)
+    sources, joint, basis, column = (np.array(each, dtype=np.int64) for each in numbers)
+    constant, sign = np.array([(e.constant, float(e.sign)) for e, _, _ in elements]).T.copy()
+    axis, value = np.array([e.axis for e, _, _ in elements], dtype=np.int8), np.zeros(len(elements))
+    sizes, curves = (n_columns, robot.n_joints), _curves(robot)
+    chain = Chain(axis, constant, sign, sources, value, joint, basis, column, *sizes, curves=curves)
     changing = set(columns) | set(range(n_parameters, n_parameters + 6))
     changing |= set(() if tool_tangent is None else tool) | set(() if base_tangent is None else base)
     chain = replace(chain, value=chain.values(np.concatenate([robot.nominal, np.zeros(6)])))

@@ -176,9 +176,8 @@ def _read(kind: Any, given: object, place: str, context: FileContext | None) -> 
 def schema(cls: type[Class]) -> type[Class]:
     """Make a frozen dataclass whose fields are validated: from Python in SI, from a file in the file's units."""
     keys = dict.fromkeys(key for c in reversed(cls.__mro__) for key in vars(c).get("__annotations__", {}))
-    refuse: Any = io.refuse_unknown_keys(
-        *("pose" if cls.__name__ == "BoardViews" and k == "board" else k for k in keys)
-    )
+    in_file = ("pose" if cls.__name__ == "BoardViews" and k == "board" else k for k in keys)
+    refuse: Any = io.refuse_unknown_keys(*in_file)
     unknown: Any = classmethod(lambda _, value: refuse(value))
     cls.refuse_unknown = pydantic.model_validator(mode="before")(unknown)  # type: ignore[attr-defined]
     config = pydantic.ConfigDict(extra="forbid", allow_inf_nan=False, populate_by_name=True)

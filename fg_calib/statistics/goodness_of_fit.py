@@ -427,9 +427,8 @@ class RowStatistics:
         able = test & (self.leverage >= LEAST_VARIANCE - 1.0)
         if not able.any():
             return None
-        numbers = (
-            np.sort(table.measurement_number[of]) for of in (part.rows, able)
-        )  # np.unique takes a second for 10^6
+        # np.unique takes a second for 10^6
+        numbers = (np.sort(table.measurement_number[of]) for of in (part.rows, able))
         n_judged, n_measurements = (int(np.count_nonzero(np.diff(number, prepend=-1))) for number in numbers)
         chosen = np.arange(n)
         if part.covariance is not None and n:
@@ -477,9 +476,8 @@ class RowStatistics:
     def _specified_variance(self) -> Floats:
         """Variance of each row by the noise as specified, shape (n,)."""
         variance, problem = self.table.sigma**2, replace(self.solution.problem, state=NoiseState())
-        for number, noise in enumerate(
-            noises_at(problem, self.solution.parameters) if self.solution.problem.state.factors else ()
-        ):
+        noises = noises_at(problem, self.solution.parameters) if self.solution.problem.state.factors else ()
+        for number, noise in enumerate(noises):
             variance[self.table.rows_of(number)] = noise.sigma[noise.block.measured] ** 2
         return variance
 

@@ -114,9 +114,8 @@ def estimate_tolerances(
     solution, (theta, found, follow) = settle(refit, len(groups), SETTLED, "tolerances")
     figures = (v.tolist() for v in (*np.exp([theta, *found.interval]), found.mean.determined))
     scales = tuple(graph.ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
-    return replace(
-        solution, estimated_tolerances=graph.ToleranceScales(scales, follow @ found.added_covariance @ follow.T)
-    )
+    added = follow @ found.added_covariance @ follow.T
+    return replace(solution, estimated_tolerances=graph.ToleranceScales(scales, added))
 
 
 class Corrections(Record):
@@ -165,9 +164,8 @@ class ScalePosterior:
         self.determined: Floats = member @ (1.0 - np.diag(C))
         square = member @ (a**2 + np.diag(C))
         self.gradient: Floats = square - member.sum(axis=1) - prior @ theta
-        self.hessian: Floats = (
-            member @ (4.0 * a[:, None] * C * a + 2.0 * C**2) @ member.T - np.diag(2.0 * square) - prior
-        )
+        both = member @ (4.0 * a[:, None] * C * a + 2.0 * C**2) @ member.T
+        self.hessian: Floats = both - np.diag(2.0 * square) - prior
 
 
 class EstimatedScales(Record):
@@ -398,11 +396,8 @@ def _with_scales(problem: graph.Problem, by: SharedScale, scales: Mapping[str, f
         by: Grouping of parameters that share a scale.
         scales: Factor on the tolerances of each group.
     """
-    parameters = tuple(
-        p
-        if p.tolerance is None
-        else replace(p, tolerance=p.tolerance * scales.get(_group_of(problem.robot, p, by), 1.0))
-        for p in problem.robot.parameters
-    )
+    factors = [scales.get(_group_of(problem.robot, p, by), 1.0) for p in problem.robot.parameters]
+    each = zip(problem.robot.parameters, factors, strict=True)
+    parameters = tuple(p if p.tolerance is None else replace(p, tolerance=p.tolerance * f) for p, f in each)
     robot = replace(problem.robot, parameters=parameters)
     return graph.with_factors(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))

@@ -291,10 +291,8 @@ class ResidualTable(FrozenArrays):
                 table, few = labels[number] if len(labels) > 1 else "", len(rows) < ROWS_PER_FITTED * self.n_fitted
                 sizes = (self._lengths(rows, v) for v in (self.before, self.after, self.sigma))
                 before, after, noise = map(root_mean_square, sizes)
-                n, wrong = (
-                    int(np.sum(self.begins[rows])),
-                    self.named(rows[:0] if suspect is None else rows[suspect[rows]]),
-                )
+                wrong = self.named(rows[:0] if suspect is None else rows[suspect[rows]])
+                n = int(np.sum(self.begins[rows]))
                 found.append(HeldOut(table, family, n, before, after, noise, few, outliers=wrong))
         return tuple(found)
 
@@ -322,7 +320,7 @@ def residual_table(solution: Solution) -> ResidualTable:
     before = [noise.residual() for noise in noises_at(problem, solution.before)]
     kinds: dict[RowKind, int] = {}
     reasons, labels = {"": 0}, {"": 0}
-    columns: list[dict[str, NDArray[Any]]] = []
+    columns = list[dict[str, Any]]()
     for number, (s, old, new) in enumerate(zip(data.blocks, before, solution.noises, strict=True)):
         names = zip(s.kind.names, s.kind.units, strict=True)
         codes = np.array([kinds.setdefault(RowKind(*name, s.table), len(kinds)) for name in names], dtype=np.int16)
@@ -331,36 +329,18 @@ def residual_table(solution: Solution) -> ResidualTable:
             excluded[mask] = reasons.setdefault(reason, len(reasons))
         m, k = (index.astype(np.int32) for index in np.nonzero(s.measured))  # measurement and component of each row
         a, b = _ends(data.places[s.table][s.ends], data.landmarks.owners[s.nuisances], data.n_configurations)
-        columns.append(
-            {
-                "kind_code": codes[k],
-                "block": np.full(len(m), number, dtype=np.int16),
-                "measurement": m,
-                "row": k.astype(np.int16),
-                "a": a[m],
-                "b": b[m],
-                "label_code": _codes(s.of, labels, s.n)[m],
-                "table_row": _table_rows(s, data.tables[s.table].measurements.part)[m],
-                "test": s.test[m],
-                "reason_code": excluded[m],
-                "measured": s.kind.figures(s.data)[m, k],
-                "before": old[m, k],
-                "after": new.residual()[m, k],
-                "excess": new.excess[m, k],
-                "sigma": new.sigma[m, k],
-            }
-        )
+        which = {"kind_code": codes[k], "block": np.full(len(m), number, dtype=np.int16), "measurement": m}
+        labelled = {"a": a[m], "b": b[m], "label_code": _codes(s.of, labels, s.n)[m]}
+        table_row = _table_rows(s, data.tables[s.table].measurements.part)[m]
+        rows = {"row": k.astype(np.int16), "table_row": table_row, "test": s.test[m], "reason_code": excluded[m]}
+        values = {"measured": s.kind.figures(s.data)[m, k], "before": old[m, k], "after": new.residual()[m, k]}
+        noise = {"excess": new.excess[m, k], "sigma": new.sigma[m, k]}
+        columns.append({**which, **labelled, **rows, **values, **noise})
     together = {name: np.concatenate([c.pop(name) for c in columns]) for name in list(columns[0])}  # never all twice
-    return ResidualTable(
-        kinds=tuple(kinds),
-        names=data.names,
-        labels=tuple(labels),
-        reasons=tuple(reasons),
-        seen=_at_fitted_readings(data.readings, together) & (not problem.evaluated),
-        evaluated=problem.evaluated,
-        n_fitted=len(problem.variables.all_scales) if problem.evaluated else 0,
-        **together,
-    )
+    seen = _at_fitted_readings(data.readings, together) & (not problem.evaluated)
+    found: dict[str, Any] = {"kinds": tuple(kinds), "labels": tuple(labels), "reasons": tuple(reasons), **together}
+    evaluated, n_fitted = problem.evaluated, len(problem.variables.all_scales) if problem.evaluated else 0
+    return ResidualTable(names=data.names, seen=seen, evaluated=evaluated, n_fitted=n_fitted, **found)
 
 
 def _at_fitted_readings(readings: Floats, rows: dict[str, NDArray[Any]]) -> Booleans:

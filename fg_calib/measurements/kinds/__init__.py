@@ -9,11 +9,8 @@ from fg_calib.inputs import MODELS
 from fg_calib.measurements import UNKNOWN, LandmarkKind
 from fg_calib.measurements.kinds.instrument import Column, Instrument
 
-INSTRUMENTS: dict[str, Instrument] = {
-    instrument.model: instrument
-    for module in dict.fromkeys(MODELS.values())
-    for instrument in import_module(f"fg_calib.measurements.kinds.{module}").INSTRUMENTS
-}
+_MODULES = [import_module(f"fg_calib.measurements.kinds.{module}") for module in dict.fromkeys(MODELS.values())]
+INSTRUMENTS: dict[str, Instrument] = {one.model: one for module in _MODULES for one in module.INSTRUMENTS}
 """The instrument of each model."""
 
 _KINDS = dict.fromkeys((UNKNOWN, *(kind for one in INSTRUMENTS.values() for kind in one.landmarks)))
@@ -23,7 +20,6 @@ LANDMARKS: dict[str, LandmarkKind] = {kind.letter: kind for kind in _KINDS}
 if len(LANDMARKS) < len(_KINDS):
     raise ValueError(f"two kinds of landmarks have one letter: {' '.join(sorted(kind.letter for kind in _KINDS))}")
 
-GENERIC_COLUMNS: dict[str, Column] = {
-    column.names[0]: column for one in INSTRUMENTS.values() for column in one.columns if column.generic
-}
+_COLUMNS = [column for one in INSTRUMENTS.values() for column in one.columns if column.generic]
+GENERIC_COLUMNS: dict[str, Column] = {column.names[0]: column for column in _COLUMNS}
 """Columns that `Measurements.columns` holds, which are kinds of noise too."""

@@ -12,14 +12,8 @@ from fg_calib.measurements.kinds.instrument import LENGTH_COLUMNS, Blocks, Colum
 ANCHOR = LandmarkKind(
     "A", "anchor", "Anchors (in the base frame), mm", key="anchors", away=2.0, n_configurations=4, stays=True
 )
-OFFSET = LandmarkKind(
-    "O",
-    "offset",
-    "Offsets of instruments on lengths, mm",
-    "what the instrument adds to every length",
-    units=("m",),
-    is_one=True,
-)
+_OFFSETS = "Offsets of instruments on lengths, mm"
+OFFSET = LandmarkKind("O", "offset", _OFFSETS, "what the instrument adds to every length", units=("m",), is_one=True)
 
 LEAST_LENGTHS = 4
 """Lengths that distinguish an anchor from its mirror image."""

@@ -12,14 +12,9 @@ from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument
 from fg_calib.measurements.kinds.pose import ORIENTATION, POSE_COLUMNS, POSITION
 from fg_calib.robot import cross_matrix, inverse_right_jacobian, left_jacobian
 
-BOARD: LandmarkKind = LandmarkKind(
-    "B",
-    "board",
-    "Boards (in the base frame: rotation vector in deg, position in mm)",
-    units=("rad", "rad", "rad", "m", "m", "m"),
-    away=2.0,
-    n_configurations=2,
-)
+_BOARDS = "Boards (in the base frame: rotation vector in deg, position in mm)"
+_UNITS = ("rad", "rad", "rad", "m", "m", "m")
+BOARD: LandmarkKind = LandmarkKind("B", "board", _BOARDS, units=_UNITS, away=2.0, n_configurations=2)
 BOARD_COLUMN: Column = Column(("board",), "", "Which board was seen, where there are several")
 
 COVARIANCE = tuple(f"cov_{i}{j}" for i in range(1, 7) for j in range(i, 7))

@@ -21,14 +21,9 @@ def normal_and_distance(behind: Floats, through: Floats, covariance: Floats) -> 
 
 
 BEHIND = LandmarkKind("C", "point behind a plane", "", "", column="plane", away=-3.0, is_constant=True)
+_PLANES = "Planes (unit normal in the base frame, distance from the base in mm)"
 PLANE = LandmarkKind(
-    "F",
-    "plane",
-    "Planes (unit normal in the base frame, distance from the base in mm)",
-    away=-2.0,
-    n_configurations=4,
-    reference=BEHIND,
-    estimate=normal_and_distance,
+    "F", "plane", _PLANES, away=-2.0, n_configurations=4, reference=BEHIND, estimate=normal_and_distance
 )
 
 

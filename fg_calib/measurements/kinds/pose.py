@@ -9,15 +9,8 @@ from fg_calib.measurements import Frames, Kind, LandmarkKind, Landmarks, Rows, T
 from fg_calib.measurements.kinds.instrument import Blocks, Column, Instrument, Kinds, Quantity
 from fg_calib.robot import cross_matrix, inverse_right_jacobian, kernels
 
-TARGET = LandmarkKind(
-    "P",
-    "target",
-    "Targets (in the tool frame), mm",
-    "the unknown places of the targets on the tool",
-    key="targets",
-    n_configurations=2,
-    stays=True,
-)
+_TARGETS, _PLACES = "Targets (in the tool frame), mm", "the unknown places of the targets on the tool"
+TARGET = LandmarkKind("P", "target", _TARGETS, _PLACES, key="targets", n_configurations=2, stays=True)
 
 POSE_COLUMNS = (
     Column(("x", "y", "z"), "length", "Measured position; of model board that of the board before the camera"),
