@@ -41,6 +41,9 @@ Joints = Literal["all"] | Sequence[int]
 LEAST_MOVE = 1e-4
 """Smallest move that takes a gear to its opposite flank, [rad]."""
 
+LEAST_LENGTH = 0.02
+"""Length that grows with temperature, [m]: shorter ones do by a micrometre, and zeros do not stay zero."""
+
 GRAVITY = (0.0, 0.0, -9.81)
 """Of a base that stands upright, [m/s^2]."""
 
@@ -350,7 +353,7 @@ class Thermal(Effect, Record):
 
     Attributes:
         reference: Temperature at which nominal values hold, in the unit of the column.
-        lengths: Whether lengths grow: value (1 + expansion (T - reference)).
+        lengths: Whether lengths of 2 cm or more grow: value (1 + expansion (T - reference)).
         zeros: Whether joint zeros drift.
         column: The column of the temperature.
     """
@@ -361,12 +364,12 @@ class Thermal(Effect, Record):
     column: str = "temperature"
 
     def _lengths(self, robot: Robot) -> list[tuple[int, int]]:
-        """Element and parameter of each length of the joints that is not zero."""
+        """Element and parameter of each length of the joints that grows: none that a calibration may find, or lose."""
         found = []
         for i, e in enumerate(robot.elements):
             if self.lengths and e.axis < Axis.RX and e.parameter is not None:
                 p = robot.parameters[e.parameter]
-                if 1 <= p.owner <= robot.n_joints and p.nominal != 0.0:
+                if 1 <= p.owner <= robot.n_joints and abs(p.nominal) >= LEAST_LENGTH:
                     found.append((i, e.parameter))
         return found
 

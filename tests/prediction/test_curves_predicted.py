@@ -219,3 +219,10 @@ def test_tables_to_predict_at_may_have_what_effects_depend_on(tmp_path):
     _, readings, context = read_joint_table(tmp_path / "at.csv", robot)
     assert {name: values.tolist() for name, values in context.items()} == {"temperature": [30.0, 31.0]}
     assert robot.trig(readings, context)[:, robot.n_joints :, 0].T.tolist() == [[10.0, 11.0]] * 4 + [[0.0, 0.0]]
+
+
+def test_lengths_that_a_calibration_finds_do_not_grow_with_temperature():
+    robot = Robot.from_dh([(0.0, 1.4, 0.3, 0.2), (0.5, 0.2, 0.0, -0.3)], "dh").with_effects(Thermal())
+    moved = robot.with_values(robot.nominal + 1e-4)
+    found = moved.trig(np.zeros((1, 2)), {"temperature": np.array([21.0])})[0, 2:, 0]
+    assert found == pytest.approx([0.3001, 0.5001])  # d1, a2
