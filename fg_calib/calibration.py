@@ -330,13 +330,8 @@ class Calibration(Record, repr=False, eq=False):
         if growth and days is None:
             raise InputError("growth", "the calibration has no date", "one that this version of fg-calib wrote")
         table, digests = self._rows(rows, pairs, like)
-        add = partial(
-            updated,
-            self.calibrated,
-            growth={name: size * float(np.sqrt(days or 0.0)) for name, size in (growth or {}).items()},
-            changed=names,
-            anchors_stay=anchors_stay,
-        )
+        grown = {name: size * float(np.sqrt(days or 0.0)) for name, size in (growth or {}).items()}
+        add = partial(updated, self.calibrated, growth=grown, changed=names, anchors_stay=anchors_stay)
         found = add(table)
         uncertainty = assess(found)
         if uncertainty.acceptance is not None and not names:

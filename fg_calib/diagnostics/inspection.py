@@ -222,22 +222,14 @@ def _survey(problem: Problem, number: int, table: Table) -> TableSurvey:
             n_residuals[name.partition(".")[0]] += int(n)
     labels = {what: len(of.names) for what, of in m.labels.items()}
     places = np.unique(problem.data.places[number])
-    return TableSurvey(
-        name=problem.data.labels[number],
-        model=table.model,
-        n_rows=m.n_configurations,
-        n_configurations=len(places),
-        n_test=int(m.test.sum()),
-        n_pairs=len({k for s in blocks if s.kind.ends == 2 for k in s.number[s.train].tolist()}),
-        n_test_pairs=len({k for s in blocks if s.kind.ends == 2 for k in s.number[s.test].tolist()}),
-        n_residuals=dict(n_residuals),
-        labels=labels | ({} if m.groups is None else {"contact point": len(m.groups.names)}),
-        n_copies=copies,
-        copy=copy,
-        n_repeats=repeats,
-        n_leaked=_n_leaked(m),
-        n_renamed=len(places) - len(np.unique(same_readings(problem.data.readings[places]))),
-    )
+    with_pairs = [s for s in blocks if s.kind.ends == 2]
+    n_pairs = len({k for s in with_pairs for k in s.number[s.train].tolist()})
+    n_test_pairs = len({k for s in with_pairs for k in s.number[s.test].tolist()})
+    labels |= {} if m.groups is None else {"contact point": len(m.groups.names)}
+    n_renamed = len(places) - len(np.unique(same_readings(problem.data.readings[places])))
+    counts = (m.n_configurations, len(places), int(m.test.sum()), n_pairs, n_test_pairs, dict(n_residuals), labels)
+    copied = (copies, copy, repeats, _n_leaked(m), n_renamed)
+    return TableSurvey(problem.data.labels[number], table.model, *counts, *copied)
 
 
 def _n_leaked(m: Measurements) -> int:

@@ -1,7 +1,5 @@
 """The exceptions of the package: each message is one line that a user can act on."""
 
-from __future__ import annotations
-
 from reprlib import Repr
 
 
@@ -48,7 +46,7 @@ class InputError(CalibrationError):
         message += f"; {_part(hint)}" if hint else ""
         super().__init__(message)
 
-    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str, str]]:
+    def __reduce__(self) -> "tuple[type[InputError], tuple[str, str, str, str]]":
         """How it is pickled: it is made of more than its message, and comes back from a worker process."""
         return type(self), (self.place, self.found, self.expected, self.hint)
 

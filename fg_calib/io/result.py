@@ -11,8 +11,6 @@ The folder of a calibration: `result.json`, the calibrated robot and its tables,
 | `joints.csv` | an estimated joint position of a configuration, in [rad] (prismatic: [m]) |
 """
 
-from __future__ import annotations
-
 import json
 import math
 import platform
@@ -199,7 +197,7 @@ class Knowledge(Section):
     right: Floats
     views: tuple[tuple[Model, FrameKnowledge], ...] = ()
     parameters: Floats = of("robot.nominal")
-    nominal: Knowledge | None = None
+    nominal: "Knowledge | None" = None
 
 
 class Carried(Section):
@@ -324,7 +322,7 @@ class Result(Section):
         history: tuple[Run, ...] = (),
         notes: tuple[str, ...] = (),
         effects: tuple[EffectTest, ...] = (),
-    ) -> Result:
+    ) -> "Result":
         """The result of a solution and its assessment.
 
         Args:
@@ -382,17 +380,11 @@ class Result(Section):
     def run(self) -> Run:
         """This result as one run of a history."""
         known = set(self.covariance.names)
-        return Run(
-            date=self.date,
-            n_residuals=self.n_residuals,
-            chi2=self.chi2,
-            dof=self.dof,
-            p_value=self.chi2_p_value,
-            verdict="good" if self.trustworthy else "doubtful",
-            parameters={p.name: (p.estimate, p.sigma, p.unit) for p in self.parameters if p.name in known},
-            inputs=self.inputs,
-            rows=self.carried.rows,
-        )
+        verdict: Literal["good", "doubtful"] = "good" if self.trustworthy else "doubtful"
+        parameters = {p.name: (p.estimate, p.sigma, p.unit) for p in self.parameters if p.name in known}
+        keys = ("date", "n_residuals", "chi2", "dof", "inputs")
+        same = {key: getattr(self, key) for key in keys} | {"p_value": self.chi2_p_value, "rows": self.carried.rows}
+        return Run(verdict=verdict, parameters=parameters, **same)
 
     def unit_of(self, kind: str) -> str:
         """The unit of a kind of residual: `m`, `rad` or `px`."""
@@ -606,34 +598,21 @@ RESOLUTION = 1e-8
 """How far the saved robot's values may be from the estimates in `result.json`, [m] and [rad]: ten nanometres."""
 
 
-def residual_frame(solution: Solution, assessed: assessment.Assessment) -> pl.DataFrame:
+def residual_frame(solution: Solution, assessed: assessment.Assessment) -> "pl.DataFrame":
     """Every scalar residual, as `residuals.csv` has it."""
     import polars as pl
 
     table, fit = assessed.fit.residuals, assessed.fit.goodness
     ends, sources = solution.problem.end_names, solution.problem.data.labels
     measured = table.measured - table.excess  # so that predicted minus measured is 0 on average
-    columns = {
-        "kind": _coded([kind.name for kind in table.kinds], table.kind_code),
-        "a": _coded(ends, table.a + 1),
-        "b": _coded(ends, table.b + 1),
-        "split": _coded(("train", "test"), table.split),
-        "used": table.used,
-        "excluded": _coded(table.reasons, table.reason_code),
-        "unit": _coded([kind.unit for kind in table.kinds], table.kind_code),
-        "measured": measured,
-        "predicted": measured + table.after,
-        "residual_before": table.before,
-        "residual": table.after,
-        "sigma": table.sigma,
-        "whitened": table.after / table.sigma,
-        "leverage": fit.leverage,
-        "studentised": fit.studentised,
-        "weight": fit.weight,
-        "flag": _coded(statistics.FLAGS, fit.flag),
-        "noise_adds": table.excess,
-        "suspect": fit.suspect,
-    }
+    kinds, units = [kind.name for kind in table.kinds], [kind.unit for kind in table.kinds]
+    columns: dict[str, Any] = {"kind": _coded(kinds, table.kind_code), "a": _coded(ends, table.a + 1)}
+    columns |= {"b": _coded(ends, table.b + 1), "split": _coded(("train", "test"), table.split), "used": table.used}
+    columns |= {"excluded": _coded(table.reasons, table.reason_code), "unit": _coded(units, table.kind_code)}
+    columns |= {"measured": measured, "predicted": measured + table.after, "residual_before": table.before}
+    columns |= {"residual": table.after, "sigma": table.sigma, "whitened": table.after / table.sigma}
+    columns |= {"leverage": fit.leverage, "studentised": fit.studentised, "weight": fit.weight}
+    columns |= {"flag": _coded(statistics.FLAGS, fit.flag), "noise_adds": table.excess, "suspect": fit.suspect}
     if len(sources) > 1:
         columns["table"] = _coded([sources[kind.table] for kind in table.kinds], table.kind_code)
     if len(table.labels) > 1:
@@ -642,7 +621,7 @@ def residual_frame(solution: Solution, assessed: assessment.Assessment) -> pl.Da
     return pl.DataFrame(columns)
 
 
-def _coded(words: Sequence[str], codes: Any) -> pl.Series:
+def _coded(words: Sequence[str], codes: Any) -> "pl.Series":
     """A column of words by their codes, four bytes a row, empty words as null."""
     import polars as pl
 
@@ -650,7 +629,7 @@ def _coded(words: Sequence[str], codes: Any) -> pl.Series:
     return pl.Series([word or None for word in words], dtype=kept)[np.asarray(codes, dtype=np.uint32)]
 
 
-def configuration_frame(solution: Solution, assessed: assessment.Assessment) -> pl.DataFrame:
+def configuration_frame(solution: Solution, assessed: assessment.Assessment) -> "pl.DataFrame":
     """Every measured configuration, as `configurations.csv` has it."""
     import polars as pl
 
@@ -671,29 +650,23 @@ def configuration_frame(solution: Solution, assessed: assessment.Assessment) -> 
     return pl.DataFrame(columns)
 
 
-def joint_frame(found: statistics.JointErrors, solution: Solution) -> pl.DataFrame:
+def joint_frame(found: statistics.JointErrors, solution: Solution) -> "pl.DataFrame":
     """Every estimated joint position, as `joints.csv` has it."""
     import polars as pl
 
     n, k = found.error.shape
     joint, units = np.tile(np.arange(k), n), [solution.problem.robot.joints[j].unit for j in found.joints]
-    columns = {
-        "id": _coded(solution.problem.end_names, np.repeat(found.configurations + 1, k)),
-        "joint": _coded(found.names, joint),
-        "unit": _coded(units, joint),
-        "reading": found.reading.ravel(),
-        "estimate": (found.reading + found.error).ravel(),
-        "error": found.error.ravel(),
-        "sigma": np.tile(found.sigma, n),
-        "error_over_sigma": (found.error / found.sigma).ravel(),
-        "studentised": found.studentised.ravel(),
-        "suspect": [place in found.suspects for place in np.ndindex(n, k)],
-    }
+    configurations = _coded(solution.problem.end_names, np.repeat(found.configurations + 1, k))
+    columns: dict[str, Any] = {"id": configurations, "joint": _coded(found.names, joint), "unit": _coded(units, joint)}
+    columns |= {"reading": found.reading.ravel(), "estimate": (found.reading + found.error).ravel()}
+    columns |= {"error": found.error.ravel(), "sigma": np.tile(found.sigma, n)}
+    columns |= {"error_over_sigma": (found.error / found.sigma).ravel(), "studentised": found.studentised.ravel()}
+    columns |= {"suspect": [place in found.suspects for place in np.ndindex(n, k)]}
     return pl.DataFrame(columns)
 
 
 def write_calibration(
-    folder: Path, result: Result, robot: Robot, tables: Mapping[str, pl.DataFrame], pages: dict[str, str]
+    folder: Path, result: Result, robot: Robot, tables: "Mapping[str, pl.DataFrame]", pages: dict[str, str]
 ) -> None:
     """Write the files of a calibration into a folder, all or none.
 
@@ -770,7 +743,7 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     return calibrated
 
 
-def read_table(folder: Path, name: str, result: Result) -> pl.DataFrame | None:
+def read_table(folder: Path, name: str, result: Result) -> "pl.DataFrame | None":
     """A table of a calibration; None where there is no such file.
 
     Args:

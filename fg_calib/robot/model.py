@@ -5,8 +5,6 @@ thing here: a list of translations along and rotations about the x, y and z axes
 A convention is therefore data, `CONVENTIONS`, and nothing behind this module knows one from another.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from abc import ABC, abstractmethod
@@ -234,7 +232,7 @@ class Effect(ABC):
             object.__setattr__(self, name, _as_tuple(value))
 
     @abstractmethod
-    def terms(self, robot: Robot) -> list[Term]:
+    def terms(self, robot: "Robot") -> list[Term]:
         """The terms for a robot without effects.
 
         Raises:
@@ -242,7 +240,7 @@ class Effect(ABC):
         """
 
     @abstractmethod
-    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+    def values(self, robot: "Robot", readings: Floats, context: Context, at: Floats) -> Floats:
         """Value of each term that is an element, and its slope in the reading of its joint, shape (n, n_terms, 2).
 
         Args:
@@ -252,7 +250,7 @@ class Effect(ABC):
             at: Values of the terms' coefficients, shape (n_terms,).
         """
 
-    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+    def context(self, robot: "Robot", readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
         """What else the values depend on, for the rows of a table.
 
         Args:
@@ -347,7 +345,7 @@ class Robot(inputs.Record):
         fixed: Sequence[str] = (),
         estimate: Sequence[str] = (),
         tolerance: Mapping[str, float] | None = None,
-    ) -> Robot:
+    ) -> "Robot":
         """A robot from a table of Denavit-Hartenberg figures, in [m] and [rad].
 
         Args:
@@ -399,7 +397,7 @@ class Robot(inputs.Record):
         return len(self.joints)
 
     @cached_property
-    def geometry(self) -> Robot:
+    def geometry(self) -> "Robot":
         """The robot without effects and their parameters; the others keep their places."""
         elements = tuple(e for e in self.elements if e.basis is None)
         parameters = tuple(p for p in self.parameters if p.kind not in EFFECT_KINDS)
@@ -446,7 +444,7 @@ class Robot(inputs.Record):
                 parts.append(effect.values(self.geometry, readings, context or {}, at))
         return np.concatenate(parts, axis=1) if len(parts) > 1 else trig
 
-    def with_effects(self, *effects: Effect) -> Robot:
+    def with_effects(self, *effects: Effect) -> "Robot":
         """Copy that does more than its geometry; each effect brings its parameters, of nominal value zero.
 
         Raises:
@@ -564,14 +562,14 @@ class Robot(inputs.Record):
         """Indices of the geometric parameters of joint `owner` (0 is the base, n + 1 the tool)."""
         return [i for i, p in enumerate(self.parameters) if p.owner == owner and p.kind not in EFFECT_KINDS]
 
-    def with_curves_held(self, values: Floats) -> Robot:
+    def with_curves_held(self, values: Floats) -> "Robot":
         """Copy whose error curves are what they are in values of all parameters, and are not estimated."""
         pairs = zip(self.parameters, values.tolist(), strict=True)
         held = [replace(p, nominal=v, estimated=False) if p.kind == "curve" else p for p, v in pairs]
         return replace(self, parameters=tuple(held))
 
     @checked
-    def with_estimated(self, names: Iterable[str]) -> Robot:
+    def with_estimated(self, names: Iterable[str]) -> "Robot":
         """Copy with just the parameters called `names` estimated.
 
         Raises:
@@ -583,7 +581,7 @@ class Robot(inputs.Record):
         return replace(self, parameters=tuple(replace(p, estimated=p.name in wanted) for p in self.parameters))
 
     @checked
-    def with_values(self, values: Floats | Sequence[float]) -> Robot:
+    def with_values(self, values: Floats | Sequence[float]) -> "Robot":
         """Copy with other nominal values, shape (n_parameters,), [m] or [rad].
 
         Raises:

@@ -78,8 +78,6 @@ orthogonal; sockets, and anchors in contact, where the nominal arm has its tool 
 nominal arm's tool point: mean, and root mean square distance from it.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
