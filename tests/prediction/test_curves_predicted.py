@@ -22,7 +22,7 @@ from fg_calib import (
     solve,
 )
 from fg_calib.graph.problem import square_root
-from fg_calib.io import read_joint_table
+from fg_calib.io import read_joint_table, read_urdf
 from fg_calib.prediction import errors_at, predict_poses, workspace
 from fg_calib.robot import Backlash, Compliance, ErrorCurve, Gain, Mass, Thermal, build_chain, forward, spline
 from fg_calib.statistics import spread_of, with_left_out
@@ -226,3 +226,15 @@ def test_lengths_that_a_calibration_finds_do_not_grow_with_temperature():
     moved = robot.with_values(robot.nominal + 1e-4)
     found = moved.trig(np.zeros((1, 2)), {"temperature": np.array([21.0])})[0, 2:, 0]
     assert found == pytest.approx([0.3001, 0.5001])  # d1, a2
+
+
+def test_a_calibrated_arm_from_a_urdf_reads_back_with_its_effects(tmp_path):
+    problem, _ = drawn()
+    export(problem.robot.geometry, "urdf").write(tmp_path / "arm.urdf")
+    effects = {"compliance": {"masses": {"link_3": {"mass": 10.0, "com": [0.2, 0.0, 0.1]}}, "joints": [2, 3]}}
+    robot = read_urdf(tmp_path / "arm.urdf", effects=effects, tolerance=dict.fromkeys(("x", "y", "z", "yaw"), 1e-3))
+    found = calibrate(robot, problem.data.tables[0].measurements, model="position")
+    found.save(tmp_path / "result")
+    loaded, q = Calibration.load(tmp_path / "result"), problem.data.readings[:5]
+    assert found.parameters["q2.compliance"].estimate != 0.0
+    assert loaded.predict(q).position == pytest.approx(found.predict(q).position, abs=1e-15)
