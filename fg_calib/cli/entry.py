@@ -17,8 +17,8 @@ from fg_calib import __version__, inputs
 from fg_calib.cli.output import progress, say
 
 COMMANDS = (
-    *("init", "inspect", "calibrate", "report", "export", "correct", "predict", "compare", "check", "update"),
-    *("history", "observe", "design", "simulate", "example", "bag", "board"),
+    *("init", "inspect", "calibrate", "report", "export", "convert", "correct", "predict", "compare", "check"),
+    *("update", "history", "observe", "design", "simulate", "example", "bag", "board"),
 )
 """The commands in the order of the help: each is the function of that name."""
 

@@ -2,14 +2,14 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, say, show, show_json
 from fg_calib.inputs import InputError, escaped
 
-Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
+Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "zeros", "yaml"]
 At = Literal["workspace", "measured"]
 Tool = Literal["nominal", "calibrated"]
 UrBase = Literal["base", "base_link"]
@@ -48,6 +48,12 @@ def export(
     if at == "measured" and q is None:
         raise InputError(str(arm), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
     made = export_arm(found, to, nominal=before, configurations=q, tool=tool, **choices)  # type: ignore[arg-type]
+    show_export(made, out, as_json)
+    end(made.findings, not_accepted=made.not_accepted)
+
+
+def show_export(made: Any, out: Path | None, as_json: bool) -> None:
+    """Write an `Export` to a new file, or print it; its notes on stderr where they are not in what is printed."""
     if out is not None:
         made.write(out)
         say(f"wrote {out}")
@@ -59,4 +65,3 @@ def export(
     for note in made.notes:
         if as_json or out is not None or note not in made.text:
             say(note)
-    end(made.findings, not_accepted=made.not_accepted)

@@ -24,9 +24,11 @@ to z, meets the next axis,
     M = [Rz(theta)] [Tx(a) Rx(alpha) Ry(beta)] [Tz(d') Rz(theta')]
     P = p - z' p_z / z'_z = a x,   Rz(-theta) z' = (sin beta, -sin alpha cos beta, cos alpha cos beta)
 
-which stays well determined, and fails only for axes at right angles. With rows of DH for those and Hayati's for these,
-every arm has a table; rows of DH have no beta, rows of Hayati no d of their own. Both (theta, a, alpha) and
-(theta + pi, -a, -alpha) say the same; theta within a quarter turn is taken, as drawings have it.
+which stays well determined, and fails only for axes at right angles. Craig's row has beta before a and alpha: there x =
+Rz(theta) Ry(beta) e_x goes from the frame to the nearest point of the next axis, P = p - z' (z'.p) = a x. With rows of
+DH for those and Hayati's for these, every arm has a table; rows of DH have no beta, rows of Hayati no d of their own.
+Both (theta, a, alpha) and (theta + pi, -a, -alpha) say the same; theta within a quarter turn is taken, as drawings have
+it.
 
 Base and tool take what is left. Before the first joint it is the base frame, unless frame 0 and the joint are such that
 the first row holds it; behind the last one it is the tool, but for the d and theta of the last row.
@@ -58,7 +60,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.inputs import Floats, InputError, Record
 from fg_calib.robot import Axis, Element, Poses, Robot, RobotBuilder, build_chain, forward, model, pose, random_readings
 
-TableConvention = Literal["dh", "mdh", "dh-hayati"]
+TableConvention = Literal["dh", "mdh", "mdh-hayati", "dh-hayati"]
 
 PARALLEL = 1e-11
 """Sine of the angle of axes that count as parallel: at an arm's length it moves the tool by as much, [m]."""
@@ -109,7 +111,7 @@ def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHE
 
     Args:
         robot: The arm, at its nominal values.
-        convention: `dh`, `mdh` (Craig), or `dh-hayati`, each row of which has d or beta.
+        convention: `dh`, `mdh` (Craig), `dh-hayati`, each row of which has d or beta, or `mdh-hayati`.
         farthest: How far along an axis the next frame may be, in the arm's length; infinite: as far as it must.
 
     Raises:
@@ -121,10 +123,10 @@ def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHE
     farthest = farthest * robot.reach
     rows, base, tool, nearly = _rows(links, convention, farthest)
     builder = RobotBuilder(robot.name, convention)
-    builder.add_frame("base", model.frame_values("base", _tidy(base)), 0, False)
+    builder.add_frame("base", model.frame_values("base", tidy(base)), 0, False)
     for joint, row in zip(robot.joints, rows, strict=True):
         builder.add_convention_joint(joint, {"beta": 0.0} | {kind: _turn(kind, row[kind]) for kind in row})
-    builder.add_frame("tool", model.frame_values("tool", _tidy(tool)), robot.n_joints + 1, False)
+    builder.add_frame("tool", model.frame_values("tool", tidy(tool)), robot.n_joints + 1, False)
     return TableRobot(builder.build(), nearly)
 
 
@@ -133,7 +135,7 @@ def _rows(
 ) -> tuple[list[dict[str, float]], Floats, Floats, tuple[Nearly, ...]]:
     """Rows by kind, base, tool, and the axes that are taken to be parallel."""
     n = len(links.between) - 1
-    craig = convention == "mdh"
+    craig, hayati = convention.startswith("mdh"), convention.endswith("hayati")
     rows = [dict.fromkeys(("a", "alpha", "d", "theta"), 0.0) for _ in range(n)]
     first, carried, base = _start(links, craig)
     rows[0] |= first
@@ -141,8 +143,8 @@ def _rows(
     for i in range(1, n):
         M = carried @ links.between[i]
         sine = float(np.hypot(M[0, 2], M[1, 2]))
-        if convention == "dh-hayati" and sine < NEARLY_PARALLEL:
-            row = plane_crossing(M)
+        if hayati and sine < NEARLY_PARALLEL:
+            row = nearest_point(M, carried[2, 3]) if craig else plane_crossing(M)
         else:
             row = common_normal(M, height=carried[2, 3])
             away = max(abs(row["d"]), abs(left_over(M, row)[2, 3]))
@@ -191,9 +193,32 @@ def plane_crossing(M: Floats) -> dict[str, float]:
     return row | {"alpha": float(np.arctan2(-y, z_)), "beta": float(np.arctan2(x, np.hypot(y, z_)))}
 
 
+def nearest_point(M: Floats, height: float) -> dict[str, float]:
+    """theta, d, beta, a and alpha from a point of the z axis of a frame to that of another one (Hayati, after Craig).
+
+    Args:
+        M: From the one frame to the other, shape (4, 4).
+        height: d, where the point is, [m]: x goes from there to the nearest point of the other axis.
+    """
+    z, p = M[:3, 2], M[:3, 3] - [0.0, 0.0, height]
+    P = p - z * (z @ p)
+    theta = _upright({"theta": _direction(P), "a": 0.0, "alpha": 0.0})["theta"]
+    turn = transform(theta=-theta)[:3, :3]
+    (x, y, z_), P = turn @ z, turn @ P
+    beta = float(np.arctan(x / z_))  # x square to z', also where the axes meet
+    c, s = np.cos(beta), np.sin(beta)
+    return {
+        "theta": theta,
+        "d": height,
+        "beta": beta,
+        "a": c * P[0] - s * P[2],
+        "alpha": np.arctan2(-y, s * x + c * z_),
+    }
+
+
 def left_over(M: Floats, row: Mapping[str, float]) -> Floats:
-    """Remainder of a transform after a row of values, shape (4, 4)."""
-    return inverse(row_transform("dh-hayati", dict(row))) @ M
+    """Remainder of a transform after a row of values, in their order, shape (4, 4)."""
+    return inverse(transform(**row)) @ M
 
 
 def _direction(p: Floats) -> float:
@@ -252,7 +277,7 @@ def _is_same(first: Floats, second: Floats) -> bool:
     return bool(np.abs(first - second).max() <= SAME)
 
 
-def _tidy(T: Floats) -> Floats:
+def tidy(T: Floats) -> Floats:
     """A transform without what is rounding."""
     return np.eye(4) if _is_same(T, np.eye(4)) else rigid(T[:3, :3], np.where(np.abs(T[:3, 3]) > SAME, T[:3, 3], 0.0))
 
@@ -280,11 +305,11 @@ def links_of(robot: Robot) -> Links:
     Raises:
         InputError: A joint's value is more than its reading plus a constant: no other format has that.
     """
+    if robot.effects:
+        raise InputError(robot.name, "joints with effects", "plain readings")
     base, tool = set(robot.owned_by(0)), set(robot.owned_by(robot.n_joints + 1))
     parts: list[list[Element]] = [[], [], []]  # base, what is between joints, tool; more are put before the tool
     for element in robot.elements:
-        if element.basis is not None:
-            raise InputError(robot.name, "joints with effects", "plain readings")
         if element.parameter in base:
             parts[0].append(element)
         elif element.parameter in tool:

@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike
 from fg_calib import __version__
 from fg_calib.calibration import Calibration
 from fg_calib.exports import dh
+from fg_calib.exports.poe import screw_content
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
 from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, printable, shown
 from fg_calib.io import Units, effects_mapping, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, build_chain, frame_values, spline
 
-ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "hayati", "zeros", "yaml"]
+ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "zeros", "yaml"]
 ToolOfZeros = Literal["nominal", "calibrated"]
 
 EXACT = 1e-9
@@ -30,6 +31,7 @@ _MM_DEG = Units("mm", "deg")
 _TABLES: Mapping[str, tuple[dh.TableConvention, str]] = {
     "dh": ("dh", "Denavit and Hartenberg"),
     "mdh": ("mdh", "Craig (modified Denavit-Hartenberg)"),
+    "mdh-hayati": ("mdh-hayati", "Hayati: rows of Craig with beta"),
     "hayati": ("dh-hayati", "Hayati: rows of Denavit and Hartenberg, with beta in place of d between parallel axes"),
 }
 
@@ -77,6 +79,7 @@ class Export(Record):
           "not_accepted": [text],
           of tables: "convention", "exact", "reasons": [text], "error": {errors},
           "effects": {end of a file's name: text},
+          of poe: "axes": {joint: {"offset", "tilt", "sigma": {x, y, pitch, roll, offset, tilt: those known}}},
           of zeros: "zeros": {joint: {see `Zero`}}, "before", "after": {"workspace": {errors}, "measured": ...},
           of ur: "base", "hash", "tool0_T_tool": [[...]], of tesseract: "joints": [names] }
 
@@ -106,9 +109,9 @@ def export(
 
     Args:
         arm: A calibration, or a robot.
-        to: `urdf`, `ur` (kinematics for ROS' ur_description), `tesseract` (calibration of joint origins), `dh`, `mdh`,
-            `hayati` (tables in mm and deg), `zeros` (joint zeros alone), `yaml` (this package's robot file).
-        nominal: The nominal robot; a calibration has it.
+        to: `urdf`, `ur` (ROS' ur_description), `tesseract` (joint origins), `dh`, `mdh`, `mdh-hayati`, `hayati` (tables
+            in mm and deg), `poe` (axes at zero readings), `zeros` (joint zeros alone), `yaml` (a robot file).
+        nominal: The nominal robot, for `zeros` and the axis report of `poe`; a calibration has it.
         configurations: Of `zeros`: where the fit is wanted, shape (n, n_joints), [rad] (prismatic: [m]); all over the
             joint limits if None.
         tool: Of `zeros`: the tool that the controller works with: as calibrated, as it is set there on its own and the
@@ -119,8 +122,7 @@ def export(
         ur_hash: Of `ur`: the controller's own hash, for which the driver asks.
 
     Raises:
-        InputError: The format cannot hold the arm, the nominal robot is not known or another one, or an option means
-            nothing for the format.
+        InputError: The format cannot hold the arm, its nominal robot is unknown or another, or an option means nothing.
     """
     given: dict[str, Any] = {"configurations": configurations is not None, "tool": tool != "calibrated", "far": far}
     given |= {"ur_base": ur_base, "ur_hash": ur_hash}
@@ -135,7 +137,7 @@ def export(
     if nominal is not None and [(joint.name, joint.prismatic) for joint in nominal.joints] != kinds:
         raise InputError("nominal", f"{nominal.name} has other joints", ", ".join(name for name, _ in kinds))
     left_out, files = list[str](), dict[str, str]()
-    if robot.effects and not (to == "yaml" and robot.convention in CONVENTIONS):
+    if robot.effects and not (to == "yaml" and robot.urdf is None):
         left_out, files = _left_out(robot, to, arm.measured if isinstance(arm, Calibration) else None)
         robot = robot.geometry
     comments = [f"by fg-calib {__version__}", *(f"NOT TO BE TRUSTED: {finding}" for finding in doubts[0])]
@@ -144,6 +146,7 @@ def export(
         "urdf": lambda: _urdf(robot, comments),
         "ur": lambda: _ur(robot, ur_base, ur_hash),
         "tesseract": lambda: _tesseract(robot),
+        "poe": lambda: screw_content(arm, nominal),
         "zeros": lambda: _zeros(arm, nominal, tool, configurations),
         "yaml": lambda: _yaml(robot),
     }
@@ -204,7 +207,7 @@ def _urdf(robot: Robot, comments: Sequence[str]) -> _Content:
         notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
         return urdf_text(robot.urdf.text, joint_origins(robot)), notes, {}
     notes = [
-        f"link {BASE_LINK} is the base frame and link {TOOL_LINK} the tool frame; joints turn about z",
+        f"the same arm to rounding: link {BASE_LINK} is the base frame, {TOOL_LINK} the tool; joints turn about z",
         "URDF knows no slide without limits, which has 1000 m here, and no turn with one limit, which has none",
         "effort and velocity in <limit> are 0: they are not known",
     ]
@@ -258,7 +261,9 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
     order = " ".join(f"{PARAMETER_KINDS[kind].axis.name.capitalize()}({kind})" for kind in CONVENTIONS[convention])
     notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
     if exact:
-        notes.append("the same arm: base and tool below hold what rows do not")
+        notes.append(
+            f"the same arm, base and tool hold what rows do not; over {error.n} configurations {_error_words(error)}"
+        )
     else:
         notes += [f"NOT EXACT: {reason}" for reason in reasons]
         notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")
@@ -267,7 +272,7 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
 
 
 def _yaml(robot: Robot) -> _Content:
-    if robot.convention in CONVENTIONS:
+    if robot.urdf is None:
         return robot_text(robot), [], {}
     note = "the same arm as rows of dh-hayati, as it came from a URDF: `--to urdf` writes that"
     return robot_text(dh.in_table(robot, "dh-hayati").robot), [note], {}

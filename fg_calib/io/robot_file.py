@@ -688,7 +688,12 @@ def write_robot(path: Path | str, robot: Robot, *, units: Units | None = None, u
 
 
 def robot_text(
-    robot: Robot, *, units: Units | None = None, urdf_name: str | None = None, place: str | None = None
+    robot: Robot,
+    *,
+    units: Units | None = None,
+    urdf_name: str | None = None,
+    place: str | None = None,
+    sigmas: Sequence[Mapping[str, float]] = (),
 ) -> str:
     """The text that `write_robot` writes.
 
@@ -697,6 +702,7 @@ def robot_text(
         units: Of the text; default m and rad.
         urdf_name: See `write_robot`.
         place: The file, for messages; the robot's name if None.
+        sigmas: For people, `sigma` of each row of `poe`.
 
     Raises:
         InputError: The robot has what no such file can say.
@@ -707,7 +713,10 @@ def robot_text(
     units, base, tool = units or Units(), robot.owned_by(0), robot.owned_by(robot.n_joints + 1)
     mapping: dict[str, Any] = {"name": robot.name, "units": asdict(units)}
     if robot.urdf is None:
-        mapping |= {"convention": robot.convention, "joints": [_row(robot, i, units) for i in range(robot.n_joints)]}
+        rows = [_row(robot, i, units) for i in range(robot.n_joints)]
+        for row, sigma in zip(rows, sigmas, strict=False):
+            row |= {"sigma": dict(sigma)}
+        mapping |= {"convention": robot.convention, "joints": rows}
     else:
         mapping |= {"urdf": urdf_name, "base_link": robot.urdf.base_link, "tip_link": robot.urdf.tip_link}
     for key, owned in (("base", base), ("tool", tool)):

@@ -182,7 +182,7 @@ def joint_errors(data: ReportData) -> Floats | None:
     error[table["rms_position"].is_null()] = np.nan
     arm = data.robot.geometry
     J = robot.forward(robot.build_chain(arm).with_joint_columns(), arm.trig(data.readings)).jacobian[:, 3:]
-    return np.einsum("ni,nij->nj", error, J) / np.maximum(np.sum(J**2, axis=1), 1e-12)  # 0 where a lever is none
+    return np.einsum("ni,nij->nj", error, J) / np.sum(J**2, axis=1)
 
 
 def correlation_matrix(data: ReportData) -> list[Chart]:

@@ -37,7 +37,9 @@ def result(tmp_path_factory):
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize("to", ["urdf", as_case("dh", is_slow=True), as_case("mdh", is_slow=True), "hayati", "yaml"])
+@pytest.mark.parametrize(
+    "to", ["urdf", as_case("dh", is_slow=True), as_case("mdh", is_slow=True), "hayati", "poe", "yaml"]
+)
 def test_a_file_is_the_calibrated_arm(result, to, fg_calib, tmp_path):
     out = tmp_path / ("arm.urdf" if to == "urdf" else "arm.yaml")
     ended = fg_calib("export", result, "--to", to, "--out", out)
@@ -50,7 +52,9 @@ def test_a_file_is_the_calibrated_arm(result, to, fg_calib, tmp_path):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize("to", ["urdf", "ur", "tesseract", as_case("dh", is_slow=True), "hayati", "zeros", "yaml"])
+@pytest.mark.parametrize(
+    "to", ["urdf", "ur", "tesseract", as_case("dh", is_slow=True), "hayati", "poe", "zeros", "yaml"]
+)
 def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     text = fg_calib("export", result, "--to", to)
     document = fg_calib("export", result, "--to", to, "--json")
@@ -60,6 +64,18 @@ def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     assert (found["schema"], found["to"], found["robot"]) == ("fg-calib/export/1", to, "ur10")
     assert found["notes"] == document.err.splitlines()
     assert found["findings"] == found["not_accepted"] == []
+
+
+@pytest.mark.parametrize("to", ["dh", as_case("mdh", is_slow=True), "mdh-hayati", "dh-hayati", "poe", "urdf"])
+def test_a_robot_is_converted_and_what_the_other_convention_cannot_hold_is_said(to, fg_calib, tmp_path):
+    robot, out = off(ur10()), tmp_path / ("out.urdf" if to == "urdf" else "out.yaml")
+    write_robot(tmp_path / "arm.yaml", robot)
+    ended = fg_calib("convert", tmp_path / "arm.yaml", "--to", to, "--out", out)
+    miss, lost = errors(read_robot(out), robot, drawn(robot, 100, 0)).position_max, to in ("dh", "mdh")
+    assert (ended.code, lost, "the same arm" in ended.err) == (0, "NOT EXACT: axes 2 and 3" in ended.err, not lost)
+    assert (1e-5 < miss < 2e-3) if lost else miss < 1e-12
+    again = fg_calib("convert", tmp_path / "arm.yaml", "--to", to, "--out", out)
+    assert (again.code, again.err) == (1, f"error: {out}: is there already, expected a folder without it\n")
 
 
 ZEROS = np.deg2rad([0.5, -0.3, 0.8, -1.0, 0.4, 6.2])

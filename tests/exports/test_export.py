@@ -66,10 +66,10 @@ def test_a_new_urdf_reads_back_as_the_same_arm_with_its_names_and_limits(arm, tm
 
 
 @pytest.mark.sampled(6)
-@pytest.mark.parametrize("to", ["hayati", "yaml"])
-def test_hayatis_table_holds_every_arm_exactly(arm, to, tmp_path):
+@pytest.mark.parametrize("to", ["hayati", "mdh-hayati", "poe", "yaml"])
+def test_what_holds_every_arm_holds_it_exactly(arm, to, tmp_path):
     made = export(arm, to)
-    if to == "hayati":
+    if "hayati" in to:
         assert made.details["exact"]
         assert made.details["reasons"] == []
     made.write(tmp_path / "out.yaml")
@@ -102,7 +102,7 @@ def test_tables_of_four_figures_say_what_they_miss_and_by_how_much(name, to, tmp
 
 def test_tables_are_products_of_their_elementary_transforms():
     arm = off(seven())
-    for convention in ("dh", "mdh", "dh-hayati"):
+    for convention in ("dh", "mdh", "dh-hayati", "mdh-hayati"):
         table = in_table(arm, convention).robot
         for q in drawn(arm, 5, 0):
             T = frames(table, 0)
