@@ -203,7 +203,7 @@ def cost(task: Task) -> Row:
 def held_out_answer(found: Row) -> str:
     """Figures of each set."""
     cells = [
-        f"{name} {row['median']:.3f} / {row['95 %']:.2f} / {row['rms without gross']:.3f} ({row['gross']} gross rows)"
+        f"{name} {row['median']:.3f} / {row['95 %']:.2f} / {row['rms without gross']:.3f} ({row['gross']} gross)"
         for name, row in found.items()
     ]
     if not cells:
@@ -211,25 +211,25 @@ def held_out_answer(found: Row) -> str:
     last = found["error curve and compliance"]
     left = f"{last['position left'] / MM:.3f} mm and {last['orientation left'] / MM:.3f} mrad"
     text = f"Median / 95 % / RMS without rows above {GROSS:g} mm, mm: {'; '.join(cells)}"
-    return f"{text}. Noise left {left}; sigma of a coefficient {last['curve sigma']:.1e} rad"
+    return f"{text}. Noise left {left}; curve sigma {last['curve sigma']:.1e} rad"
 
 
 def half_answer(found: Row) -> str:
     """RMS of both halves, by set."""
     cells = [f"{name} {row['upper rms']:.2f}, {row['lower rms']:.2f}" for name, row in found.items()]
-    return f"RMS of the half of joint 2 that was not measured, mm: {'; '.join(cells)}" if cells else "no data"
+    return f"RMS of the half not measured, mm: {'; '.join(cells)}" if cells else "no data"
 
 
 def parts_answer(found: Row) -> str:
     """RMS z by joint."""
     cells = [f"joint {name} {row['z']:.2f}" for name, row in found.items()]
-    return f"RMS z between four blocks of rows, with error curves and compliance: {', '.join(cells)}" if cells else "-"
+    return f"RMS z between four blocks: {', '.join(cells)}" if cells else "-"
 
 
 def sockets_answer(found: Row) -> str:
     """Spread by set."""
     cells = [f"{name} {row['spread']:.3f}" for name, row in found.items()]
-    return f"Spread of the ball centre at unseen locations, mm: {', '.join(cells)}" if cells else "the data are missing"
+    return f"Spread at unseen locations, mm: {', '.join(cells)}" if cells else "the data are missing"
 
 
 def cost_answer(found: Row) -> str:
@@ -238,7 +238,7 @@ def cost_answer(found: Row) -> str:
         return "the data are missing"
     once = found["geometry"]["seconds"]
     cells = [f"{name} {row['seconds'] / once:.1f}" for name, row in found.items() if name != "geometry"]
-    return f"1 495 poses, multiples of the geometry's {once:.2f} s: {', '.join(cells)}"
+    return f"1 495 poses, times the geometry's {once:.2f} s: {', '.join(cells)}"
 
 
 def names(of: Row) -> Any:
@@ -249,12 +249,12 @@ def names(of: Row) -> Any:
 QUESTIONS = (
     Question("held_out", "What do effects bring on a real UR10's held-out poses?", names(SETS), held_out, by_name,
              held_out_answer),
-    Question("half", "And where a half of a joint's range was not measured?",
+    Question("half", "And where joint 2 was not measured?",
              names({"geometry": 0, "error curve and compliance": 0}), half, by_name, half_answer),
-    Question("parts", "Do calibrations of parts of its rows agree, with effects?", lambda n, s: [(1,), (2,), (3,)],
+    Question("parts", "Do calibrations of its parts agree?", lambda n, s: [(1,), (2,), (3,)],
              parts, by_name, parts_answer),
     Question("sockets", "And a real Panda's touches?", names(SOCKETS), sockets, by_name, sockets_answer),
-    Question("cost", "How long does a solve with effects take?",
+    Question("cost", "How long does a solve take?",
              names({"geometry": 0, "compliance": 0, "error curve and compliance": 0}), cost, by_name, cost_answer,
              timed=True),
 )  # fmt: skip

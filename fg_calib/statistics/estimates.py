@@ -37,7 +37,7 @@ class ParameterEstimate(Record):
             parameter that was left out to fix the gauge: its prior sigma.
         prior_sigma: 1 sigma of its prior; None without one.
         identifiability: Class by the data alone: `independent`, `relative`, `ineffective`; or `fixed`. Coefficients of
-            an error curve are relative, to the joint's zero, where rows measure them, ineffective elsewhere.
+            an error curve are relative, to the joint's zero, where rows measure them, else ineffective.
         stands_for: Of a relative parameter that was kept where others were left out to fix the gauge: the combination
             that it was estimated for, factors by name; else None.
         sigma_of_combination: 1 sigma of the estimate as one of that combination; None where it stands for itself.
