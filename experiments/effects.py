@@ -197,7 +197,7 @@ QUESTIONS = (
     Question("ranks", "What of an arm's effects do distances and rotation angles see, without any frame?",
              lambda n, s: [(a, m, e) for a in ARMS for m in MODELS for e in EFFECTS], ranks, ranks_summary,
              ranks_answer),
-    Question("arm", "What do compliances and eccentricities cost the paper's arm, in the model and not?", arm_tasks,
+    Question("arm", "What do compliances and eccentricities cost the paper's arm?", arm_tasks,
              calibrate_both, arm_summary, arm_answer, (200, 1)),
 )  # fmt: skip
 
