@@ -10,12 +10,14 @@ from scipy.spatial.transform import Rotation
 from fg_calib import Measurements, Robot, Table
 from fg_calib.io import Units, write_csv, write_robot
 from fg_calib.measurements import Pairs
-from fg_calib.robot import pose, rotation_angle
+from fg_calib.robot import build_chain, forward, pose, rotation_angle
 from fg_calib.simulation import table_columns
 
 PAPER_A = [0, 0, 0, 5, 5, 0, 0]
 PAPER_ALPHA = [0, -90, -90, 0, 0, 90, 90]
 PAPER_D = [2.3, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
+ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
+TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
 TOOL = [f"tool.{k}" for k in ("x", "y", "z", "roll", "pitch", "yaw")]
 
 
@@ -48,10 +50,40 @@ def true_robot(robot: Robot, rng: np.random.Generator) -> Robot:
     return robot.with_values(robot.nominal + error)
 
 
+def arm_with(*effects, tolerance=TOLERANCE) -> Robot:
+    """A 4-joint arm with effects beyond its geometry."""
+    return Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=tolerance).with_effects(*effects)
+
+
+def within_tolerance(robot: Robot, rng: np.random.Generator) -> Robot:
+    """The robot with errors of its tolerances, coefficients of effects among them."""
+    tolerance = np.array([p.tolerance or 0.0 for p in robot.parameters])
+    return robot.with_values(robot.nominal + tolerance * rng.normal(size=len(tolerance)))
+
+
+def tool_points(robot, q, context=None):
+    """Tool points of a robot with its effects, shape (n, 3)."""
+    return forward(build_chain(robot), robot.trig(q, context)).position
+
+
+def measure_points(true, q, rng, sigma=1e-4) -> Measurements:
+    """Tool points of the true robot at readings q, with noise."""
+    points = tool_points(true, q) + sigma * rng.normal(size=(len(q), 3))
+    return Measurements.from_arrays(q, position=points, sigma_position=sigma)
+
+
 def nees(found, true: Robot) -> tuple[float, int]:
     """Squared error of an assessed arm over its covariance, and the number of its estimated parameters."""
     error = (found.robot.nominal - true.nominal)[[found.robot.index(name) for name in found.names]]
     return error @ np.linalg.solve(found.covariance, error), len(error)
+
+
+def errors_of_all(solution, true: Robot):
+    """Errors of a solution's robot in all columns, of curves too, and the root of their covariance."""
+    v = solution.problem.variables
+    columns = np.concatenate([np.r_[one.columns] for one in (*v.items, *v.nuisance)])
+    places = np.concatenate([one.places for one in (*v.items, *v.nuisance)])
+    return solution.parameters[places] - true.nominal[places], solution.system.full_root[columns]
 
 
 def plus(array, rows, amount):

@@ -4,21 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated import arm_with, errors_of_all, measure_points, within_tolerance
 
-from fg_calib import Calibration, Job, Measurements, Options, Robot, build_problem, calibrate, selection
+from fg_calib import Calibration, Job, Options, build_problem, calibrate, selection
 from fg_calib.assessment import solve_job
 from fg_calib.graph import solve
-from fg_calib.robot import Compliance, ErrorCurve, Gain, Harmonics, Mass, build_chain, forward
+from fg_calib.robot import Compliance, ErrorCurve, Gain, Harmonics, Mass
 from fg_calib.selection import EffectTest, estimate_curve_sigma, select_effects
 from fg_calib.statistics import estimate_noise
 
-ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
-TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
 SIGMA, N_COEFFICIENTS = 8e-4, 40
-
-
-def arm(*effects):
-    return Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE).with_effects(*effects)
 
 
 def with_prior(robot, sigma):
@@ -28,23 +23,19 @@ def with_prior(robot, sigma):
     ))  # fmt: skip
 
 
-def measured(true, seed, n=80, sigma=1e-4):
+def measured(true, seed, n=80):
     rng = np.random.default_rng(seed)
-    q = rng.uniform(-3.1, 3.1, (n, 4))
-    p = forward(build_chain(true), true.trig(q)).position + sigma * rng.normal(size=(n, 3))
-    return Measurements.from_arrays(q, position=p, sigma_position=1e-4)
+    return measure_points(true, rng.uniform(-3.1, 3.1, (n, 4)), rng)
 
 
 def drawn(robot, seed):
-    rng = np.random.default_rng(seed)
-    tolerance = np.array([p.tolerance or 0.0 for p in robot.parameters])
-    return robot.with_values(robot.nominal + tolerance * rng.normal(size=len(tolerance)))
+    return within_tolerance(robot, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
 @pytest.mark.parametrize("free_noise", [False, True])
 def test_sigma_of_curves_is_found_from_a_tenth_and_from_ten_times_of_it(factor, free_noise):
-    robot = with_prior(arm(ErrorCurve([2, 3], 20)), SIGMA)
+    robot = with_prior(arm_with(ErrorCurve([2, 3], 20)), SIGMA)
     problem = build_problem(with_prior(robot, factor * SIGMA), measured(drawn(robot, 1), 1), Options(model="position"))
     solution = estimate_curve_sigma(problem, estimate_noise if free_noise else solve)
     found = {p.tolerance for p in solution.problem.robot.parameters if p.kind == "curve"}
@@ -61,24 +52,20 @@ def test_sigma_of_curves_is_found_from_a_tenth_and_from_ten_times_of_it(factor, 
 def test_errors_are_within_their_sigmas_with_an_estimated_prior_of_curves():
     squares, n_draws = [], 8
     for seed in range(n_draws):
-        robot = with_prior(arm(ErrorCurve([2, 3], 20)), SIGMA)
+        robot = with_prior(arm_with(ErrorCurve([2, 3], 20)), SIGMA)
         true = drawn(robot, seed)
         solution = estimate_curve_sigma(
             build_problem(with_prior(robot, SIGMA / 10.0), measured(true, seed), Options(model="position"))
         )
-        v = solution.problem.variables
-        each = (*v.items, *v.nuisance)
-        columns, places = np.concatenate([np.r_[i.columns] for i in each]), np.concatenate([i.places for i in each])
-        e = solution.parameters[places] - true.nominal[places]
-        C = solution.system.full_root[columns] @ solution.system.full_root[columns].T
-        n = v.n_columns
+        e, root = errors_of_all(solution, true)
+        C, n = root @ root.T, solution.problem.variables.n_columns
         squares.append([e[k] @ np.linalg.solve(C[k, k], e[k]) / len(e[k]) for k in (slice(n), slice(n, None))])
     for mean, size in zip(np.mean(squares, axis=0), (n, N_COEFFICIENTS), strict=True):
         assert mean == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (n_draws * size)))  # 4 sigma
 
 
 def test_a_specified_sigma_of_curves_is_kept():
-    robot = arm(ErrorCurve([2, 3], 20, 3.0 * SIGMA))
+    robot = arm_with(ErrorCurve([2, 3], 20, 3.0 * SIGMA))
     problem = build_problem(robot, measured(drawn(robot, 1), 1), Options(model="position"))
     found = estimate_curve_sigma(problem).problem.robot
     assert {p.tolerance for p in found.parameters if p.kind == "curve"} == {3.0 * SIGMA}
@@ -95,13 +82,13 @@ def choosing(robot):
 
 def curved_and_compliant(seed):
     """An arm with error curves and compliance of 2e-5 rad/(N m)."""
-    true = drawn(with_prior(arm(*LISTED[1::2]), SIGMA), seed)
+    true = drawn(with_prior(arm_with(*LISTED[1::2]), SIGMA), seed)
     return true.with_values([2e-5 if p.kind == "compliance" else p.nominal for p in true.parameters])
 
 
 def test_effects_that_the_arm_has_are_kept_and_others_are_left(tmp_path):
     data = measured(curved_and_compliant(1), 1, n=160)
-    found = calibrate(choosing(arm(*LISTED)), data, model="position", estimate_noise=True)
+    found = calibrate(choosing(arm_with(*LISTED)), data, model="position", estimate_noise=True)
     tests = {one.effect: one for one in found.result.effects}
     assert list(tests) == ["error_curve", "compliance", "harmonics", "gain"]
     assert [one.kept for one in tests.values()] == [True, True, False, False]
@@ -112,7 +99,7 @@ def test_effects_that_the_arm_has_are_kept_and_others_are_left(tmp_path):
         assert one.kept == (one.p_value < 1e-6) == (one.folds_after < 0.99 * one.folds_before) == (not one.reason)
     assert tests["compliance"].joints == (2, 3)
     assert tests["compliance"].folds_after == tests["error_curve"].folds_after == tests["gain"].folds_before
-    alone = calibrate(arm(*LISTED[1::2]), data, model="position", estimate_noise=True)
+    alone = calibrate(arm_with(*LISTED[1::2]), data, model="position", estimate_noise=True)
     assert found.robot.nominal == pytest.approx(alone.robot.nominal, abs=1e-9)
     found.save(tmp_path)
     for one in (found, Calibration.load(tmp_path)):
@@ -121,16 +108,16 @@ def test_effects_that_the_arm_has_are_kept_and_others_are_left(tmp_path):
         assert any(
             line.startswith("gain of joints 1, 2, 3, 4: p ") and line.endswith(": left, no evidence") for line in lines
         )
-    again = Job(None, choosing(arm(*LISTED)), measured(curved_and_compliant(1), 2), Options(model="position"))
+    again = Job(None, choosing(arm_with(*LISTED)), measured(curved_and_compliant(1), 2), Options(model="position"))
     assert found.check(again).verdict == "pass"
 
 
 def test_nothing_is_kept_of_an_arm_that_is_its_geometry():
-    job = Job(None, choosing(arm(*LISTED)), measured(drawn(arm(), 3), 3), Options(model="position"))
+    job = Job(None, choosing(arm_with(*LISTED)), measured(drawn(arm_with(), 3), 3), Options(model="position"))
     chosen, tests = select_effects(job, solve_job)
-    assert chosen.robot == arm()
+    assert chosen.robot == arm_with()
     assert [one.reason for one in tests] == ["no evidence"] * 4
-    plain = replace(job, robot=arm(*LISTED))
+    plain = replace(job, robot=arm_with(*LISTED))
     assert select_effects(plain, solve_job) == (plain, ())
 
 
@@ -151,14 +138,14 @@ def test_effects_are_tried_until_nothing_changes(monkeypatch):
             return EffectTest(name, (), 1.0, 1.0, 1.0, of_use.get(name, lambda kept: False)(kept))
 
     monkeypatch.setattr(selection, "_Choice", Scripted)
-    job = Job(None, choosing(arm(*LISTED)), measured(arm(), 0), Options(model="position"))
+    job = Job(None, choosing(arm_with(*LISTED)), measured(arm_with(), 0), Options(model="position"))
     assert select_effects(job, solve_job)[0].robot.effects == LISTED[1::2]
 
 
 @pytest.fixture(scope="module")
 def choice():
-    job = Job(None, choosing(arm(*LISTED)), measured(curved_and_compliant(2), 2, 60), Options(model="position"))
-    return selection._Choice(job, solve_job(replace(job, robot=arm())))
+    job = Job(None, choosing(arm_with(*LISTED)), measured(curved_and_compliant(2), 2, 60), Options(model="position"))
+    return selection._Choice(job, solve_job(replace(job, robot=arm_with())))
 
 
 @pytest.mark.parametrize("kept", [(), (1,), (1, 3)])

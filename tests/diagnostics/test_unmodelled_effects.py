@@ -7,22 +7,15 @@ import pytest
 from instruments import measured_by
 from reported import format_report
 from scipy.stats import binom, kstest
-from simulated import measure, plus, small_arm, true_robot
+from simulated import measure, measure_points, plus, small_arm, true_robot
 from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
 from touches import corners, touch
 
-from fg_calib import Measurements, Table, assess, build_problem, calibrate, solve
-from fg_calib.diagnostics.unmodelled_effects import (
-    LIKE_NOISE,
-    LINK,
-    basis_of,
-    find_change,
-    find_systematic,
-    forgotten_offsets,
-    regress,
-)
+from fg_calib import Table, assess, build_problem, calibrate, solve
+from fg_calib.diagnostics import LIKE_NOISE, basis_of
+from fg_calib.diagnostics.unmodelled_effects import LINK, find_change, find_systematic, forgotten_offsets, regress
 from fg_calib.graph import prior_rows, unknown_prior_rows
-from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass, build_chain, forward, pose
+from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass, pose
 from fg_calib.statistics import estimate_noise, spread_of
 
 
@@ -82,9 +75,7 @@ def with_curves(rng, *, harmonic=0.0, width=1.0, gravity=(0.0, 0.0, -9.81)):
     error = rng.normal(size=len(width)) * [p.tolerance or 0.0 for p in full.parameters] * width
     true = full.with_values(full.nominal + error)
     q = rng.uniform(-2.5, 2.5, (120, 4)) * [1.0, 1.0, 0.2, 1.0]
-    p = forward(build_chain(true), true.trig(q)).position + 1e-4 * rng.normal(size=(120, 3))
-    m = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
-    return solve(build_problem(robot.with_effects(*modelled), m, model="position"))
+    return solve(build_problem(robot.with_effects(*modelled), measure_points(true, q, rng), model="position"))
 
 
 @pytest.mark.parametrize("width", [1.0, 0.0])

@@ -3,29 +3,24 @@
 import gtsam
 import numpy as np
 import pytest
-from simulated import small_arm
+from simulated import arm_with, errors_of_all, measure_points, small_arm, within_tolerance
 from touches import corners, touch
 
-from fg_calib import Measurements, Options, Robot, build_problem, solve
+from fg_calib import Options, build_problem, solve
 from fg_calib.graph import NormalSystem, prior_rows, unknown_prior_rows
 from fg_calib.graph.normal_system import eliminate_more
 from fg_calib.graph.problem import square_root
-from fg_calib.robot import Compliance, ErrorCurve, Mass, build_chain, forward
+from fg_calib.robot import Compliance, ErrorCurve, Mass
 
-ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
-TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
 EFFECTS = (ErrorCurve([2, 3], knots=8, sigma=1e-3), Compliance([Mass(3, 10.0, (0.2, 0.0, 0.1))], [2, 3]))
 
 
 def problem_of(model="position", n=40, seed=0):
     """An arm with error curves and compliance, measured."""
     rng = np.random.default_rng(seed)
-    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE).with_effects(*EFFECTS)
-    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
-    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
-    q = rng.uniform(-2.5, 2.5, (n, 4))
-    p = forward(build_chain(true), true.trig(q)).position + 1e-4 * rng.normal(size=(n, 3))
-    data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
+    robot = arm_with(*EFFECTS)
+    true = within_tolerance(robot, rng)
+    data = measure_points(true, rng.uniform(-2.5, 2.5, (n, 4)), rng)
     return build_problem(robot, data, Options(model=model, gauge="prior")), true
 
 
@@ -72,12 +67,7 @@ def test_curves_and_compliance_are_within_their_sigmas():
     squares = []
     for seed in range(6):
         problem, true = problem_of(seed=seed)
-        solution = solve(problem)
-        v = solution.problem.variables
-        columns = np.concatenate([np.r_[one.columns] for one in (*v.items, *v.nuisance)])
-        places = np.concatenate([one.places for one in (*v.items, *v.nuisance)])
-        e = solution.parameters[places] - true.nominal[places]
-        root = solution.system.full_root[columns]
+        e, root = errors_of_all(solve(problem), true)
         squares.append(e @ np.linalg.pinv(root @ root.T, rcond=1e-12) @ e / root.shape[1])
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (6 * root.shape[1])))  # 4 sigma of the mean
 
@@ -99,8 +89,7 @@ def test_rows_of_more_variance_count_for_less():
 def test_points_in_contact_and_distances_between_them_tell_curves():
     rng = np.random.default_rng(4)
     robot = small_arm({"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}).with_effects(ErrorCurve([2, 4], knots=8))
-    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
-    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    true = within_tolerance(robot, rng)
     apart = [(0, k, 1e-4) for k in range(1, 8)]
     data = touch(true, corners(robot, 8, rng), 10, rng, distances=apart)
     solution = solve(build_problem(robot, data, Options(model="distance")))

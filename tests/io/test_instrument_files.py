@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import yaml
 from instruments import CAMERA, measured_by
+from refusals import refusal
 from scipy.spatial.transform import Rotation
 
-from fg_calib import InputError, Noise, calibrate, calibrate_job, read_job
+from fg_calib import Noise, calibrate, calibrate_job, read_job
 from fg_calib.io import read_measurements, write_csv, write_robot
 from fg_calib.measurements.kinds.board import COVARIANCE
 
@@ -126,9 +127,7 @@ CASES = [
 def test_a_cell_that_cannot_be_used_is_named(model, text, message, tmp_path):
     robot, _, _ = measured_by("anchors", np.random.default_rng(25))
     (tmp_path / "t.csv").write_text(text)
-    with pytest.raises(InputError) as error:
-        read_measurements(tmp_path / "t.csv", robot, model=model, noise=Noise(distance=1e-3))
-    assert str(error.value) == message
+    assert refusal(read_measurements, tmp_path / "t.csv", robot, model=model, noise=Noise(distance=1e-3)) == message
 
 
 @pytest.mark.parametrize(("column", "word"), [("anchor", "NA"), ("plane", "nan"), ("station", "-"), ("target", "None")])
@@ -138,8 +137,7 @@ def test_a_word_for_nothing_is_no_name(column, word, tmp_path):
     (tmp_path / "t.csv").write_text(f"{HEAD},x,y,z,{column},distance\n0,0,0,0,1,2,3,{word},1\n")
     model = column if column in ("anchor", "plane") else "position"
     empty = ", or an empty cell" * (column != "station")
-    with pytest.raises(InputError) as error:
-        read_measurements(tmp_path / "t.csv", robot, model=model)
+    error = refusal(read_measurements, tmp_path / "t.csv", robot, model=model)
     article = "an" if column == "anchor" else "a"
     expected = f"the name of {article} {column}{empty}"
-    assert str(error.value) == f"t.csv:2: {column}: found {word!r}, expected {expected}"
+    assert error == f"t.csv:2: {column}: found {word!r}, expected {expected}"

@@ -7,6 +7,7 @@ of another case, files of another kind or encoding, links in circles, control ch
 import datetime
 
 import pytest
+from refusals import refusal
 
 from fg_calib import InputError, Robot, read_job, read_robot
 from fg_calib.inputs import ORDINARY
@@ -183,6 +184,4 @@ def test_a_file_is_refused_in_one_line(tmp_path, case):
 
 @pytest.mark.parametrize(("given", "message"), FRAMES, ids=range(len(FRAMES)))
 def test_frames(given, message):
-    with pytest.raises(InputError) as caught:
-        read_measurements(given, ARM)
-    assert str(caught.value) == message
+    assert refusal(read_measurements, given, ARM) == message

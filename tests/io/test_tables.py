@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from oracle import frame
+from refusals import refusal
 from tolerances import rounding
 
 from fg_calib import InputError, Noise
@@ -221,9 +222,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("table", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_a_mistake_is_named_in_one_line(write, table, message):
-    with pytest.raises(InputError) as caught:
-        read_measurements(write(table), ARM)
-    assert str(caught.value) == message
+    assert refusal(read_measurements, write(table), ARM) == message
 
 
 def test_threads_of_polars_that_are_no_number_are_refused(write, monkeypatch):
@@ -233,9 +232,8 @@ def test_threads_of_polars_that_are_no_number_are_refused(write, monkeypatch):
 
 
 def test_an_unknown_file_is_named(write):
-    with pytest.raises(InputError) as caught:
-        read_measurements(write("", "poses.xlsx"), ARM)
-    assert str(caught.value) == "poses.xlsx: ending '.xlsx', expected one of .csv, .parquet, .pq; save the sheet as CSV"
+    caught = refusal(read_measurements, write("", "poses.xlsx"), ARM)
+    assert caught == "poses.xlsx: ending '.xlsx', expected one of .csv, .parquet, .pq; save the sheet as CSV"
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet", "frame"])

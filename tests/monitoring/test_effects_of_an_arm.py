@@ -2,29 +2,24 @@
 
 import numpy as np
 import pytest
+from simulated import arm_with, measure_points, within_tolerance
 
-from fg_calib import Measurements, Robot, calibrate
-from fg_calib.robot import Compliance, ErrorCurve, Mass, build_chain, forward
+from fg_calib import calibrate
+from fg_calib.robot import Compliance, ErrorCurve, Mass
 
-ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
-TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
-SIGMA = 5e-5
 EFFECTS = (ErrorCurve([2, 3], knots=12, sigma=1e-3), Compliance([Mass(3, 20.0, (0.2, 0.0, 0.1))], [2, 3]))
 
 
 def measured(robot, n, rng):
-    q = rng.uniform(-2.5, 2.5, (n, 4))
-    at = forward(build_chain(robot), robot.trig(q))
-    return Measurements.from_arrays(q, position=at.position + SIGMA * rng.normal(size=(n, 3)), sigma_position=SIGMA)
+    return measure_points(robot, rng.uniform(-2.5, 2.5, (n, 4)), rng, sigma=5e-5)
 
 
 @pytest.fixture(scope="module")
 def month():
     """The calibration, the arm with joint 3 softer by 50 urad/(N m), and its measurements."""
     rng = np.random.default_rng(3)
-    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE).with_effects(*EFFECTS)
-    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
-    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    robot = arm_with(*EFFECTS)
+    true = within_tolerance(robot, rng)
     calibration = calibrate(robot, measured(true, 80, rng), model="position", gauge="prior")
     values = true.nominal
     values[true.index("theta3.compliance")] += 5e-5

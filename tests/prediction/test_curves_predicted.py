@@ -6,29 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from simulated import ROWS, TOLERANCE, arm_with, measure_points, tool_points, within_tolerance
 
-from fg_calib import (
-    Calibration,
-    InputError,
-    Measurements,
-    Options,
-    Robot,
-    build_problem,
-    calibrate,
-    correct,
-    export,
-    predict,
-    read_robot,
-    solve,
-)
+from fg_calib import Calibration, InputError, Options, Robot, build_problem, calibrate, correct, export, predict, solve
 from fg_calib.graph.problem import square_root
-from fg_calib.io import read_joint_table, read_urdf
+from fg_calib.io import read_joint_table, read_robot, read_urdf
 from fg_calib.prediction import errors_at, predict_poses, workspace
 from fg_calib.robot import Backlash, Compliance, ErrorCurve, Gain, Mass, Thermal, build_chain, forward, spline
 from fg_calib.statistics import spread_of, with_left_out
 
-ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
-TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
 LOAD = Compliance([Mass(3, 10.0, (0.2, 0.0, 0.1))], [2, 3])
 MEASURED = 1.5
 """Joint 2 is measured within, [rad]."""
@@ -37,13 +23,10 @@ MEASURED = 1.5
 def drawn(seed=0, n=40, tolerance=TOLERANCE, **options):
     """A problem, and the true arm that it was measured on."""
     rng, effects = np.random.default_rng(seed), (ErrorCurve([2, 3], knots=8, sigma=1e-3), LOAD, Gain([2]))
-    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=tolerance).with_effects(*effects)
-    sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
-    true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
+    robot = arm_with(*effects, tolerance=tolerance)
+    true = within_tolerance(robot, rng)
     q = rng.uniform(-2.5, 2.5, (n, 4)) * [1.0, MEASURED / 2.5, 1.0, 1.0]
-    p = forward(build_chain(true), true.trig(q)).position + 1e-4 * rng.normal(size=(n, 3))
-    data = Measurements.from_arrays(q, position=p, sigma_position=1e-4)
-    return build_problem(robot, data, Options(model="position", **options)), true
+    return build_problem(robot, measure_points(true, q, rng), Options(model="position", **options)), true
 
 
 def position_derivative(variables, x, q):
@@ -111,7 +94,7 @@ def test_errors_over_a_range_without_rows_are_as_expected():
         problem, true = drawn(seed)
         solution = solve(problem)
         spread, robot = spread_of(solution), problem.robot.with_values(solution.parameters[: len(true.parameters)])
-        off = forward(build_chain(robot), robot.trig(q)).position - forward(build_chain(true), true.trig(q)).position
+        off = tool_points(robot, q) - tool_points(true, q)
         expected = [errors_at(spread, q[rows])[0].position for rows in (~far, far)]
         rms = [np.sqrt(np.square(off[rows]).sum(axis=1).mean()) for rows in (~far, far)]
         ratios.append(np.square(rms) / np.square(expected))
@@ -179,12 +162,12 @@ def test_damaged_curves_are_named_in_one_line(calibrated, tmp_path, change, mess
 def test_commands_count_effects_and_poses_for_the_controller_do_not(calibrated):
     found = calibrated[2]
     q = np.random.default_rng(5).uniform(-1.2, 1.2, (5, 4))
-    target = forward(build_chain(found.nominal.geometry), found.nominal.geometry.trig(q)).position
+    target = tool_points(found.nominal.geometry, q)
     points = correct(found, target, near=q)
     assert points.reached.all()
-    there = forward(build_chain(found.robot), found.robot.trig(points.readings)).position
+    there = tool_points(found.robot, points.readings)
     assert np.linalg.norm(there - target, axis=1).max() < 1e-9
-    controller = forward(build_chain(found.nominal.geometry), found.nominal.geometry.trig(points.readings)).position
+    controller = tool_points(found.nominal.geometry, points.readings)
     assert np.linalg.norm(controller - points.position, axis=1).max() < 1e-12
     assert np.linalg.norm(controller - target, axis=1).min() > 1e-5
 
@@ -192,14 +175,14 @@ def test_commands_count_effects_and_poses_for_the_controller_do_not(calibrated):
 def test_exports_without_effects_write_them_next_to_the_file(calibrated, tmp_path):
     found = calibrated[2]
     made, q = export(found, "hayati"), found.measured
-    at, without = (forward(build_chain(r), r.trig(q)).position for r in (found.robot, found.robot.geometry))
+    at, without = (tool_points(r, q) for r in (found.robot, found.robot.geometry))
     rms = 1e3 * np.sqrt(np.square(at - without).sum(axis=1).mean())
     assert "cannot hold error_curve, compliance, gain, without" in made.notes[0]
     assert f"off where it was measured: position {rms:.4g} mm RMS" in made.notes[0]
     made.write(tmp_path / "arm.yaml")
     geometry = read_robot(tmp_path / "arm.yaml")
     assert not geometry.effects
-    assert forward(build_chain(geometry), geometry.trig(q)).position == pytest.approx(without, abs=1e-9)
+    assert tool_points(geometry, q) == pytest.approx(without, abs=1e-9)
     rows = [line.split(",") for line in (tmp_path / "arm_curves.csv").read_text().splitlines()]
     assert rows[0] == ["joint", "angle", "correction"]
     coefficients = np.array([found.parameters[f"theta3.curve[{k}]"].estimate for k in range(8)])

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import yaml
+from refusals import refusal
 from simulated import paper_robot
 from tolerances import rounding
 
@@ -190,9 +191,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("text", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_a_mistake_is_named_in_one_line(folder, text, message):
-    with pytest.raises(InputError) as caught:
-        read(folder, text)
-    assert str(caught.value) == f"scenario.yaml: {message}"
+    assert refusal(read, folder, text) == f"scenario.yaml: {message}"
 
 
 def test_the_truth_is_written_in_the_units_of_the_scenario(folder):

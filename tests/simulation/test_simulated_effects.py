@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from oracle import tool_poses
 from scenarios import SIGMA, TOLERANCE, WALL
+from simulated import arm_with
 
-from fg_calib import InputError, Pairing, Robot, assess, build_problem, design, read_job, simulate, solve
+from fg_calib import InputError, Pairing, assess, build_problem, design, read_job, simulate, solve
 from fg_calib.prediction import errors_at
 from fg_calib.robot import Backlash, Compliance, Coupling, ErrorCurve, Gain, Harmonics, Mass, Thermal
 from fg_calib.simulation import Errors, GivenReadings, Instrument, RandomReadings, Scenario, write_simulation
 from fg_calib.statistics import spread_of
 
-ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
 MASSES = (Mass(2, 12.0, (0.2, 0.0, 0.1)), Mass(4, 5.0, (0.0, 0.0, 0.1)))
 BOARD = Instrument(model="board", name="board", boards=WALL | {"again": WALL["wall"]})
 PAIRS = Instrument(model="distance-rotation", name="pairs", pairs=Pairing("random", 200))
 
 
 def scenario(*effects, **changes):
-    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0.0, 0.2], tolerance=TOLERANCE).with_effects(*effects)
+    robot = arm_with(*effects, tolerance=TOLERANCE)
     errors = Errors("normal", {p.name: p.tolerance for p in robot.parameters if p.tolerance})
     given = {"configurations": RandomReadings(60), "noise": SIGMA, "job": {"model": "pose"}, "temperature": (12, 21)}
     return Scenario(robot, errors, **given | changes)

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from instruments import measured_by
+from refusals import refusal
 from simulated import measure, small_arm, true_robot, write_job
 
-from fg_calib import InputError, Limits, Options, calibrate
+from fg_calib import Limits, Options, calibrate
 
 TOOL = ("tool.x", "tool.y", "tool.z")
 ROBOT = small_arm(tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.01), estimate=TOOL)
@@ -84,9 +85,7 @@ def test_without_rows_held_out_nothing_is_evaluated(n_test, words):
     ("0.5 mm", "accept: found '0.5 mm', expected a Limits, such as Limits(position=5e-4)"),
 ])  # fmt: skip
 def test_wrong_limits_are_one_line(accept, message):
-    with pytest.raises(InputError) as error:
-        Options.of(accept=accept)
-    assert str(error.value).startswith(message)
+    assert refusal(Options.of, accept=accept).startswith(message)
 
 
 def of_job(tmp_path, fg_calib, accept, *arguments):
