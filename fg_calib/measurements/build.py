@@ -51,10 +51,10 @@ class Dataset(Brief):
 
         Args:
             robot: The robot.
-            values: Values of its parameters first, by which joints give way; nominal if None.
+            values: Values of its parameters first, by which loads are found; nominal if None.
         """
-        loads = (robot.nominal if values is None else values)[list(robot.loads)]
-        key = (tuple(joint.prismatic for joint in robot.joints), robot.effects, loads.tobytes())
+        at = robot.nominal if values is None else values[: len(robot.parameters)]
+        key = (tuple(joint.prismatic for joint in robot.joints), robot.effects, at.tobytes() if robot.loads else b"")
         if key not in self._trigs:
             if robot.loads:
                 self._trigs.clear()

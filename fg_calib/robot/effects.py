@@ -221,6 +221,10 @@ class Compliance(Effect, Record):
         if self.masses is None and self.gravity == "estimate":
             raise InputError("gravity", "found 'estimate' with free masses", "masses", "free masses tell no tilt")
 
+    @property
+    def by_loads(self) -> bool:
+        return True
+
     def _loads(self, robot: Robot, joint: int) -> list[tuple[int, int]]:
         """Free first moments that turn a joint: number of the link from 1, and axis."""
         return [(i + 1, axis) for i in range(joint, robot.n_joints) for axis in (0, 1)]
@@ -286,6 +290,8 @@ class Bending(Effect, Record):
     masses: Sequence[Mass]
     gravity: Sequence[float] = GRAVITY
 
+    by_loads = Compliance.by_loads
+
     def terms(self, robot: Robot) -> list[Term]:
         place = robot.end_of(0) - 1
         return [Term("base.bending", 1e-5, 0, place, axis) for axis in (Axis.RX, Axis.RY)]
@@ -308,6 +314,10 @@ class Backlash(Effect, Record):
     joints: Joints = "all"
     side: str = "moves"
     masses: Sequence[Mass] = ()
+
+    @property
+    def by_loads(self) -> bool:
+        return self.side == "load"
 
     def terms(self, robot: Robot) -> list[Term]:
         return [_own(robot, i, "backlash", 1e-3, -1) for i in _joints(robot, self.joints, "backlash")]

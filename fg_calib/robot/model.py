@@ -231,6 +231,11 @@ class Effect(ABC):
         for name, value in list(vars(self).items()):
             object.__setattr__(self, name, _as_tuple(value))
 
+    @property
+    def by_loads(self) -> bool:
+        """Whether its values are loads, which depend on the robot's parameters."""
+        return False
+
     @abstractmethod
     def terms(self, robot: "Robot") -> list[Term]:
         """The terms for a robot without effects.
@@ -409,9 +414,9 @@ class Robot(inputs.Record):
         return tuple(tuple(t for t in e.terms(self.geometry) if t.after is not None) for e in self.effects)
 
     @cached_property
-    def loads(self) -> tuple[int, ...]:
-        """Indices of the parameters by which joints give way: loads depend on them."""
-        return tuple(i for i, p in enumerate(self.parameters) if p.kind in ("compliance", "load", "tilt"))
+    def loads(self) -> bool:
+        """Whether effects follow loads, which depend on parameters: on lengths, and on how joints give way."""
+        return any(effect.by_loads for effect in self.effects)
 
     def trig(self, readings: Floats, context: Context | None = None, values: Floats | None = None) -> Floats:
         """Joint readings as the kernels take them, shape (n, n_joints + n_terms, 2).
@@ -422,7 +427,7 @@ class Robot(inputs.Record):
         Args:
             readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
             context: What else was measured there, by name: see `effects`.
-            values: Values of the parameters, by which loads are found where joints give way; nominal if None.
+            values: Values of the parameters, by which loads are found; nominal if None.
 
         Raises:
             InputError: The readings are of more or fewer joints.
@@ -438,10 +443,12 @@ class Robot(inputs.Record):
         if prismatic.any():
             trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
         values, parts, readings = self._nominal if values is None else values, [trig], np.asarray(readings)
+        arm = self.geometry
+        loaded = arm.with_values(values[: len(arm.parameters)]) if self.loads else arm
         for effect, terms in zip(self.effects, self.terms, strict=True):
             if terms:
                 at = np.array([values[self.index(t.name)] if t.name else 1.0 for t in terms])
-                parts.append(effect.values(self.geometry, readings, context or {}, at))
+                parts.append(effect.values(loaded if effect.by_loads else arm, readings, context or {}, at))
         return np.concatenate(parts, axis=1) if len(parts) > 1 else trig
 
     def with_effects(self, *effects: Effect) -> "Robot":

@@ -217,3 +217,11 @@ def test_effects_that_cannot_be_are_one_line(arm, effects, said):
 def test_an_unknown_kind_and_a_name_that_hides_it_are_one_line(name, kind):
     with pytest.raises(InputError, match=rf"parameter '{name}': kind '{kind}', expected a name that ends in its kind"):
         Parameter(name, kind, 1, 0.0)
+
+
+def test_loads_are_those_of_the_arm_as_its_parameters_are(arm):
+    robot = arm.with_effects(Compliance(MASSES, lateral=True), Bending(MASSES), Gain())
+    values = robot.nominal + 1e-3 * np.random.default_rng(2).normal(size=len(robot.parameters))
+    found = robot.trig(Q, None, values)
+    assert found == pytest.approx(robot.with_values(values).trig(Q), abs=1e-12)
+    assert np.abs(found - robot.trig(Q)).max() > 1e-3  # of tens of N m
