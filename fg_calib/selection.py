@@ -32,7 +32,7 @@ from fg_calib import graph
 from fg_calib.inputs import Figure, Floats, Integers, Probability, Record
 from fg_calib.job import Job
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import EFFECT_KINDS, EFFECTS, ErrorCurve
+from fg_calib.robot import EFFECTS, ErrorCurve
 from fg_calib.statistics.variance_components import settle
 
 SETTLED = 3e-3
@@ -185,9 +185,8 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
 def _with_effects(job: Job, kept: Collection[int]) -> Job:
     """The job with some of its robot's effects, by their numbers; their parameters stay as specified."""
     robot = job.robot
-    parameters = tuple(p for p in robot.parameters if p.kind not in EFFECT_KINDS)
-    bare = replace(robot.geometry, parameters=parameters, select_effects=False)
-    found = bare.with_effects(*(e for i, e in enumerate(robot.effects) if i in kept))
+    effects = (e for i, e in enumerate(robot.effects) if i in kept)
+    found = replace(robot.geometry, select_effects=False).with_effects(*effects)
     as_specified = tuple(robot.parameters[robot.index(p.name)] for p in found.parameters)
     return replace(job, robot=replace(found, parameters=as_specified))
 

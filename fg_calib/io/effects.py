@@ -134,7 +134,7 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
             options["masses"] = _mapping_of(options["masses"])
         if type(effect) not in keys:
             raise InputError(robot.name, f"an effect {type(effect).__name__}", f"of {', '.join(EFFECTS)}")
-        out[keys[type(effect)]] = _plain(options)
+        out[keys[type(effect)]] = {name: _plain(value) for name, value in options.items()}
     curves = defaultdict[str, list[float]](list)
     for p in robot.parameters:
         if p.kind == "curve":
@@ -149,11 +149,9 @@ def _mapping_of(masses: Sequence[Mass] | None) -> Any:
     """Masses by link; those on one link together."""
     if masses is None:
         return "free"
-    by_link = defaultdict[int, list[Mass]](list)
-    for one in masses:
-        by_link[one.link].append(one)
     out = {}
-    for link, each in by_link.items():
+    for link in dict.fromkeys(one.link for one in masses):
+        each = [one for one in masses if one.link == link]
         total = sum(one.mass for one in each)
         com = np.array([one.mass for one in each]) @ np.array([one.com for one in each]) / total
         out[link] = {"mass": total, "com": com.tolist()}
@@ -162,6 +160,4 @@ def _mapping_of(masses: Sequence[Mass] | None) -> Any:
 
 def _plain(value: Any) -> Any:
     """Tuples as lists: YAML has no others."""
-    if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
     return [_plain(one) for one in value] if isinstance(value, list | tuple) else value

@@ -33,7 +33,7 @@ import numpy as np
 
 from fg_calib.inputs import Floats, InputError, Record, check_number, shown
 from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Robot, Term
+from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Parameter, Robot, Term
 
 Joints = Literal["all"] | Sequence[int]
 """Numbers of joints from 1; all that turn, for gains all."""
@@ -226,8 +226,8 @@ class Compliance(Effect, Record):
         return True
 
     def _loads(self, robot: Robot, joint: int) -> list[tuple[int, int]]:
-        """Free first moments that turn a joint: number of the link from 1, and axis."""
-        return [(i + 1, axis) for i in range(joint, robot.n_joints) for axis in (0, 1)]
+        """Free first moments that turn a joint: number of the link from 1, and axis; none of known masses."""
+        return [(i + 1, axis) for i in range(joint, robot.n_joints) for axis in (0, 1) if self.masses is None]
 
     def terms(self, robot: Robot) -> list[Term]:
         joints = _joints(robot, self.joints, "compliance")
@@ -235,10 +235,9 @@ class Compliance(Effect, Record):
             loads = [(i, link, axis) for i in joints for link, axis in self._loads(robot, i)]
             return [_own(robot, i, f"load{link}{'xy'[axis]}", 1e-3, -1) for i, link, axis in loads]
         terms = [_own(robot, i, "compliance", 1e-4, -1) for i in joints]
-        for i in joints if self.lateral else ():
-            place = _moving(robot, i)[0]
-            kinds = (("x", Axis.RX), ("y", Axis.RY))
-            terms += [Term(f"{_prefix(robot, i)}.compliance_{x}", 1e-4, i + 1, place - 1, axis) for x, axis in kinds]
+        for i, axis in [(i, axis) for i in joints for axis in (Axis.RX, Axis.RY) if self.lateral]:
+            name = f"{_prefix(robot, i)}.compliance_{'xy'[axis - Axis.RX]}"
+            terms.append(Term(name, 1e-4, i + 1, _moving(robot, i)[0] - 1, axis))
         if self.gravity == "estimate":
             names = ("base.tilt_x", "base.tilt_y", "")
             terms += [_own(robot, i, "", 2e-2, -1)._replace(name=name, owner=0) for name in names for i in joints]
@@ -252,10 +251,9 @@ class Compliance(Effect, Record):
         along = gravity + np.cross([*tilts, 0.0], gravity)
         own = self._torques(robot, readings, joints, along)
         if np.any(at[: own.shape[1]]):  # as the joints have turned
-            counts = [len(self._loads(robot, i)) if self.masses is None else 1 for i in joints]
-            turned = readings.copy()
-            turned[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
-            readings = turned
+            counts = [len(self._loads(robot, i)) or 1 for i in joints]
+            readings = readings.copy()
+            readings[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
             own = self._torques(robot, readings, joints, along)
         parts = [own]
         if self.lateral and self.masses is not None:
@@ -271,10 +269,8 @@ class Compliance(Effect, Record):
         moments, columns = _Moments(robot, readings, gravity), list[Floats]()
         for i in joints:
             place, e = _moving(robot, i)
-            if self.masses is not None:
-                each = [moments.of_masses(place, self.masses)]
-            else:
-                each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
+            each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
+            each = each or [moments.of_masses(place, self.masses or ())]
             columns += [e.sign * m[:, 2] for m in each]
         return np.stack(columns, axis=1)
 
@@ -373,31 +369,27 @@ class Thermal(Effect, Record):
     zeros: bool = False
     column: str = "temperature"
 
-    def _lengths(self, robot: Robot) -> list[tuple[int, int]]:
-        """Element and parameter of each length of the joints that grows: none that a calibration may find, or lose."""
-        found = []
-        for i, e in enumerate(robot.elements):
-            if self.lengths and e.axis < Axis.RX and e.parameter is not None:
-                p = robot.parameters[e.parameter]
-                if 1 <= p.owner <= robot.n_joints and abs(p.nominal) >= LEAST_LENGTH:
-                    found.append((i, e.parameter))
-        return found
+    def _lengths(self, robot: Robot) -> list[tuple[int, Element, Parameter]]:
+        """Place, element and parameter of each length that grows: none that a calibration may find, or lose."""
+        places = enumerate(robot.elements if self.lengths else ())
+        of = [(i, e, robot.parameters[e.parameter]) for i, e in places if e.axis < Axis.RX and e.parameter is not None]
+        return [(i, e, p) for i, e, p in of if 1 <= p.owner <= robot.n_joints and abs(p.nominal) >= LEAST_LENGTH]
+
+    def _drifting(self, robot: Robot) -> list[int]:
+        return _joints(robot, "all" if self.zeros else (), "thermal")
 
     def terms(self, robot: Robot) -> list[Term]:
         terms = []
-        for i, k in self._lengths(robot):
-            p, e = robot.parameters[k], robot.elements[i]
+        for i, e, p in self._lengths(robot):
             frame, _, kind = p.name.rpartition(".")
             name = f"{frame}.expansion_{kind}" if frame else f"{kind}.expansion"
             terms.append(Term(name, 1e-4, p.owner, i, e.axis, e.sign))
-        joints = _joints(robot, "all", "thermal") if self.zeros else []
-        return terms + [_own(robot, i, "drift", 1e-4, -1) for i in joints]
+        return terms + [_own(robot, i, "drift", 1e-4, -1) for i in self._drifting(robot)]
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         warmer = np.nan_to_num(context.get(self.column, np.full(len(readings), self.reference)) - self.reference)
-        lengths = [robot.parameters[k].nominal for _, k in self._lengths(robot)]
-        zeros = [1.0] * len(_joints(robot, "all", "thermal")) if self.zeros else []
-        return _with_slopes(warmer[:, None] * np.array([*lengths, *zeros]))
+        lengths = [p.nominal for *_, p in self._lengths(robot)]
+        return _with_slopes(warmer[:, None] * np.array(lengths + [1.0] * len(self._drifting(robot))))
 
     def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
         return {self.column: read([self.column])[:, 0]}

@@ -127,9 +127,7 @@ def solve_inverse(
     return Inverse(best, search.length * np.linalg.norm(missed[:, 3:], axis=1), np.linalg.norm(missed[:, :3], axis=1))
 
 
-def _starts(
-    robot: Robot, near: ArrayLike | None, shape: tuple[int, int, int], generator: np.random.Generator
-) -> Floats:
+def _starts(robot: Robot, near: ArrayLike | None, shape: tuple[int, ...], generator: np.random.Generator) -> Floats:
     """Configurations to start from, random or ever wider about one, shape (n_poses, n_starts, n_joints)."""
     n_poses, n_starts, n_joints = shape
     if near is None:

@@ -71,26 +71,19 @@ class ParameterKind(NamedTuple):
     axis: Axis = Axis.RZ
 
 
+_AXES = {
+    **{"theta": Axis.RZ, "d": Axis.TZ, "a": Axis.TX, "alpha": Axis.RX, "beta": Axis.RY},
+    **{"x": Axis.TX, "y": Axis.TY, "z": Axis.TZ, "yaw": Axis.RZ, "pitch": Axis.RY, "roll": Axis.RX},
+}
+"""Elementary transforms of the kinds of geometry."""
+
 PARAMETER_KINDS: Mapping[str, ParameterKind] = {
-    "theta": ParameterKind("rad", Axis.RZ),
-    "d": ParameterKind("m", Axis.TZ),
-    "a": ParameterKind("m", Axis.TX),
-    "alpha": ParameterKind("rad", Axis.RX),
-    "beta": ParameterKind("rad", Axis.RY),
-    "x": ParameterKind("m", Axis.TX),
-    "y": ParameterKind("m", Axis.TY),
-    "z": ParameterKind("m", Axis.TZ),
-    "yaw": ParameterKind("rad", Axis.RZ),
-    "pitch": ParameterKind("rad", Axis.RY),
-    "roll": ParameterKind("rad", Axis.RX),
-    "compliance": ParameterKind("rad/(N m)"),
-    "bending": ParameterKind("rad/(N m)"),
+    **{kind: ParameterKind("m" if axis < Axis.RX else "rad", axis) for kind, axis in _AXES.items()},
+    **dict.fromkeys(("compliance", "bending"), ParameterKind("rad/(N m)")),
     "tilt": ParameterKind("rad"),
     "load": ParameterKind("rad s^2/m"),
     "gain": ParameterKind("1"),
-    "sin": ParameterKind("rad"),
-    "cos": ParameterKind("rad"),
-    "backlash": ParameterKind("rad"),
+    **dict.fromkeys(("sin", "cos", "backlash"), ParameterKind("rad")),
     "coupling": ParameterKind("1"),
     "expansion": ParameterKind("1/K"),
     "drift": ParameterKind("rad/K"),
@@ -629,7 +622,7 @@ class RobotBuilder:
     def add_frame(self, prefix: str, values: Mapping[str, float], owner: int, estimated: bool) -> None:
         """Append a frame: six parameters `prefix.x` ... `prefix.yaw`; missing values are 0, [m] or [rad]."""
         for kind in FRAME_KINDS:
-            self._add_parameter(f"{prefix}.{kind}", kind, owner, values.get(kind, 0.0), estimated)
+            self._add_parameter(f"{prefix}.{kind}", owner, values.get(kind, 0.0), estimated)
 
     def add_constant_frame(self, values: Mapping[str, float], *, backwards: bool = False) -> None:
         """Append a frame that has no parameters, such as a fixed joint of a URDF, or its inverse (`backwards`)."""
@@ -649,9 +642,7 @@ class RobotBuilder:
         self._joints.append(joint)
         moving = "d" if joint.prismatic else "theta"
         for kind in CONVENTIONS[self._convention]:
-            self._add_parameter(
-                f"{kind}{index + 1}", kind, index + 1, values[kind], True, index if kind == moving else None
-            )
+            self._add_parameter(f"{kind}{index + 1}", index + 1, values[kind], True, index if kind == moving else None)
 
     @checked
     def add_urdf_joint(
@@ -672,7 +663,7 @@ class RobotBuilder:
         onto = _onto(axis)
         self._elements += onto
         if zero:
-            self._add_parameter(f"{joint.name}.zero", "theta", index + 1, 0.0, True, index)
+            self._add_parameter(f"{joint.name}.zero", index + 1, 0.0, True, index)
         else:
             self._elements.append(Element(Axis.TZ if joint.prismatic else Axis.RZ, joint=index))
         self._elements += _inverse(onto)
@@ -709,7 +700,7 @@ class RobotBuilder:
         kinds = SCREW_KINDS[2:] if joint.prismatic else SCREW_KINDS
         self._elements += there
         for kind in kinds:
-            self._add_parameter(f"{joint.name}.{kind}", kind, index + 1, (values or {}).get(kind, 0.0), True)
+            self._add_parameter(f"{joint.name}.{kind}", index + 1, (values or {}).get(kind, 0.0), True)
         there += self._elements[-len(kinds) :]
         self._elements += [Element(Axis.TZ if joint.prismatic else Axis.RZ, joint=index), *_inverse(there)]
 
@@ -779,9 +770,8 @@ class RobotBuilder:
                 limits = f"{joint.lower:g} to {joint.upper:g} rad"
                 _log.warning("%s: joint %s has limits of %s; are they in deg?", place, escaped(joint.name), limits)
 
-    def _add_parameter(
-        self, name: str, kind: str, owner: int, nominal: float, estimated: bool, joint: int | None = None
-    ) -> None:
+    def _add_parameter(self, name: str, owner: int, nominal: float, estimated: bool, joint: int | None = None) -> None:
+        kind = kind_of(name)
         parameter = Parameter(name, kind, owner, float(nominal), estimated=estimated)
         self._elements.append(Element(PARAMETER_KINDS[kind].axis, parameter=len(self._parameters), joint=joint))
         self._parameters.append(parameter)
