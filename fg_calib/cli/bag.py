@@ -37,7 +37,7 @@ def bag(
     stops = importers.average_stops(of_joints, of_pose, arm, still=still, offset=offset, most_offset=most_offset)
     if out is not None:
         importers.write_stops(out, stops, arm)
-    found = (recording.name, of_joints, of_pose, stops)
+    found = recording.name, {"joints": _topic(of_joints), "pose": _topic(of_pose)}, stops
     show_result(as_json, lambda: _document(*found), lambda: _report(*found))
     nothing = "nothing is written: --out poses.csv writes the table"
     say(nothing if out is None else f"wrote {len(stops.ids)} poses to {out}")
@@ -47,27 +47,23 @@ def _topic(stream: "importers.JointStream | importers.PoseStream") -> dict[str, 
     return asdict(stream.source) | {"messages": len(stream.time), "period": importers.period(stream.time)}
 
 
-def _document(
-    name: str, joints: "importers.JointStream", poses: "importers.PoseStream", stops: "importers.Stops"
-) -> dict[str, Any]:
+def _document(name: str, topics: dict[str, Any], stops: "importers.Stops") -> dict[str, Any]:
     """The content of the recording for programs: [m], [rad], [s]."""
     from fg_calib.report import plain
 
     found = {"n_found": len(stops.ids) + len(stops.skipped), "n_written": len(stops.ids)}
     offsets = {"offset": stops.offset, "applied_offset": stops.applied}
-    skipped, topics = [s._asdict() for s in stops.skipped], {"joints": _topic(joints), "pose": _topic(poses)}
+    skipped = [s._asdict() for s in stops.skipped]
     more = {"topics": topics, **offsets, **found, "skipped": skipped, "scatter": stops.scatter}
     return plain({"schema": "fg-calib/bag/1", "bag": name, **more})
 
 
-def _report(
-    name: str, joints: "importers.JointStream", poses: "importers.PoseStream", stops: "importers.Stops"
-) -> Group:
+def _report(name: str, topics: dict[str, Any], stops: "importers.Stops") -> Group:
     """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
     from fg_calib.report import line, report, section, table_of
 
-    topics, n = {"joints": _topic(joints), "poses": _topic(poses)}, len(stops.ids)
-    streams = [(what, t["topic"], t["type"], t["messages"], 1.0 / t["period"]) for what, t in topics.items()]
+    named, n = zip(("joints", "poses"), topics.values(), strict=True), len(stops.ids)
+    streams = [(what, t["topic"], t["type"], t["messages"], 1.0 / t["period"]) for what, t in named]
     units = {"position": "mm", "joint": "mrad or mm"}
     columns, scatter, rough = ("", "of one|>", "of the mean|>", "correlated over|>"), [], []
     for what, s in stops.scatter.items():

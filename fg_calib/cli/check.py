@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -57,10 +57,8 @@ def update(
     io.require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
     before = calibration.Calibration.load(result)
     units = {name: p.unit for p in before.robot.parameters for name in (robot.tolerance_kind(p), p.name) if name}
-    drift, new = _growth(growth or (), units), changed or ()
-    found = before.update(
-        table, date=date, growth=drift, changed=new, anchors_stay=anchors_stay, pairs=pairs, like=like
-    )
+    since: dict[str, Any] = {"date": date, "growth": _growth(growth or (), units), "changed": changed or ()}
+    found = before.update(table, **since, anchors_stay=anchors_stay, pairs=pairs, like=like)
     found.save(out)
     show_calibration(found, as_json)
 

@@ -74,10 +74,8 @@ def compare(
     from fg_calib.report import write_document
 
     if new is not None:
-        both, files = (io.read_result(job), io.read_result(new)), (job, new)
-        show_result(
-            as_json, lambda: report.changes_document(*both, files), lambda: report.build_changes_report(*both, files)
-        )
+        of = io.read_result(job), io.read_result(new), (job, new)
+        show_result(as_json, lambda: report.changes_document(*of), lambda: report.build_changes_report(*of))
         return
     found = baseline.comparison.compare(io.read_job(job))
     if out is not None:

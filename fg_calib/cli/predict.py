@@ -1,5 +1,6 @@
 """`fg-calib predict` and `correct`: what a calibration is good for."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -27,11 +28,8 @@ def predict(
     found = predict_tool(arm, readings, context, limit=limit)
     if out is not None:
         report.write_prediction(out, found, arm.result, arm.robot, ids, units)
-    show_result(
-        as_json,
-        lambda: report.prediction_document(found, arm.result, ids),
-        lambda: report.build_prediction_report(found, arm.result, arm.robot, ids),
-    )
+    document = partial(report.prediction_document, found, arm.result, ids)
+    show_result(as_json, document, lambda: report.build_prediction_report(found, arm.result, arm.robot, ids))
     if out is not None:
         say(f"wrote the prediction to {out}")
     end(arm.findings)
@@ -58,11 +56,8 @@ def correct(
     commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)
     if out is not None:
         report.write_commands(out, wanted.ids, commands, found.robot, units)
-    show_result(
-        as_json,
-        lambda: report.correction_document(found.robot.name, wanted.ids, commands),
-        lambda: report.build_correction_report(wanted.ids, commands, found.robot),
-    )
+    document = partial(report.correction_document, found.robot.name, wanted.ids, commands)
+    show_result(as_json, document, lambda: report.build_correction_report(wanted.ids, commands, found.robot))
     say(f"wrote {len(wanted.ids)} commands to {out}" if out else "nothing is written: --out commands.csv writes them")
     left = int((~commands.reached).sum())
     doubts = [f"the calibration was not to be trusted: {finding}" for finding in found.findings]

@@ -207,13 +207,8 @@ def nearest_point(M: Floats, height: float) -> dict[str, float]:
     (x, y, z_), P = turn @ z, turn @ P
     beta = float(np.arctan(x / z_))  # x square to z', also where the axes meet
     c, s = np.cos(beta), np.sin(beta)
-    return {
-        "theta": theta,
-        "d": height,
-        "beta": beta,
-        "a": c * P[0] - s * P[2],
-        "alpha": np.arctan2(-y, s * x + c * z_),
-    }
+    a, alpha = c * P[0] - s * P[2], np.arctan2(-y, s * x + c * z_)
+    return {"theta": theta, "d": height, "beta": beta, "a": a, "alpha": alpha}
 
 
 def left_over(M: Floats, row: Mapping[str, float]) -> Floats:

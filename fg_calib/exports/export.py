@@ -127,8 +127,8 @@ def export(
     given: dict[str, Any] = {"configurations": configurations is not None, "tool": tool != "calibrated", "far": far}
     given |= {"ur_base": ur_base, "ur_hash": ur_hash}
     for name, value in given.items():
-        if value not in (None, False) and to not in _FORMATS_OF[name]:
-            raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_FORMATS_OF[name])}")
+        if value not in (None, False) and to not in _ONLY_IN[name]:
+            raise InputError(name, f"means nothing for {to}", f"the format {' or '.join(_ONLY_IN[name])}")
     if isinstance(arm, Calibration):
         robot, nominal, doubts = arm.robot, nominal or arm.nominal, (arm.findings, arm.not_accepted)
     else:
@@ -180,10 +180,12 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
 _Content = tuple[str, Sequence[str], dict[str, Any]]
 """Text of a format, without comments unless it is XML; notes, and details as in `Export`."""
 
-_FORMATS_OF: Mapping[str, tuple[str, ...]] = {
-    **dict.fromkeys(("configurations", "tool"), ("zeros",)),
-    **dict.fromkeys(("ur_base", "ur_hash"), ("ur",)),
-    "far": ("dh", "mdh"),
+_ONLY_IN = {
+    "configurations": ["zeros"],
+    "tool": ["zeros"],
+    "far": ["dh", "mdh"],
+    "ur_base": ["ur"],
+    "ur_hash": ["ur"],
 }
 """The formats for which an option means something."""
 
@@ -261,9 +263,8 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
     order = " ".join(f"{PARAMETER_KINDS[kind].axis.name.capitalize()}({kind})" for kind in CONVENTIONS[convention])
     notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
     if exact:
-        notes.append(
-            f"the same arm, base and tool hold what rows do not; over {error.n} configurations {_error_words(error)}"
-        )
+        over = f"over {error.n} configurations {_error_words(error)}"
+        notes.append(f"the same arm, base and tool hold what rows do not; {over}")
     else:
         notes += [f"NOT EXACT: {reason}" for reason in reasons]
         notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")

@@ -64,10 +64,9 @@ def urdf_joints(robot: Robot) -> list[UrdfJoint]:
         InputError: A joint's value is more than its reading plus a constant.
     """
     links: Links = links_of(robot)
-    joints = [UrdfJoint("base_frame", None, FIRST_LINK, links.base)]
-    for i, joint in enumerate(robot.joints):
-        joints.append(UrdfJoint(joint.name, joint, f"link_{i + 1}", links.between[i]))
-    return [*joints, UrdfJoint("tool_frame", None, TOOL_LINK, links.between[-1] @ links.tool)]
+    moving = [UrdfJoint(joint.name, joint, f"link_{i + 1}", links.between[i]) for i, joint in enumerate(robot.joints)]
+    tool = UrdfJoint("tool_frame", None, TOOL_LINK, links.between[-1] @ links.tool)
+    return [UrdfJoint("base_frame", None, FIRST_LINK, links.base), *moving, tool]
 
 
 def new_urdf(robot: Robot, comments: Sequence[str]) -> str:

@@ -48,6 +48,7 @@ from .result import (
 )
 from .robot_file import (
     ROUNDING,
+    Bound,
     FrameValues,
     joint_origins,
     read_robot,
@@ -74,7 +75,6 @@ from .tables import (
 from .yaml import (
     ANGLES,
     LENGTHS,
-    Bound,
     Count,
     FilePath,
     NotNegative,

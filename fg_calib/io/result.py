@@ -25,17 +25,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import scipy
-from pydantic import (
-    AliasPath,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    PlainSerializer,
-    PlainValidator,
-    ValidationError,
-    WrapSerializer,
-)
+from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, ValidationError
+from pydantic.functional_serializers import PlainSerializer, WrapSerializer
 
 from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
@@ -74,17 +65,10 @@ Observability = Annotated[
 """Identifiability by the data; flat in JSON."""
 
 
-class Section(BaseModel):
+class Section(BaseModel, defer_build=True, populate_by_name=True):
     """A part of a document; it may be made of any object that has its fields as attributes."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        from_attributes=True,
-        populate_by_name=True,
-        protected_namespaces=(),
-        defer_build=True,
-        loc_by_alias=False,
-    )
+    model_config = ConfigDict(frozen=True, from_attributes=True, protected_namespaces=(), loc_by_alias=False)
 
 
 def of(path: str, default: Any = ...) -> Any:

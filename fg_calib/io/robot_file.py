@@ -35,19 +35,7 @@ from pydantic import BeforeValidator, Field
 from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
-from fg_calib.io.yaml import (
-    Bound,
-    FilePath,
-    Loader,
-    Number,
-    Positive,
-    Schema,
-    Units,
-    UnitsOfFile,
-    read_yaml,
-    validate,
-    within,
-)
+from fg_calib.io.yaml import FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate, within
 from fg_calib.robot import Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
@@ -114,7 +102,9 @@ def read_urdf(
         InputError: There is no such file, it is not a URDF, or the chain is not one of revolute, continuous,
             prismatic and fixed joints.
     """
-    path = _checked_path(path)
+    if str(path).lstrip().startswith("<"):
+        raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
+    path = Path(path)
     text, root = _parse(read_bytes(path), path.name)
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", model.frame_values("base", base), 0, False)
@@ -131,13 +121,9 @@ def read_urdf(
         hint = _XACRO if any("xacro" in str(element.tag) for element in root.iter()) else error.hint
         raise InputError(error.place, error.found, error.expected, hint) from None
     builder.add_frame("tool", model.frame_values("tool", tool), n_joints + 1, False)
-    choices = {
-        "fixed": fixed,
-        "estimate": estimate,
-        "tolerance": tolerance,
-        "urdf": UrdfSource(text, base_link, tip_link),
-    }
-    return _with_effects(builder, effects or {}, _links_of(root, tree, chain, base_link), place or path.name, **choices)
+    choices = {"fixed": fixed, "estimate": estimate, "tolerance": tolerance}
+    links, source = _links_of(root, tree, chain, base_link), UrdfSource(text, base_link, tip_link)
+    return _with_effects(builder, effects or {}, links, place or path.name, urdf=source, **choices)
 
 
 def _links_of(root: Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base_link: str) -> dict[str, Any]:
@@ -183,12 +169,6 @@ def _with_effects(
     robot = builder.build(effects=read_effects(given, where, links, builder.n_joints), place=place, **choices)
     robot = replace(robot, select_effects=bool(given.get("select", False)))
     return with_coefficients(robot, coefficients, f"{where}: values")
-
-
-def _checked_path(path: Path | str) -> Path:
-    if str(path).lstrip().startswith("<"):
-        raise InputError("path", "found XML text", "the path of a URDF", "write the text to a file")
-    return Path(path)
 
 
 _CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
@@ -525,6 +505,10 @@ class _Robot(Schema):
         return {"fixed": self.fixed, "estimate": (*self.estimate, *estimate), "tolerance": tolerance}
 
 
+Bound = Annotated[float, Field(strict=True, allow_inf_nan=True)]
+"""A number, or infinity."""
+
+
 class _JointRow(Schema):
     type: Literal["revolute", "prismatic"] = "revolute"
     name: str | None = None
@@ -641,8 +625,7 @@ def _build_rows(file: _DhRobot | _PoeRobot, place: str, estimate: Sequence[str])
         else:
             builder.add_convention_joint(joint, _values(row, file.convention, file.units, here))
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
-    n = len(names)
-    links = {str(i): partial(Mass, i) for i in range(n + 1)}
+    links = {str(i): partial(Mass, i) for i in range(len(names) + 1)}
     robot = _with_effects(builder, file.effects, links, place, **file.choices(place, estimate))
     return replace(robot, units=(file.units.length, file.units.angle))
 
@@ -722,8 +705,7 @@ def robot_text(
     for key, owned in (("base", base), ("tool", tool)):
         frame = [robot.parameters[i] for i in owned]
         mapping |= {key: {p.kind: units.from_si(p.nominal, p.unit) for p in frame if p.nominal != 0.0}}
-    of_frames = [robot.parameters[i] for i in (*base, *tool)]
-    zeros = has_own_zeros(robot)
+    of_frames, zeros = [robot.parameters[i] for i in (*base, *tool)], has_own_zeros(robot)
     of_joints = [p for p in robot.parameters if p not in of_frames and (not zeros or p.name in robot.zero_names)]
     mapping |= {
         "fixed": [p.name for p in of_joints if not p.estimated],
@@ -734,12 +716,9 @@ def robot_text(
     mapping = {key: value for key, value in mapping.items() if value or key == "joints"}
     if robot.urdf is None:
         place = place or robot.name
-        written = robot_from_mapping(mapping, place, Path())
-        require_same_chain(robot, written, place)
-    text = yaml.dump(
-        mapping, Dumper=_Dumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf
-    )
-    return str(text)
+        require_same_chain(robot, robot_from_mapping(mapping, place, Path()), place)
+    style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "allow_unicode": True, "width": math.inf}
+    return str(yaml.dump(mapping, Dumper=_Dumper, **style))
 
 
 def require_same_chain(robot: Robot, written: Robot, place: str) -> None:
@@ -801,6 +780,4 @@ class _Dumper(yaml.SafeDumper):
     yaml_implicit_resolvers = Loader.yaml_implicit_resolvers  # quotes what reads as a number
 
 
-_Dumper.add_representer(
-    _Flow, lambda dumper, row: dumper.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True)
-)
+_Dumper.add_representer(_Flow, lambda to, row: to.represent_mapping("tag:yaml.org,2002:map", row, flow_style=True))

@@ -391,9 +391,7 @@ def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None
     write_text(Path(path), frame.select(*columns).write_csv())
 
 
-_NOT_JOINTS = names_of(
-    OF_CONFIGURATIONS[name] for name in ("id", "split", "group", "x", "qx", "roll", "sigma_x", "sigma_rx")
-)
+_NOT_JOINTS = names_of(OF_CONFIGURATIONS[k] for k in ("id", "split", "group", "x", "qx", "roll", "sigma_x", "sigma_rx"))
 """Names of columns that a joint's readings cannot have, whatever the model."""
 
 _BY_AXIS = {"position": "sigma_x", "orientation": "sigma_rx", "pixel": "sigma_u"}

@@ -19,9 +19,6 @@ from fg_calib.robot import SCALES
 Number = Annotated[float, Field(strict=True, ge=-MOST_SIZE, le=MOST_SIZE)]
 """A finite number."""
 
-Bound = Annotated[float, Field(strict=True, allow_inf_nan=True)]
-"""A number, or infinity."""
-
 Positive = Annotated[float, Field(strict=True, gt=0, le=MOST_SIZE)]
 """A finite number above 0."""
 
