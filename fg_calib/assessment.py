@@ -206,5 +206,4 @@ def assess(solution: graph.Solution) -> Assessment:
     names = whole.variables.names[: whole.variables.n_robot_columns]
     expected = None if problem.evaluated else expected_error(problem, whole)
     found = (spread, whole, fit, identifiability, verdict, expected)
-    assessment = Assessment(robot, estimates, names, whole.named(), *found)
-    return assessment.with_held_out((), solution)
+    return Assessment(robot, estimates, names, whole.named(), *found).with_held_out((), solution)

@@ -193,8 +193,7 @@ class Calibration(Record, repr=False, eq=False):
         result, folder = io.read_result(path), Path(path) if io.is_folder(Path(path)) else Path(path).parent
         robot = _with_priors(io.read_calibrated_robot(folder, result), result)
         nominal = robot.with_values([p.nominal for p in result.parameters])  # columns are scaled by its reach
-        posterior = _posterior(nominal, result, f"{folder / 'result.json'}: posterior")
-        return cls(robot, result, posterior, folder=folder)
+        return cls(robot, result, _posterior(nominal, result, f"{folder / 'result.json'}: posterior"), folder=folder)
 
     @checked
     def save(
@@ -594,8 +593,7 @@ def predict(
         raise InputError(place, "nothing says what was measured", expected)
     at = None if readings is None else _possible_readings("readings", readings, found.robot)
     sigma = found.result.sigma_joint if np.any(found.result.sigma_joint > 0.0) else None
-    fitted = found.result.free_of_frame
-    more: dict[str, Any] = {"fitted": fitted, "limit": limit, "context": context}
+    more: dict[str, Any] = {"fitted": found.result.free_of_frame, "limit": limit, "context": context}
     return predict_errors(found.robot, found.posterior, there, at, sigma_joint=sigma, **more)
 
 

@@ -177,9 +177,8 @@ def inspect_job(job: Job) -> Inspection:
     disagreements = () if misread else _disagreements(job)
     identifiability = identifiability_of(problem.whole or problem, problem.start, "practical")
     expected = None if problem.evaluated else expected_error(problem, with_left_out(at_nominal, spread))
-    n_unknowns = problem.variables.n_columns + problem.variables.n_nuisance
     dof = problem.n_independent + problem.n_priors - n_directions
-    counts = (problem.n_residuals, problem.n_priors, n_unknowns, dof)
+    counts = (problem.n_residuals, problem.n_priors, problem.variables.n_columns + problem.variables.n_nuisance, dof)
     excluded = {reason: n for reason, n in problem.n_excluded.items() if n}
     rows = (surveys, _joints(problem, job.robot), tuple(setups), disagreements)
     found = Inspection(job.robot.name, *rows, identifiability, expected, *counts, excluded, problem.evaluated)

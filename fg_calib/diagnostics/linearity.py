@@ -138,8 +138,7 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
             flips |= prior_along > np.maximum(to_180 / 2.0, 2.0 * sigma) ** 2
             leverage, across = _without_itself(direction, J @ sqrt_cov, np.maximum(sigma, 1e-300))
             half = 0.5 * np.maximum(f, 1e-300)
-            second_order = 0.25 * across / (half if is_length else np.tan(half))
-            turns = second_order > MAX_SECOND_ORDER * sigma
+            turns = 0.25 * across / (half if is_length else np.tan(half)) > MAX_SECOND_ORDER * sigma
             for found, which in ((names, flips), (turned, turns)):
                 found += ["-".join(problem.end_names[i + 1] for i in pair) for pair in places[which & used]]
             n_rows += int(used.sum())

@@ -80,8 +80,7 @@ def multistart(solution: Solution) -> Solution:
         indistinct = 2.0 * (one.objective - kept.objective) < CHI2_INDISTINCT
         if indistinct and _is_an_arm(one, kept) and all(_apart(one, other) for other in (kept, *others)):
             others.append(one)
-    seconds = sum(one.seconds for one in found)
-    return replace(kept, others=tuple(one.parameters for one in others), seconds=seconds)
+    return replace(kept, others=tuple(one.parameters for one in others), seconds=sum(one.seconds for one in found))
 
 
 _objective = attrgetter("objective")
@@ -119,8 +118,7 @@ def _steps(solution: Solution) -> list[Floats]:
     if weak.any() and problem.n_residuals <= MAX_ROWS:
         # The same signs and lengths whatever basis the weak directions have.
         signs = np.random.default_rng(0).choice([-1.0, 1.0], len(scales))
-        far = START_SIGMAS / np.minimum(s[weak], 1.0)
-        step = scales * (V[:, weak] @ (far * (V[:, weak].T @ signs)))
+        step = scales * (V[:, weak] @ (START_SIGMAS / np.minimum(s[weak], 1.0) * (V[:, weak].T @ signs)))
         longest = variables.scales[: len(scales)] / SIGNAL_FLOOR  # 1 rad, or the reach of the arm
         step /= max(1.0, float(np.max(np.abs(step) / longest)))
         steps += [step, -step]
@@ -130,8 +128,7 @@ def _steps(solution: Solution) -> list[Floats]:
 def _is_an_arm(other: Solution, best: Solution) -> bool:
     """Whether an optimum is a possible arm: with angles a radian away it is the same arm in other words, or none."""
     angles = [p.unit == "rad" for p in best.problem.robot.parameters]
-    off = (other.parameters - best.parameters)[best.problem.variables.robot_span]
-    return bool(np.all(np.abs(off[angles]) < 1.0))
+    return bool(np.all(np.abs((other.parameters - best.parameters)[best.problem.variables.robot_span][angles]) < 1.0))
 
 
 def _apart(a: Solution, b: Solution) -> bool:

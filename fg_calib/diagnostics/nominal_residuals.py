@@ -77,8 +77,7 @@ class Setup(Record):
     @property
     def has_landmarks(self) -> bool:
         """Whether landmarks have to be located before anything can be said of the table."""
-        without = self.instrument.is_pose or self.instrument.uses_pairs
-        return not without or "target" in self.table.measurements.labels
+        return not (self.instrument.is_pose or self.instrument.uses_pairs) or "target" in self.table.measurements.labels
 
     @property
     def sees_lengths(self) -> bool:
@@ -108,16 +107,14 @@ def setup_of(robot: Robot, table: Table) -> Setup | None:
     if pairs is not None:
         train = np.flatnonzero(~pairs.test)
         pairs = pairs.select(train[evenly(len(train), 3 * MAX_ROWS)])
-        touched = rows[:MAX_ROWS] if m.groups is not None else rows[:0]
-        rows = np.unique(np.concatenate([touched, pairs.a, pairs.b]))
+        rows = np.unique(np.concatenate([rows[:MAX_ROWS] if m.groups is not None else rows[:0], pairs.a, pairs.b]))
         pairs = replace(pairs, a=np.searchsorted(rows, pairs.a), b=np.searchsorted(rows, pairs.b))
     elif m.image is not None:
         images = rng.permutation(np.unique(m.ids[rows]))[:MAX_IMAGES]
         rows = np.concatenate([rows[m.ids[rows] == image][:MAX_CORNERS] for image in images])
     else:
         rows = np.sort(rng.permutation(rows)[:MAX_ROWS])
-    groups = m.groups and replace(m.groups, index=m.groups.index[rows])
-    some = replace(m.select(rows), pairs=pairs, groups=groups)
+    some = replace(m.select(rows), pairs=pairs, groups=m.groups and replace(m.groups, index=m.groups.index[rows]))
     some_rows = replace(table, measurements=some, pairing=Pairing("chain"), own=())
     base = {robot.parameters[i].name for i in robot.owned_by(0) if robot.parameters[i].estimated}
     if base and INSTRUMENTS[table.model].is_pose and table.frame == "known":  # the base is fitted as a frame

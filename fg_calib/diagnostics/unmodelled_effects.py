@@ -175,9 +175,8 @@ class LinearFit(Record):
         total, rest = float(self.r @ self.r), float(r @ r)
         if not m or after.dof < LEAST_LEFT:
             return 1.0, 1.0, self
-        ratio = ((total - rest) / m) / max(rest / after.dof, 1e-300)
         left = max(rest - after.dof * self.variance, 0.0) / max(total - self.dof * self.variance, 1e-300)
-        return float(special.fdtrc(m, after.dof, ratio)), left, after
+        return float(special.fdtrc(m, after.dof, ((total - rest) / m) / max(rest / after.dof, 1e-300))), left, after
 
     def clipped(self) -> LinearFit:
         """The fit of residuals that are cut at `MOST_TYPICAL` robust sigmas: gross errors hide effects."""
@@ -427,8 +426,7 @@ def _eliminate(
         return shared, np.ones(len(white)), scale
     root = V * np.sqrt(kept)
     free = 1.0 - np.concatenate([np.sum(np.asarray(L @ (factor / scale * root)) ** 2, axis=1), np.sum(root**2, axis=1)])
-    states = csr_array(scipy.sparse.hstack([shared.loadings, loadings * (factor / scale)]))
-    return SchurComplement(states), free, scale
+    return SchurComplement(csr_array(scipy.sparse.hstack([shared.loadings, loadings * (factor / scale)]))), free, scale
 
 
 def with_link_motions(problem: Problem, at: Floats) -> tuple[Variables, Floats]:
@@ -495,8 +493,7 @@ def basis_of(columns: Floats, fitted: Floats | None = None, least: float = 0.0) 
     """
     fitted = np.zeros((len(columns), 0)) if fitted is None else fitted
     size = np.linalg.norm(columns, axis=0)
-    rest = columns - fitted @ (fitted.T @ columns)
     scale = np.maximum(size, max(_NOTHING * float(np.max(size, initial=0.0)), 1e-300))
-    Q, R, order = scipy.linalg.qr(rest / scale, mode="economic", pivoting=True)
+    Q, R, order = scipy.linalg.qr((columns - fitted @ (fitted.T @ columns)) / scale, mode="economic", pivoting=True)
     left = np.abs(np.diag(R))
     return np.asarray(Q[:, (left > _RANK * np.sqrt(len(size))) & (left * scale[order[: len(left)]] > least)])

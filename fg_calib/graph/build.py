@@ -46,8 +46,7 @@ def build_problem(robot: Robot, measurements: Tables, options: Options | None = 
     tables = tables_of(measurements, options)
     for table in tables:
         if not table.uses_pairs and table.measurements.pairs is not None:
-            source = table.measurements.pairs.source
-            _log.warning("%s: not used, model %s is of poses", source, table.model)
+            _log.warning("%s: not used, model %s is of poses", table.measurements.pairs.source, table.model)
         for text in missing_values(table):
             _log.warning("%s", text)
     build.check_copies(tables)
@@ -73,8 +72,7 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
     if evaluated:
         free = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
         robot, tables = robot.with_estimated(free), [table.all_train() for table in tables]
-        gauge = "none" if options.gauge == "keep" else options.gauge
-        options = replace(options, gauge=gauge, encoder="propagated")
+        options = replace(options, gauge="none" if options.gauge == "keep" else options.gauge, encoder="propagated")
     elif options.estimate_tolerance is not None:
         n, parameters = robot.n_joints, robot.parameters
         none = [p.tolerance is None and p.estimated and 1 <= p.owner <= n for p in parameters]

@@ -90,8 +90,7 @@ class SchurComplement(Record):
     def posterior_mean(self, rows: Floats) -> Floats:
         """Z = S^-1 L^T rows = L^T C^-1 rows, the posterior mean of the states, shape (n_states, k)."""
         L, (of_rows, solve) = self.loadings, self._factor
-        out: Floats = L.T @ solve(rows) if of_rows else solve(L.T @ rows)
-        return out
+        return L.T @ solve(rows) if of_rows else solve(L.T @ rows)
 
     def weigh(self, rows: Floats) -> Floats:
         """C^-1 rows with C = 1 + L L^T, shape (n_rows, k)."""
@@ -136,8 +135,7 @@ class SchurComplement(Record):
             return of_rows, lambda b: scipy.linalg.cho_solve(dense, b, check_finite=False)
         graph = _configuration_graph(L, self.width)
         n_parts = csgraph.connected_components(graph, directed=False)[0]
-        n_loops = (graph.nnz - graph.shape[0]) // 2 - graph.shape[0] + n_parts
-        loops = n_loops * self.width > MAX_LOOP_STATES
+        loops = ((graph.nnz - graph.shape[0]) // 2 - graph.shape[0] + n_parts) * self.width > MAX_LOOP_STATES
         if loops and min(n_rows, n_states) > MAX_SPARSE:
             found = f"{n_states} errors that pairs share in loops are too many to eliminate"
             way_out = "use model pose with frame unknown, which holds the same, or a star or chain"
@@ -480,8 +478,7 @@ def correlation_of(noises: Sequence[RowNoise], rows: WhitenedRows, J: Floats) ->
         J: Their derivatives, shape (n_rows, n_columns); C is the covariance of the whitened rows.
     """
     each = [(noises[part.number], whitener_of(noises[part.number], part)) for part in rows.parts]
-    private = [block_diagonal(W @ noise.loading[noise.block.train]) for noise, W in each]
-    own = scipy.sparse.block_diag(private).T @ J
+    own = scipy.sparse.block_diag([block_diagonal(W @ noise.loading[noise.block.train]) for noise, W in each]).T @ J
     common = all_errors(noises, rows).T @ J
     return np.asarray(common.T @ common - own.T @ own)
 
@@ -535,8 +532,7 @@ def _whiten(
 
     for _ in over_spans(whiten, n):
         pass
-    whitened = replace(measured, data=data, whitening=whitening)
-    part = WhitenedBlock(whitened, block.table, number, block.nuisances[train])
+    part = WhitenedBlock(replace(measured, data=data, whitening=whitening), block.table, number, block.nuisances[train])
     if not carried:
         return part, Sparse((n * h, noise.place.n_errors)), Sparse((n * h, 0))
     E = W * np.sqrt(artificial)[:, None]

@@ -147,8 +147,7 @@ def measurement_factors(
     for number, (part, k) in enumerate(measurements):
         kind, these = part.block.kind, slice(first, first + part.block.residual_dim)
         L, first = rows.states.loadings[these], these.stop
-        shared = np.unique(L.indices // n).tolist()
-        errors = [(estimates[i][0], L[:, i * n : (i + 1) * n].toarray()) for i in shared]
+        errors = [(estimates[i][0], L[:, i * n : (i + 1) * n].toarray()) for i in np.unique(L.indices // n).tolist()]
         if not variables.items and np.all(variables.coordinates[part.nuisances[k]] < 0):
             continue  # nothing of it is estimated
         if all(type(each) in _PAIR_FACTORS for each in kind.parts):

@@ -132,22 +132,18 @@ class RowNoise:
     def private_at(self, rows: Integers | slice) -> Floats:
         """Covariance of the private noise of some measurements, shape (m, residual_dim, residual_dim)."""
         if self.block.covariance is not None:
-            covariance: Floats = self.block.covariance[rows] * np.outer(self.factors, self.factors)
-            return covariance
-        out: Floats = self.variance[rows][:, :, None] * np.eye(self.block.kind.residual_dim)
-        return out
+            return self.block.covariance[rows] * np.outer(self.factors, self.factors)
+        return self.variance[rows][:, :, None] * np.eye(self.block.kind.residual_dim)
 
     def total_at(self, rows: Integers | slice) -> Floats:
         """Covariance of all noise of some measurements, shape (m, residual_dim, residual_dim)."""
         G = self.loading[rows]
-        out: Floats = self.private_at(rows) + G @ np.swapaxes(G, 1, 2)
-        return out
+        return self.private_at(rows) + G @ np.swapaxes(G, 1, 2)
 
     @property
     def sigma(self) -> Floats:
         """1 sigma of each row, all noise together, shape (n, residual_dim), [m] and [rad]."""
-        out: Floats = np.sqrt(self.variance + np.einsum("nhk,nhk->nh", self.loading, self.loading))
-        return out
+        return np.sqrt(self.variance + np.einsum("nhk,nhk->nh", self.loading, self.loading))
 
     def residual(self) -> Floats:
         """Residuals of all rows, shape (n, residual_dim), [m] and [rad]."""
@@ -159,9 +155,8 @@ class RowNoise:
         Both are 0 for measurements that take no part.
         """
         used = self.block.used
-        r = np.where(used, self.residual(), 0.0)
         W = whitening_of(self.total_at(slice(None)), used)
-        return np.linalg.norm(W @ r[:, :, None], axis=(1, 2)), used.sum(axis=1)
+        return np.linalg.norm(W @ np.where(used, self.residual(), 0.0)[:, :, None], axis=(1, 2)), used.sum(axis=1)
 
     def errors_at(self, rows: Integers, W: Floats | None = None, chosen: Booleans | None = None) -> Sparse:
         """How some rows follow from all errors, sparse, shape (m residual_dim, n_errors).
@@ -268,8 +263,7 @@ def reach(noises: Sequence[RowNoise], *, test: bool = False) -> Integers:
     total = np.zeros(noises[0].place.n_errors if noises else 0, dtype=np.int64)
     for noise in noises:
         rows = np.flatnonzero(noise.block.test) if test else noise.block.train
-        present = noise.loading[rows].any(axis=1)
-        total += np.bincount(noise.columns[rows][present], minlength=len(total))
+        total += np.bincount(noise.columns[rows][noise.loading[rows].any(axis=1)], minlength=len(total))
     return total
 
 

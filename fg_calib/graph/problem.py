@@ -191,9 +191,8 @@ class Problem(FrozenArrays):
     @property
     def estimated(self) -> list[Parameter]:
         """The robot's estimated parameters, in the order of the columns."""
-        names = self.variables.names[: self.variables.n_robot_columns]
         by_name = {p.name: p for p in self.robot.parameters}
-        return [by_name[name] for name in names]
+        return [by_name[name] for name in self.variables.names[: self.variables.n_robot_columns]]
 
     @property
     def pair_blocks(self) -> tuple[MeasurementBlock, ...]:
@@ -359,8 +358,7 @@ def start_of(robot: Robot, data: Dataset, variables: Variables) -> Floats:
     nominal, free, bare = np.zeros(6), np.zeros(6, dtype=np.bool_), robot.nominal
     if len(tool):
         nominal, free, bare[tool] = start[tool], np.array([robot.parameters[i].estimated for i in tool]), 0.0
-    before = Frame(pose_of(nominal).rotation().matrix(), nominal[:3])
-    begun = start_frames(robot.with_values(bare), data, before, free)
+    begun = start_frames(robot.with_values(bare), data, Frame(pose_of(nominal).rotation().matrix(), nominal[:3]), free)
     if begun.found.any():
         start[tool[begun.found]] = _coordinates(begun.tool, nominal)[begun.found]
     for v in variables.frames:
@@ -472,8 +470,7 @@ def square_root(problem: Problem, parameters: Floats, *, with_loss: bool = False
         others.append(problem.known.at_parameters(v, problem.data.landmarks, parameters))
     if problem.added:
         others.append(linearize_factors(problem.added, v, v.values(parameters)))
-    variance = loss_variance(problem) if with_loss else 1.0
-    measured = problem._square_roots(parameters.tobytes()) / np.sqrt(variance)
+    measured = problem._square_roots(parameters.tobytes()) / np.sqrt(loss_variance(problem) if with_loss else 1.0)
     return np.vstack([*(np.column_stack([J, r]) for r, J in others), measured])
 
 

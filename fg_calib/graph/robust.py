@@ -102,8 +102,7 @@ def tuning(loss: Loss, dim: int) -> float:
 
 def constants(loss: Loss, residual_dim: NDArray[np.int64]) -> Floats:
     """The constant of a loss for measurements of so many rows each, shape (n,)."""
-    of_dim = [tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)]
-    return np.array(of_dim)[residual_dim]
+    return np.array([tuning(loss, max(h, 1)) for h in range(residual_dim.max(initial=0) + 1)])[residual_dim]
 
 
 class Effect(Record):
@@ -135,8 +134,7 @@ def effect(loss: Loss, dim: int, low: float = 0.0) -> Effect:
 
     kept, chi2 = _means(terms, dim, (0.0, min(c, end), end))
     outliers = max(0.0, 1.0 - (1.0 - low) / kept)
-    psi = FAR * c * float(weight(loss, np.array(FAR * c), c))
-    squared += outliers / max(1.0 - outliers, 0.5) * psi**2 / dim
+    squared += outliers / max(1.0 - outliers, 0.5) * (FAR * c * float(weight(loss, np.array(FAR * c), c))) ** 2 / dim
     return Effect(float(mean * squared / slope**2), float(chi2 / (dim * kept)))
 
 

@@ -195,8 +195,7 @@ class Solution(FrozenArrays):
         total = self.weighted_cost
         for s, w, noise in zip(self.problem.data.blocks, weights, self.noises, strict=True):
             e, residual_dim = noise.lengths()
-            more = cost(loss, e, constants(loss, residual_dim)) - 0.5 * w * e**2
-            total += float(np.sum(more[s.train]))
+            total += float(np.sum((cost(loss, e, constants(loss, residual_dim)) - 0.5 * w * e**2)[s.train]))
         return total
 
     @cached_property

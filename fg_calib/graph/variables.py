@@ -80,8 +80,7 @@ class Variable(Record):
     @property
     def symbol(self) -> str:
         """Symbol `K(3)`, `T(0)`, `X(0)`; GTSAM's own notation for an added one."""
-        own = self.kind.startswith("own")
-        return str(gtsam.Symbol(self.key)).strip() if own else f"{self.letter}({self.number})"
+        return str(gtsam.Symbol(self.key)).strip() if self.kind.startswith("own") else f"{self.letter}({self.number})"
 
     @property
     def is_pose(self) -> bool:
@@ -180,8 +179,7 @@ class Variables(Brief):
         scales = self.scales.copy()
         for v in self.items:
             with_prior, weight = self.prior_weights[v.key]
-            places = [_ALONG_TANGENT.index(k) if v.is_pose else k for k in with_prior]
-            scales[v.columns][places] = 1.0 / weight
+            scales[v.columns][[_ALONG_TANGENT.index(k) if v.is_pose else k for k in with_prior]] = 1.0 / weight
         return scales
 
     @property
@@ -218,8 +216,7 @@ class Variables(Brief):
         for v in self.items + self.nuisance if only is None else only:
             of_v = v.places
             if v.is_pose:
-                near = None if v.kind == "frame" else parameters[of_v]
-                parameters[of_v] = frame_of(values.atPose3(v.key), near)
+                parameters[of_v] = frame_of(values.atPose3(v.key), None if v.kind == "frame" else parameters[of_v])
             else:
                 parameters[of_v] = values.atVector(v.key)
         return parameters
@@ -464,9 +461,8 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         parameters: The parameter vector.
         only: The variable whose priors are wanted; all if None.
     """
-    items = variables.items if only is None else (only,)
     nominal, r, J = variables.nominal(), [np.zeros(0)], [np.zeros((0, variables.n_columns))]
-    for v in items:
+    for v in variables.items if only is None else (only,):
         with_prior, weight = variables.prior_weights[v.key]
         x, of = parameters[v.places], nominal[v.places]
         off, D = _off_nominal(x, of) if v.is_pose else (x - of, np.eye(len(x)))

@@ -126,9 +126,8 @@ def cramer_rao(
     sigma = np.array([np.inf if p.tolerance is None else p.tolerance for p in robot.parameters if p.estimated])
     gain, claimed, rank = _linear_estimate(J, np.diag(1.0 / sigma) if prior else np.zeros((0, len(names))), k)
     left = gain @ J - np.eye(len(names))
-    enters = np.abs(left).max(axis=0, initial=0.0) > _ENTERS
     # With priors every parameter that has one enters by it; the others are determined or not.
-    for i in np.flatnonzero(np.isinf(sigma) & enters):
+    for i in np.flatnonzero(np.isinf(sigma) & (np.abs(left).max(axis=0, initial=0.0) > _ENTERS)):
         raise InputError(f"robot {robot.name}", f"no tolerance for {names[i]}", "one: its own error stays in part")
     of_errors = left * np.where(np.isfinite(sigma), sigma, 0.0)
     covariance = gain @ gain.T + of_errors @ of_errors.T

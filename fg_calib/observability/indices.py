@@ -257,8 +257,7 @@ def _chained(relations: Floats) -> Floats:
     for r in range(len(relations) - 1):
         shared = np.flatnonzero((relations[r] != 0.0) & (relations[r + 1] != 0.0))
         if len(shared):
-            ratio = relations[r, shared[-1]] / relations[r + 1, shared[-1]]
-            against = relations[r] - ratio * relations[r + 1]
+            against = relations[r] - relations[r, shared[-1]] / relations[r + 1, shared[-1]] * relations[r + 1]
             against[np.abs(against) < SUPPORT_TOLERANCE] = 0.0
             if np.count_nonzero(against) <= np.count_nonzero(relations[r]):
                 chained[r] = against

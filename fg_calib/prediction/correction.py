@@ -158,8 +158,7 @@ def _in_base(
     q = _middle(posterior.variables.robot)[None]
     base, world = predict_poses(posterior, q, None), predict_poses(posterior, q, table)
     R = world[1][0] @ base[1][0].T  # world_R_base
-    t = world[0][0] - R @ base[0][0]
-    return (position - t) @ R, None if rotation is None else R.T @ rotation
+    return (position - (world[0][0] - R @ base[0][0])) @ R, None if rotation is None else R.T @ rotation
 
 
 def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, *, anywhere: bool = False) -> Inverse:
@@ -228,7 +227,6 @@ def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats) -> Floa
         turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
         return np.concatenate([(at.position - position)[0] * _WEIGHT, turn[0]])
 
-    limits = tuple(robot.limits.T)
-    best = least_squares(misses, q, jac="3-point", bounds=limits, xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+    best = least_squares(misses, q, jac="3-point", bounds=tuple(robot.limits.T), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
     found = solve_inverse(robot, position, near=best, n_starts=1)
     return found.readings[0] if found.reached[0] else q

@@ -135,8 +135,7 @@ def _rms(variance: Floats) -> float | None:
 
 def base_chain(covariance: TangentCovariance) -> Chain:
     """The arm in its base frame, at the estimate, with derivatives in the joints too."""
-    chain = build_variables(covariance.variables.robot, [False]).chains[0]
-    return chain.at(covariance.parameters).with_joint_columns()
+    return build_variables(covariance.variables.robot, [False]).chains[0].at(covariance.parameters).with_joint_columns()
 
 
 def tool_derivatives(

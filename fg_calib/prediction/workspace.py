@@ -143,8 +143,7 @@ def summed_up(errors: Floats) -> dict[str, float | None]:
 
     What is not known counts as larger than all else: the median is known where more than half of the errors are.
     """
-    known = np.isfinite(errors).all()
-    found: dict[str, float | None] = {"rms": float(np.sqrt(np.mean(errors**2))) if known else None}
+    found: dict[str, float | None] = {"rms": float(np.sqrt(np.mean(errors**2))) if np.isfinite(errors).all() else None}
     ordered = np.where(np.isnan(errors), np.inf, errors)
     for name, share in QUANTILES.items():
         value = float(np.quantile(ordered, share, method="higher"))

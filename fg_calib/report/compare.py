@@ -151,9 +151,8 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
         for i, p in enumerate(comparison.job.robot.parameters)
         if robot is not None and p.estimated
     ]
-    own = {key: value for key, value in vars(e).items() if key not in ("robot", "sigma")}
     more = {"description": ESTIMATORS[e.name], "ran": e.ran, "n_estimated": e.n_estimated, "parameters": parameters}
-    return own | more
+    return {key: value for key, value in vars(e).items() if key not in ("robot", "sigma")} | more
 
 
 def changes(old: Result, new: Result) -> Iterator[dict[str, Any]]:
@@ -287,8 +286,7 @@ def _explanations(explanations: Sequence[monitoring.Explanation]) -> Table:
         change = ", ".join(f"{figure(c, unit, '+')} {tables.shown_in(unit).unit}" for c, _, unit in several)
         sigma = ", ".join(figure(s, unit) for _, s, unit in several)
         rows.append((named(e.parameters), KINDS.get(e.kind, ""), change, sigma, e.chi2_drop, e.p_value, word))
-    columns = ("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", "")
-    return table_of(columns, rows, wrap=True)
+    return table_of(("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", ""), rows, wrap=True)
 
 
 def _conclusions(found: monitoring.Check) -> Iterator[str]:

@@ -147,8 +147,7 @@ def errors_over_torque(data: ReportData) -> Iterator[Chart]:
     known = {p.name: p for p in data.result.parameters}
     for effect in (e for e in data.robot.effects if isinstance(e, robot.Compliance)):
         alone = replace(data.robot, effects=(effect,))
-        torques = alone.trig(data.readings)[:, alone.n_joints :, 0].T
-        for term, tau in zip(alone.terms[0], torques, strict=True):
+        for term, tau in zip(alone.terms[0], alone.trig(data.readings)[:, alone.n_joints :, 0].T, strict=True):
             if not term.name.endswith(".compliance") or np.ptp(tau) < MIN_TORQUE_RANGE:
                 continue
             p, factor, ends = known[term.name], shown_in("rad/(N m)").factor, limits_of(tau)
@@ -194,8 +193,7 @@ def correlation_matrix(data: ReportData) -> list[Chart]:
         return []
     sigma = np.sqrt(variance[known])
     rho = np.tril(C[np.ix_(known, known)] / np.outer(sigma, sigma), -1)
-    most = np.max(np.abs(np.nan_to_num(rho + rho.T)), axis=1)
-    chosen = np.sort(np.argsort(-most, kind="stable")[:MAX_PARAMETERS])
+    chosen = np.sort(np.argsort(-np.max(np.abs(np.nan_to_num(rho + rho.T)), axis=1), kind="stable")[:MAX_PARAMETERS])
     more = "" if len(chosen) == len(known) else f"; the {len(chosen)} most correlated of {len(known)}"
     labels, rho = [names[known[k]] for k in chosen], rho[np.ix_(chosen, chosen)]
     plot = Plot(labels, labels, ("", ""))
@@ -245,8 +243,7 @@ def _row_by_row(rows: "pl.DataFrame", values: Floats, test: Booleans) -> Chart:
 def _histogram(values: Floats, caption: str) -> Chart:
     """The distribution of residuals; the columns at the ends hold those beyond `MAX_SIGMA` too."""
     edges = np.linspace(-MAX_SIGMA, MAX_SIGMA, 41)
-    counts = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0]
-    density = counts / (len(values) * np.diff(edges))
+    density = np.histogram(np.clip(values, edges[0], edges[-1]), edges)[0] / (len(values) * np.diff(edges))
     limits = limits_of(density, [0.45], with_zero=True)
     plot = Plot((float(edges[0]), float(edges[-1])), limits, ("residual, in its sigma", "share per sigma"))
     for k in np.flatnonzero(density).tolist():

@@ -109,8 +109,7 @@ def _joints(found: Inspection) -> Table:
         used = "" if joint.share is None else f"{100.0 * joint.share:.0f} %"
         outside = f"outside in {joint.n_outside} configurations" if joint.n_outside else "hardly moves" * joint.still
         rows.append((joint.name, joint.least, joint.most, joint.unit, *joint.limits, used, outside))
-    columns = ("", "from|q:z.1f", "to|q:z.1f", "|unit", "limits|q:.1f|-", "|q:.1f|-", "used|>", "")
-    return table_of(columns, rows)
+    return table_of(("", "from|q:z.1f", "to|q:z.1f", "|unit", "limits|q:.1f|-", "|q:.1f|-", "used|>", ""), rows)
 
 
 def _residuals(found: Inspection) -> Table:

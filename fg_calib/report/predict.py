@@ -140,7 +140,6 @@ def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot
     n, names = len(found.errors.readings), _names(found, ids)
     where = f"at {n} configurations" if found.given else "over the workspace"
     in_part = ", as far as it is known" * bool(found.unknown)
-    listed = [_configurations(found, robot, names)] if found.given else []
     return tables.report(
         line(f"{result.robot}: expected error of the tool {where}", "bold"),
         line(f"the calibration was {verdict_word(result)}", "bold red" if result.findings else "bold green"),
@@ -148,7 +147,7 @@ def build_prediction_report(found: PredictedErrors, result: Result, robot: Robot
         *section("Expected error, by the covariance of the calibration", size_table(found), *percentages(found)),
         *section(f"Where it is largest{in_part}", *_worst_in_words(found, robot, names)),
         *section("Parameters that it comes from there", _responsible(found, result)),
-        *section("Configurations", *listed),
+        *section("Configurations", *[_configurations(found, robot, names)] if found.given else []),
         *section("Notes", *_prediction_notes(found, robot)),
     )
 
@@ -266,9 +265,8 @@ def build_correction_report(ids: Sequence[str], correction: Correction, robot: R
         correction: The commands.
         robot: The calibrated robot.
     """
-    title = f"{robot.name}: {int(correction.reached.sum())} of {len(ids)} targets can be reached"
     return tables.report(
-        line(title, "bold"),
+        line(f"{robot.name}: {int(correction.reached.sum())} of {len(ids)} targets can be reached", "bold"),
         line(""),
         _target_errors(correction),
         *section("Joint positions to command", _commands(ids, correction, robot)),

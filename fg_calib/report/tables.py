@@ -42,8 +42,7 @@ def plain_text(report: RenderableType, width: int = WIDTH) -> str:
     """A report as plain text, without blanks at the ends of lines."""
     inputs.check_number("width", width, least=1, whole=True)
     text = io.StringIO()
-    console = Console(file=text, width=width_for(report, width), color_system=None, highlight=False)
-    console.print(report)
+    Console(file=text, width=width_for(report, width), color_system=None, highlight=False).print(report)
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
 
 

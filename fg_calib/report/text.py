@@ -328,8 +328,7 @@ def _tolerances(result: Result) -> Table:
     for one in result.tolerance_scales or ():
         (unit, sigma), *others = {sigma_of[name] for name in one.parameters}
         sigmas = ("", "", "") if others or sigma is None else (sigma / one.scale, sigma, unit)
-        count = f"{one.seen:.1f} of {len(one.parameters)}"
-        rows.append((one.group, *sigmas, one.scale, one.low, one.high, count))
+        rows.append((one.group, *sigmas, one.scale, one.low, one.high, f"{one.seen:.1f} of {len(one.parameters)}"))
     columns = ("", "specified|q:.3g", "estimated|q:.3g", "|unit", "ratio|.3g", "from|.2g", "to|.2g")
     return table_of((*columns, "corrections that count|>"), rows)
 

@@ -92,8 +92,7 @@ class TangentCovariance(FrozenArrays):
 
     def named(self) -> Floats:
         """Covariance of the robot's parameters among the columns, shape (n_robot_columns, n_robot_columns)."""
-        n = self.variables.n_robot_columns
-        out = self.covariance(self.variables.named_derivative(self.parameters)[:n])
+        out = self.covariance(self.variables.named_derivative(self.parameters)[: self.variables.n_robot_columns])
         for v in self.variables.items:
             if v.is_pose and v.kind != "frame":
                 angles = np.arange(v.columns.start + 3, v.columns.stop)
@@ -205,8 +204,7 @@ def held_frames(undetermined: Floats, undetermined_at_nominal: Floats, scales: F
     at_nominal, here = undetermined_at_nominal / scales, undetermined / scales
     U, s, _ = np.linalg.svd(at_nominal[:, :n_robot])
     of_frames = U[:, np.append(s, np.zeros(len(U) - len(s))) <= graph.SUPPORT_TOLERANCE].T @ at_nominal
-    turned: Floats = of_frames @ here.T @ here
-    return (turned * scales).T / graph.SIGNAL_FLOOR
+    return (of_frames @ here.T @ here * scales).T / graph.SIGNAL_FLOOR
 
 
 def covariance_of_rows(variables: graph.Variables, parameters: Floats, rows: Floats) -> TangentCovariance:

@@ -202,8 +202,7 @@ def _divided(data: Dataset, n: int, rng: np.random.Generator) -> Integers:
     fold[sorted(rng.permutation(n_sets).tolist(), key=lambda k: landmarks[k])] = np.arange(n_sets) % n
     found = fold[place]
     for configurations, needed in observers:
-        left = len(configurations) - np.bincount(found[configurations] + 1, minlength=n + 1)[1:].max()
-        if left < needed:
+        if len(configurations) - np.bincount(found[configurations] + 1, minlength=n + 1)[1:].max() < needed:
             found[np.isin(place, place[configurations])] = -1
     return found
 

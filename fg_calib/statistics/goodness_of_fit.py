@@ -405,8 +405,7 @@ class RowStatistics:
                     continue
                 found = model.errors(number, chunk).at(np.flatnonzero(measured[chunk])).over(table.sigma[rows])
                 self.leverage[rows] = found.with_errors(T).diagonal - 1.0
-                lost = table.test[rows] & np.isnan(self.spread.variance(model.of_core(found)))
-                self.leverage[rows][lost] = np.nan
+                self.leverage[rows][table.test[rows] & np.isnan(self.spread.variance(model.of_core(found)))] = np.nan
                 kept.append(found.at(np.flatnonzero(keep[rows])))
         self.leverage[~np.isfinite(self.leverage)] = np.nan
         return ResidualCovariance.joined(kept)

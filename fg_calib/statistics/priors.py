@@ -151,8 +151,7 @@ class ScalePosterior:
     def __init__(self, corrections: Corrections, theta: Floats) -> None:
         self.theta, n = theta, len(theta)
         member = np.equal.outer(np.arange(n), corrections.group).astype(np.float64)  # 1 for those of a group
-        guess: Floats = COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n)
-        prior = np.linalg.inv(guess)
+        prior = np.linalg.inv(COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n))
         s = np.exp(theta) @ member
         M = np.eye(len(s)) + s[:, None] * corrections.information * s
         C = np.linalg.inv(M)
@@ -317,10 +316,9 @@ def judge_priors(solution: graph.Solution, spread: Spread) -> PriorFit | None:
         return None
     chi2, expected, square = float(z @ z), float(np.trace(A)), float(np.sum(A * A))
     nu = expected**2 / square if expected > 1e-9 else 0.0
-    sigma = np.sqrt(np.maximum(np.diag(A), 0.0))
     p_value = float(special.gammaincc(nu / 2.0, nu / 2.0 * chi2 / expected)) if nu else None
     beyond = tuple(_beyond(names, z, A, len(_prior_parameters(solution.problem.variables))))
-    return PriorFit(names, z, sigma, chi2, max(expected, 0.0), p_value, beyond)
+    return PriorFit(names, z, np.sqrt(np.maximum(np.diag(A), 0.0)), chi2, max(expected, 0.0), p_value, beyond)
 
 
 def _judged_rows(solution: graph.Solution, spread: Spread) -> tuple[tuple[str, ...], Floats, Floats]:

@@ -90,8 +90,7 @@ def pooled(parts: Sequence[HeldOut], table: str = "") -> HeldOut:
     squares = n @ np.array([[getattr(part, name) ** 2 for name in names] for part in parts]) / n.sum()
     rms = dict(zip(names, np.sqrt(squares).tolist(), strict=True))
     outliers = tuple(name for part in parts for name in part.outliers)
-    few = any(part.few for part in parts)
-    return replace(parts[0], table=table, n=int(n.sum()), few=few, outliers=outliers, **rms)
+    return replace(parts[0], table=table, n=int(n.sum()), few=any(part.few for part in parts), outliers=outliers, **rms)
 
 
 class ResidualTable(FrozenArrays):
@@ -182,8 +181,7 @@ class ResidualTable(FrozenArrays):
     @property
     def used(self) -> Booleans:
         """Whether each row was fitted, shape (n,)."""
-        used: Booleans = (self.reason_code == 0) & ~self.test
-        return used
+        return (self.reason_code == 0) & ~self.test
 
     def unit(self, family: str) -> str:
         """The unit of a kind of noise, `m`, `rad` or `px`."""
@@ -354,8 +352,7 @@ def _at_fitted_readings(readings: Floats, rows: dict[str, NDArray[Any]]) -> Bool
 
 def same_readings(readings: Floats) -> Integers:
     """A number for each configuration, the same for equal readings, shape (n,)."""
-    place: Integers = np.unique(np.round(readings, READING_DECIMALS), axis=0, return_inverse=True)[1]
-    return place.ravel()
+    return np.unique(np.round(readings, READING_DECIMALS), axis=0, return_inverse=True)[1].ravel()
 
 
 def _codes(of: Labels | None, codes: dict[str, int], n: int) -> Indices:
@@ -389,6 +386,5 @@ def _ends(ends: Integers, landmarks: Integers, n: int) -> tuple[Indices, Indices
     """
     first = np.flatnonzero(np.diff(landmarks[:1], prepend=-1)[0]) if len(landmarks) else np.zeros(0, dtype=np.int64)
     both = ends if ends.shape[1] else n + landmarks[:, first]
-    none = np.full((len(both), 2), -1)
-    a, b = np.hstack([both, none])[:, :2].T.astype(np.int32)
+    a, b = np.hstack([both, np.full((len(both), 2), -1)])[:, :2].T.astype(np.int32)
     return a, b

@@ -276,5 +276,4 @@ def _scaled(problem: graph.Problem, factors: Mapping[graph.NoiseName, float]) ->
     def scale(p: graph.Problem) -> graph.Problem:
         return graph.relinearized_at(p, p.start, replace(p.state, factors={**p.state.factors, **factors}))
 
-    whole = None if problem.whole is None else scale(problem.whole)
-    return replace(scale(problem), whole=whole)
+    return replace(scale(problem), whole=None if problem.whole is None else scale(problem.whole))
