@@ -93,8 +93,7 @@ def _solve_from(solution: Solution, problem: Problem, start: Floats | None = Non
         other = solve(problem, options, start=start)
     except CalibrationError:  # says nothing against the first
         return []
-    if start is not None:
-        other = replace(other, before=solution.before, initial_cost=solution.initial_cost)
+    other = replace(other, before=solution.before, initial_cost=solution.initial_cost) if start is not None else other
     noise, tolerances = solution.estimated_noise, solution.estimated_tolerances
     return [replace(other, estimated_noise=noise, estimated_tolerances=tolerances)] if other.converged else []
 

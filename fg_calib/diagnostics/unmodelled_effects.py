@@ -28,8 +28,6 @@ large, and priors too wide, would make the ratio F too large, so both are made a
 MacKay's fixed point, with tr L S^-1 L^T the number of coefficients that the rows determine (see `error_states`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cached_property
 
@@ -162,7 +160,7 @@ class LinearFit(Record):
         """Columns of the rows, shape (n_rows, m), of the priors too."""
         return np.pad(columns, ((0, len(self.r) - len(columns)), (0, 0)))
 
-    def test(self, columns: Floats) -> tuple[float, float, LinearFit]:
+    def test(self, columns: Floats) -> "tuple[float, float, LinearFit]":
         """A score test of more columns of the rows, shape (n_rows, m).
 
         Returns:
@@ -178,7 +176,7 @@ class LinearFit(Record):
         left = max(rest - after.dof * self.variance, 0.0) / max(total - self.dof * self.variance, 1e-300)
         return float(special.fdtrc(m, after.dof, ((total - rest) / m) / max(rest / after.dof, 1e-300))), left, after
 
-    def clipped(self) -> LinearFit:
+    def clipped(self) -> "LinearFit":
         """The fit of residuals that are cut at `MOST_TYPICAL` robust sigmas: gross errors hide effects."""
         free = self.free - np.sum(self.fitted**2, axis=1)
         size, seen = np.sqrt(np.maximum(free, 0.0)), free > LEAST_SHARE

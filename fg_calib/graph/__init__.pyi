@@ -12,7 +12,6 @@ from .error_states import (
     WhitenedRows,
     all_errors,
     block_diagonal,
-    curve_columns,
     whitener_of,
 )
 from .factors import DistanceFactor, RotationAngleFactor
@@ -98,7 +97,6 @@ __all__ = [
     "coordinates_of",
     "corrections_of",
     "correlation",
-    "curve_columns",
     "determined",
     "directions",
     "effect",

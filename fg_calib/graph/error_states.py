@@ -17,8 +17,6 @@ This matters where pairs are more than the errors, so that second-order terms ar
 `q m / 2`, m the smaller number, is about as much; pairs of a star or chain, which are fewer, have m <= 2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -188,12 +186,12 @@ class State(Brief):
     n_nuisance: int
     curves: Curves | None = None
 
-    def without_columns(self) -> State:
+    def without_columns(self) -> "State":
         """Copy without derivatives."""
         chains = tuple(chain.without_columns() for chain in self.chains)
         return replace(self, chains=chains, n_columns=0, n_nuisance=0, curves=None)
 
-    def without_curves(self) -> State:
+    def without_curves(self) -> "State":
         """Copy without derivatives in error curves, whose columns are the first nuisances'."""
         n = 0 if self.curves is None else len(self.curves.sigma)
         return replace(self, columns=self.columns - n, n_nuisance=self.n_nuisance - n, curves=None)
@@ -244,7 +242,7 @@ class WhitenedBlock(Brief):
         """Number of scalar rows."""
         return self.block.n * self.block.residual_dim
 
-    def only(self, k: int) -> WhitenedBlock:
+    def only(self, k: int) -> "WhitenedBlock":
         """One of its measurements."""
         one = slice(k, k + 1)
         return replace(self, block=residuals.rows_of(self.block, one), nuisances=self.nuisances[one])
@@ -520,8 +518,7 @@ def _whiten(
         private, plain = noise.private_at(these), noise.rows_at(these)
         own = np.where(is_state[span][:, None], 0.0, noise.loading[these])
         private = private + own @ np.swapaxes(own, 1, 2)
-        if carried:
-            private = private + artificial[span][:, :, None] * np.eye(h)
+        private = private + artificial[span][:, :, None] * np.eye(h) if carried else private
         if weights is not None:  # private noise on top, so much that a measurement says no more than its weight
             more = 1.0 / np.maximum(weights[these], MIN_WEIGHT) - 1.0
             private = private + more[:, None, None] * noise.total_at(these)

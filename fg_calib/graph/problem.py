@@ -4,8 +4,6 @@
 take part and why the others do not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from functools import cached_property, lru_cache
@@ -58,7 +56,7 @@ class Problem(FrozenArrays):
     start: Floats
     state: NoiseState
     rows: WhitenedRows
-    whole: Problem | None = None
+    whole: "Problem | None" = None
     added: tuple[gtsam.NonlinearFactor, ...] = ()
     evaluated: bool = False
     knowledge: Knowledge | None = None
@@ -141,8 +139,7 @@ class Problem(FrozenArrays):
             SolverError: A residual or derivative is not finite.
         """
         v, given = self.variables, self.rows  # of the system, which would keep the problem in a cycle
-        r, J = prior_rows(v, parameters)
-        priors = np.column_stack([J, r])
+        priors = np.column_stack(prior_rows(v, parameters)[::-1])
         if not v.n_curves or given.states.n_states or self.has_more:
             rows: Floats | Eliminated = square_root(self, parameters, with_loss=with_loss)
         else:
@@ -240,10 +237,8 @@ class Problem(FrozenArrays):
     @cached_property
     def known(self) -> Knowledge | None:
         """Information of earlier rows about what is estimated; None without any."""
-        if self.knowledge is None:
-            return None
-        found = self.knowledge.seen_by(self.variables, self.data.landmarks)
-        return found if found.n else None
+        found = self.knowledge and self.knowledge.seen_by(self.variables, self.data.landmarks)
+        return found if found and found.n else None
 
     @property
     def has_more(self) -> bool:
@@ -401,8 +396,7 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
         parameters: The parameter vector.
         state: Estimated noise; None for what the problem has.
     """
-    same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
-    same = same and not problem.robot.loads
+    same = not problem.robot.loads and all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
     if (state is None or state is problem.state) and same:
         started = replace(problem, start=parameters)
         vars(started).update(_square_roots=problem._square_roots, _curve_roots=problem._curve_roots)
@@ -418,9 +412,8 @@ def subsampled(problem: Problem, share: float, parameters: Floats | None = None)
         share: Which share of each block.
         parameters: The parameter vector at which they are whitened; the problem's start if None.
     """
-    rng, blocks = np.random.default_rng(0), []
-    for s in problem.data.blocks:
-        blocks.append(s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])))
+    rng, given = np.random.default_rng(0), problem.data.blocks
+    blocks = [s.select(np.sort(rng.permutation(s.train)[: round(share * len(s.train))])) for s in given]
     data, state = replace(problem.data, blocks=tuple(blocks)), replace(problem.state, weights=None)
     return with_factors(problem, problem.start if parameters is None else parameters, state, data=data)
 

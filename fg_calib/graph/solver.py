@@ -226,8 +226,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
     clock = time.perf_counter()
     with one_blas_thread:
         before = _fit_frames(problem, options) if start is None else np.asarray(start, dtype=np.float64)
-        if before is not problem.start:
-            problem = relinearized_at(problem, before)
+        problem = relinearized_at(problem, before) if before is not problem.start else problem
         run = _fit(_started_by_few(problem, options), options)
         state, variables, cost = run.problem.state, run.problem.variables, run.cost
         parameters = variables.parameters(variables.values(run.parameters))  # angles in usual range

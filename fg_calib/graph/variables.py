@@ -22,8 +22,6 @@ from nominal, `Log(R_nominal^T R)`, whose components about the frame's own x, y 
 pitch and yaw: at a pitch of 90 degrees the angles themselves are no coordinates.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import field, replace
 from functools import cached_property
@@ -244,7 +242,7 @@ class Variables(Brief):
                 out[v.columns] = end[v.places] - start[v.places]
         return out
 
-    def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> Variables:
+    def with_unknowns(self, unknowns: Landmarks, estimated: NDArray[np.bool_]) -> "Variables":
         """Copy with the measurements' estimated unknowns as nuisance variables."""
         column, place = self.n_columns + self.n_nuisance, self.nuisance_span.stop
         coordinates, more, taken = list[int](), list[Variable](), {v.symbol for v in self.items}
@@ -280,7 +278,7 @@ class Variables(Brief):
         values = np.concatenate([parameters[v.places] for v, _ in found])
         return Curves({v.number - 1: v.columns.start - self.n_columns for v, _ in found}, values, sigma)
 
-    def with_added(self, keys: Sequence[int], initial: gtsam.Values) -> Variables:
+    def with_added(self, keys: Sequence[int], initial: gtsam.Values) -> "Variables":
         """The variables with those that a user added, and no others of a user's."""
         v = replace(self, nuisance=tuple(v for v in self.nuisance if not v.kind.startswith("own")))
         for key in keys:
@@ -290,7 +288,7 @@ class Variables(Brief):
             v = replace(v, nuisance=(*v.nuisance, Variable(key, kind, places, columns, scales=(1.0,) * n)))
         return v
 
-    def columns_of(self, other: Variables, parameters: Floats) -> Floats:
+    def columns_of(self, other: "Variables", parameters: Floats) -> Floats:
         """Each column of other variables of the same arm in these, shape (n_columns, other.n_columns).
 
         Args:

@@ -103,8 +103,7 @@ def correct_targets(
     target, turned, start = _check_targets(nominal, position, rotation, near)
     if table is not None:
         target, turned = _in_base(posterior, target, turned, table)
-    uncorrected = start
-    off = np.zeros((len(target), 2))
+    uncorrected, off = start, np.zeros((len(target), 2))
     if position is not None:
         first = reach(nominal, target, turned, start, anywhere=near is None)
         uncorrected = first.readings
@@ -137,8 +136,7 @@ def _check_targets(
     target = as_floats("position", np.atleast_2d(position), "(n, 3)")
     if rotation is not None:
         rotation = as_rotations("rotation", rotation if np.ndim(rotation) == 3 else [rotation], len(target))
-    if near is None:
-        near = _middle(nominal)[None]
+    near = _middle(nominal)[None] if near is None else near
     if len(near) not in {1, len(target)}:
         raise InputError("near", f"{len(near)} rows", f"one for all, or {len(target)}")
     return target, rotation, np.broadcast_to(near, (len(target), n_joints)).copy()

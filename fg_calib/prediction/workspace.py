@@ -102,9 +102,7 @@ class PredictedErrors(FrozenArrays):
     @cached_property
     def worst(self) -> WorstConfiguration | None:
         """Configuration with the largest error; None where it is known nowhere."""
-        if self.unknown == 1.0:
-            return None
-        return _worst(self, int(np.nanargmax(self.expected[:, 0])))
+        return None if self.unknown == 1.0 else _worst(self, int(np.nanargmax(self.expected[:, 0])))
 
     @property
     def undetermined(self) -> tuple[str, ...]:

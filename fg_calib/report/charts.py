@@ -113,8 +113,7 @@ class Plot:
         left = 10.0 + LETTER * max(map(len, rows)) if rows else LEFT
         bottom = 8.0 + LETTER * max(map(len, columns)) if columns else BOTTOM
         right, foot = WIDTH - RIGHT, TOP + CELL * len(rows) if rows else height - bottom
-        if columns:
-            right = left + CELL * len(columns)
+        right = left + CELL * len(columns) if columns else right
         self._size = right + RIGHT, foot + bottom
         self.x, self.y = _scale(x, left, right), _scale(y, TOP, foot) if rows else _scale(y, foot, TOP)
         self._elements: list[str] = []

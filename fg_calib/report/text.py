@@ -3,8 +3,6 @@
 It is made of a typed result and its tables, so that a loaded calibration prints like a new one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from itertools import groupby
@@ -42,8 +40,8 @@ class ReportData(inputs.Record):
     result: Result
     robot: Robot
     posterior: statistics.TangentCovariance
-    configurations: pl.DataFrame | None
-    residuals: pl.DataFrame | None
+    configurations: "pl.DataFrame | None"
+    residuals: "pl.DataFrame | None"
 
     @property
     def split(self) -> str:
@@ -339,7 +337,7 @@ def _combinations(result: Result) -> Table:
     return table_of(("", "sigma|q", "|unit", "of the sum"), rows, wrap=True)
 
 
-def _suspicious_rows(residuals: pl.DataFrame | None, split: str, most: int) -> list[Table]:
+def _suspicious_rows(residuals: "pl.DataFrame | None", split: str, most: int) -> list[Table]:
     """The rows of a split that are larger than noise, the worst first; none if they were not saved."""
     if residuals is None:
         return []
@@ -391,10 +389,9 @@ def _frames(result: Result) -> Iterator[Section]:
     """The estimated measurement frames."""
     for symbol, frame in result.frames.items():
         which = "" if len(result.tables) == 1 else f" of {result.tables[int(symbol[2:-1])][0]}"
-        rows = [("xyz", *frame.xyz, "m"), ("± along its axes", *frame.sigma[3:], "m")]
-        rows.append(("± about its axes", *frame.sigma[:3], "rad"))
+        along, about = ("± along its axes", *frame.sigma[3:], "m"), ("± about its axes", *frame.sigma[:3], "rad")
         quaternion = "  ".join(f"{v:z.8f}" for v in frame.quaternion_xyzw.tolist())
-        table = table_of(("", "|q", "|q", "|q", "|unit"), rows)
+        table = table_of(("", "|q", "|q", "|q", "|unit"), [("xyz", *frame.xyz, "m"), along, about])
         yield from section(f"Measurement frame (world_T_base{which})", table, f"quaternion xyzw: {quaternion}")
 
 

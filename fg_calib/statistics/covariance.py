@@ -15,8 +15,6 @@ Where one of L has no tolerance its error may be anything: the direction (G, -1)
 estimate is known to be, whatever x_L, is that of the combination `x_K + G x_L`, with the covariance C_K.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import field, replace
 
@@ -130,7 +128,7 @@ class Spread(TangentCovariance):
     rank: int
     excess: float
 
-    def inflated(self, variance: float) -> Spread:
+    def inflated(self, variance: float) -> "Spread":
         """The covariance of rows whose noise has so many times the variance; priors stay as they are."""
         half, held = self.root[:, : self.rank], self.root[:, self.rank :]
         priors = graph.prior_rows(self.variables, self.parameters)[1] @ half
@@ -215,9 +213,8 @@ def covariance_of_rows(variables: graph.Variables, parameters: Floats, rows: Flo
         parameters: The parameter vector.
         rows: Derivatives in the core, nuisances eliminated, shape (m, n_columns).
     """
-    r, J = graph.prior_rows(variables, parameters)
-    priors, square_root = np.column_stack([J, r]), np.pad(rows, ((0, 0), (0, 1)))
-    system = graph.NormalSystem(square_root, variables.n_columns, variables.prior_scales, priors)
+    priors = np.column_stack(graph.prior_rows(variables, parameters)[::-1])
+    system = graph.NormalSystem(np.pad(rows, ((0, 0), (0, 1))), variables.n_columns, variables.prior_scales, priors)
     undetermined = _orthonormal(system.directions[system.rank :], variables.scales)
     return TangentCovariance(variables, parameters, system.covariance, undetermined, undetermined)
 

@@ -13,9 +13,8 @@ import scipy.sparse
 from scipy.linalg import block_diag
 from scipy.sparse import csgraph
 
-from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, all_errors, curve_columns, loss_variance, reach
+from fg_calib.graph import PRIVATE_SHARE, RowNoise, Solution, WhitenedBlock, all_errors, loss_variance, reach
 from fg_calib.inputs import Booleans, Floats, Integers, Record
-from fg_calib.measurements import residuals
 from fg_calib.robot import Chain
 
 Sparse = scipy.sparse.csr_array
@@ -187,19 +186,13 @@ class RowModel:
 
     def _derivatives(self, number: int, rows: Integers) -> tuple[Floats, Sparse]:
         """Derivatives of some measurements' rows in core and landmarks, and in errors."""
-        noise, at = self._noises[number], self._at
-        J, nuisances = residuals.linearise(noise.rows_at(rows), self.chain(number))[1], noise.block.nuisances[rows]
-        P = np.zeros((*J.shape[:2], at.n_columns + at.n_nuisance))
-        P[:, :, : at.n_columns] = J[:, :, : at.n_columns]
-        for k, column in enumerate(at.columns[nuisances].T):
-            found = np.flatnonzero(column >= 0)
-            P[found, :, column[found]] = J[found, :, at.n_columns + k]
-        if at.curves is not None:
-            columns = curve_columns(noise.rows_at(rows), self.chain(number), at.curves).sparse().toarray()
-            P[:, :, at.n_columns : at.n_columns + columns.shape[1]] = columns.reshape(*P.shape[:2], columns.shape[1])
+        noise = self._noises[number]
+        nuisances, at = noise.block.nuisances[rows], replace(self._at, coordinates=noise.place.coordinates)
+        chunks = WhitenedBlock(noise.rows_at(rows), noise.block.table, number, nuisances).linearise(at)
+        P = np.concatenate([np.zeros((0, at.n_columns + at.n_nuisance + 1)), *chunks])[:, :-1]
         if not noise.block.kind.is_contact:
-            P[self._nowhere[nuisances].any(axis=1)] = np.nan
-        return P.reshape(P.shape[0] * P.shape[1], P.shape[2]), noise.errors_at(rows)
+            P[np.repeat(self._nowhere[nuisances].any(axis=1), noise.block.kind.residual_dim)] = np.nan
+        return P, noise.errors_at(rows)
 
 
 def row_squares(L: Sparse) -> Floats:
