@@ -193,8 +193,7 @@ _ONLY_IN = {
 def _frame_words(robot: Robot, owner: int) -> str:
     """A frame of an arm in words; empty where it is none."""
     own = [robot.parameters[i] for i in robot.owned_by(owner)]
-    figures = [f"{p.kind} {_MM_DEG.from_si(p.nominal, p.unit):.9g}" for p in own if p.nominal != 0.0]
-    return ", ".join(figures)
+    return ", ".join(f"{p.kind} {_MM_DEG.from_si(p.nominal, p.unit):.9g}" for p in own if p.nominal != 0.0)
 
 
 def _frames_outside(robot: Robot, start: str, end: str) -> list[str]:

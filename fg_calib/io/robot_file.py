@@ -109,8 +109,7 @@ def read_urdf(
     builder = RobotBuilder(name or root.get("name") or path.stem, "urdf")
     builder.add_frame("base", model.frame_values("base", base), 0, False)
     try:
-        names = [link.get("name", "") for link in root.findall("link")]
-        tree = _Tree(_read_joints(root, path.name), names, path.name)
+        tree = _Tree(_read_joints(root, path.name), [link.get("name", "") for link in root.findall("link")], path.name)
         base_link = tree.root() if base_link is None else tree.known(base_link)
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
         chain = tree.chain(base_link, tip_link)

@@ -116,8 +116,7 @@ class Harmonics(Effect, Record):
 
     def terms(self, robot: Robot) -> list[Term]:
         names = [(f"{m:.9g}".replace(".", "_"), f) for m in self.orders for f in ("sin", "cos")]
-        joints = _joints(robot, self.joints, "harmonics")
-        return [_own(robot, i, f"{f}{m}", 3e-3) for i in joints for m, f in names]
+        return [_own(robot, i, f"{f}{m}", 3e-3) for i in _joints(robot, self.joints, "harmonics") for m, f in names]
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         orders = np.array(self.orders, dtype=np.float64)
@@ -289,8 +288,7 @@ class Bending(Effect, Record):
     by_loads = Compliance.by_loads
 
     def terms(self, robot: Robot) -> list[Term]:
-        place = robot.end_of(0) - 1
-        return [Term("base.bending", 1e-5, 0, place, axis) for axis in (Axis.RX, Axis.RY)]
+        return [Term("base.bending", 1e-5, 0, robot.end_of(0) - 1, axis) for axis in (Axis.RX, Axis.RY)]
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
