@@ -225,9 +225,8 @@ def real_errors(estimated: Robot, true: Robot, readings: Floats) -> RealErrors:
     def error(points: Floats, onto: Floats, R: Floats) -> PoseError:
         distance = np.linalg.norm(points @ R.T - onto, axis=1)
         rotation = rotation_vector(np.swapaxes(R @ at.rotation, 1, 2) @ truth.rotation)
-        rms = float(np.sqrt(np.mean(distance**2)))
-        orientation_rms = float(np.sqrt(np.mean(np.sum(rotation**2, axis=1))))
-        return PoseError(float(distance.max()), float(distance.mean()), rms, orientation_rms)
+        rms, turn = (float(np.sqrt(np.mean(square))) for square in (distance**2, np.sum(rotation**2, axis=1)))
+        return PoseError(float(distance.max()), float(distance.mean()), rms, turn)
 
     base, fitted = error(at.position, truth.position, np.eye(3)), None
     if len(readings) >= 3:

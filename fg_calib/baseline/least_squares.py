@@ -272,11 +272,9 @@ class _System:
         self._index = np.concatenate([chosen, frames, np.arange(self._edge, len(start))]).astype(np.int64)
         first = n + 6 * (np.cumsum(unknown) - 1)
         self._frames = [slice(k, k + 6) if own else slice(0) for k, own in zip(first.tolist(), unknown, strict=True)]
-        self._chains = []
-        for frame, has_frame in zip(self._frames, unknown.tolist(), strict=True):
-            columns = dict(enumerate([*range(n), *range(len(start))[frame]]))
-            chain = build_chain(robot, columns, frame=has_frame)
-            self._chains.append(replace(chain, n_columns=self._edge))
+        columns = (dict(enumerate([*range(n), *range(len(start))[frame]])) for frame in self._frames)
+        chains = (build_chain(robot, of, frame=own) for of, own in zip(columns, unknown.tolist(), strict=True))
+        self._chains = [replace(chain, n_columns=self._edge) for chain in chains]
         self._rows = _train_rows(robot, data, weighted)
 
     def parameters(self, x: Floats) -> Floats:

@@ -229,8 +229,7 @@ def build_pool(
     formed = {k: (i.model, i.pairing or Pairing()) for k, i in own}
     more = {"scenario": scenario, "tables": tables, "found": found, "before": before, "formed": formed}
     pool = pool_of(problem, np.arange(len(names)), scenario.source, alone=before is None, **more)
-    given_poses = pool.pose_of[among_given & (pool.pose_of >= 0)]
-    return replace(pool, given=given_poses)
+    return replace(pool, given=pool.pose_of[among_given & (pool.pose_of >= 0)])
 
 
 def pool_of(problem: Problem, poses: Integers, source: str, *, alone: bool = True, **more: Any) -> Pool:
@@ -288,10 +287,9 @@ def _with_instruments(scenario: Scenario) -> Scenario:
     Raises:
         InputError: An instrument measures pairs directly.
     """
-    for instrument in scenario.instruments:
-        if instrument.pairs is not None:
-            expected = "model: pose with frame: unknown to choose the configurations of pairs"
-            raise InputError(f"instruments: {instrument.name}", "pairs that are measured directly", expected)
+    if name := next((i.name for i in scenario.instruments if i.pairs is not None), ""):
+        expected = "model: pose with frame: unknown to choose the configurations of pairs"
+        raise InputError(f"instruments: {name}", "pairs that are measured directly", expected)
     if scenario.instruments:
         return scenario
     model = scenario.job.get("model", "distance-rotation")

@@ -265,8 +265,7 @@ def average_stops(
     applied = offset if estimate is None else estimate.seconds
     assert applied is not None
     stops, reasons = _centre(joints, poses, np.array(spans), applied)
-    origin = float(joints.time[0])
-    skipped = tuple(Skipped(f"stop{k + 1}", spans[k][0] - origin, reasons[k]) for k in sorted(reasons))
+    skipped = tuple(Skipped(f"stop{k + 1}", spans[k][0] - float(joints.time[0]), reasons[k]) for k in sorted(reasons))
     good = [k for k in stops if k not in reasons]
     if not good:
         hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])

@@ -143,8 +143,8 @@ def _too_few(rows: Linear) -> str:
     """Why the rows cannot be judged; empty if they can."""
     if rows.dof >= LEAST_DOF:
         return ""
-    fitted = "frame, station and whatever else does not stay with the arm"
-    used = f"{rows.placed.problem.n_independent} figures, of which {rows.n_free} go to {fitted}"
+    fitted = f"{rows.n_free} go to frame, station and whatever else does not stay with the arm"
+    used = f"{rows.placed.problem.n_independent} figures, of which {fitted}"
     return f"{used}: {rows.dof} left to judge by, at least {LEAST_DOF} needed"
 
 
@@ -196,8 +196,7 @@ def _detectable(calibrated: Calibrated, found: Sequence[HypothesisTest]) -> dict
     """The offset change of each joint that is found with a probability of `POWER`."""
     least = np.sqrt(hypotheses.quantile(hypotheses.CERTAIN / max(len(found), 1), 1)) + special.ndtri(POWER)
     sizes = {f.hypothesis.names[0]: float(least * f.sigma[0]) for f in found if f.hypothesis.kind == "zero"}
-    names = calibrated.robot.zero_names
-    return {name: sizes[name] if np.isfinite(sizes.get(name, np.nan)) else None for name in names}
+    return {n: sizes[n] if np.isfinite(sizes.get(n, np.nan)) else None for n in calibrated.robot.zero_names}
 
 
 def _reasons(

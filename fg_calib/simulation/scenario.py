@@ -275,6 +275,9 @@ class Box:
         _require(bool((self.lower < self.upper).all()), "upper", found, "more than lower in x, y and z")
 
 
+InBox = Annotated[Box, _in_file(lambda given, _: io.corners_of(given))]
+
+
 @schema
 class Conditions:
     """Conditions on configurations of any kind.
@@ -285,9 +288,7 @@ class Conditions:
             as its share of the arm's reach. None: any.
     """
 
-    keep_out: tuple[Annotated[Box, _in_file(lambda given, _: io.corners_of(given))], ...] = Field(
-        default=(), kw_only=True
-    )
+    keep_out: tuple[InBox, ...] = Field(default=(), kw_only=True)
     apart: PositiveAngle | None = Field(default=None, kw_only=True)
 
 

@@ -90,8 +90,7 @@ class Visits(NamedTuple):
     @staticmethod
     def joined(parts: "Sequence[Visits]") -> "Visits":
         """Visits one after the other."""
-        values: list[Any] = [np.concatenate(values) for values in zip(*parts, strict=True)]
-        return Visits(*values)
+        return Visits(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass

@@ -164,8 +164,7 @@ def _job_text(simulation: Simulation, units: Units) -> str:
     if scenario.instruments:
         return job_text(words, {**keys, **scenario.job}, simulation.tables, robot, units)
     keys |= {"measurements": m.source, **scenario.job, "frame": simulation.tables[0].frame, "units": asdict(units)}
-    noise = {"joint": joint_noise(m.sigma_joint, robot, units)}
-    return words + _yaml(keys | {"noise": _noise(m, units) | noise})
+    return words + _yaml(keys | {"noise": _noise(m, units) | {"joint": joint_noise(m.sigma_joint, robot, units)}})
 
 
 def _yaml(document: Mapping[str, Any]) -> str:
@@ -216,8 +215,7 @@ def _noise(m: Measurements, units: Units) -> dict[str, float]:
     if between is not None:
         sigmas |= {"distance": between[0].sigma_distance, "angle": between[0].sigma_angle}
     specified = {kind: float(s.flat[0]) for kind, s in sigmas.items() if s is not None and np.isfinite(s).any()}
-    of_unit = {kind: (sigma, NOISE_UNITS[kind]) for kind, sigma in specified.items()}
-    return {kind: _rounded(units.from_si(s, unit)) for kind, (s, unit) in of_unit.items()}
+    return {kind: _rounded(units.from_si(sigma, NOISE_UNITS[kind])) for kind, sigma in specified.items()}
 
 
 def _rounded(sigma: float) -> float:

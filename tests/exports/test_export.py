@@ -135,7 +135,7 @@ def ur_macro(kinematics):
         ("flange-tool0", "flange", "tool0", f"{np.pi / 2} 0 {np.pi / 2}"),
     ]
     parts = ['<link name="base_link"/>']
-    for name, parent, child, rpy in fixed[:2]:
+    for name, parent, child, rpy in fixed:
         parts.append(f'<link name="{child}"/><joint name="{name}" type="fixed"><origin xyz="0 0 0" rpy="{rpy}"/>'
                      f'<parent link="{parent}"/><child link="{child}"/></joint>')  # fmt: skip
     for link, (name, parent, child) in UR_JOINTS.items():
@@ -146,9 +146,6 @@ def ur_macro(kinematics):
             f'<origin xyz="{o["x"]} {o["y"]} {o["z"]}" rpy="{o["roll"]} {o["pitch"]} {o["yaw"]}"/><axis xyz="0 0 1"/>'
             '<limit lower="-6.3" upper="6.3" effort="1" velocity="1"/></joint>'
         )
-    for name, parent, child, rpy in fixed[2:]:
-        parts.append(f'<link name="{child}"/><joint name="{name}" type="fixed"><origin xyz="0 0 0" rpy="{rpy}"/>'
-                     f'<parent link="{parent}"/><child link="{child}"/></joint>')  # fmt: skip
     return f'<robot name="ur">{"".join(parts)}</robot>'
 
 
