@@ -300,7 +300,7 @@ QUESTIONS = (
              ranks_answer),
     Question("arm", "What do compliances and eccentricities cost the paper's arm?", arm_tasks,
              calibrate_both, arm_summary, arm_answer, (200, 1)),
-    Question("honesty", "Are sigmas with effects true?",
+    Question("honesty", "Are sigmas true?",
              lambda n, s: [(f"{name}, {view}", s + k) for name in SETS for view in VIEWS for k in range(n)], honesty,
              honesty_summary, honesty_answer, (40, 2)),
 )  # fmt: skip
