@@ -140,8 +140,7 @@ def summarise(order: Order) -> JobSummary:
     verdict: Verdict = "doubtful" if result.findings else "not accepted" if not_accepted else "good"
     units = {kind: result.unit_of(kind) for kind in rms}
     about = (None, result.findings, not_accepted, result.robot, result.n_configurations, rms, rows, units)
-    seconds = time.perf_counter() - clock
-    return JobSummary(order.name, str(order.job), verdict, *about, result.reduced_chi2, seconds)
+    return JobSummary(order.name, str(order.job), verdict, *about, result.reduced_chi2, time.perf_counter() - clock)
 
 
 def calibrate_into(orders: Sequence[Order], executor: Executor | None = None) -> list[JobSummary]:

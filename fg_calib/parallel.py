@@ -250,8 +250,7 @@ def local_processes(n_workers: int) -> ProcessPoolExecutor:
         InputError: The number of processes is no number from 1 to 1000.
     """
     check_number("workers", n_workers, above=True, whole=True, most=MOST)
-    share = max(1, processors() // n_workers)
-    return ProcessPoolExecutor(n_workers, get_context("spawn"), _start_worker, (share,))
+    return ProcessPoolExecutor(n_workers, get_context("spawn"), _start_worker, (max(1, processors() // n_workers),))
 
 
 def _start_worker(n_threads: int) -> None:

@@ -294,8 +294,7 @@ class _System:
         """Whitened residuals, shape (m,), and their derivatives, shape (m, n_unknowns)."""
         (chains, coordinates), found_r, found_J = self._at(x), [], []
         for W, rows in zip(weights, self._rows, strict=True):
-            block = replace(rows.block, nuisances=coordinates[rows.landmarks])
-            r, J = residuals.linearise(block, chains[rows.table])
+            r, J = residuals.linearise(replace(rows.block, nuisances=coordinates[rows.landmarks]), chains[rows.table])
             wide = np.zeros((*r.shape, len(self._start) + 1))  # the last column for known coordinates
             wide[:, :, : self._edge] = J[:, :, : self._edge]
             for k, columns in enumerate(self._column[rows.landmarks].T):

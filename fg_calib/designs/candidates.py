@@ -213,8 +213,7 @@ def build_pool(
     tables = _measure_all(scenario, found, given)
     gauge: Gauge = "none" if scenario.job.get("gauge") == "none" or scenario.job.get("prior") is False else "prior"
     options = Options(tables[0].model or "pose", gauge=gauge) if before is None else before.options
-    places = None if before is None else places_of(before, before.start)
-    problem = true_problem(scenario.robot, tables, options, places)
+    problem = true_problem(scenario.robot, tables, options, None if before is None else places_of(before, before.start))
     data = problem.data
     if not problem.rows.parts:
         n = data.n_configurations

@@ -143,8 +143,7 @@ def design(
     parallel.tell("looking for candidates")
     pool = _build_pool(of, candidates, given, n_candidates, draw["candidates"])
     readings = random_readings(pool.robot, N_TASK, draw["task"]) if task is None else task
-    blind_to_base = ObservedQuantities.of(pool.problem).blind_to_base
-    wanted = Task(readings, blind_to_base if fitted is None else fitted, lever)
+    wanted = Task(readings, ObservedQuantities.of(pool.problem).blind_to_base if fitted is None else fitted, lever)
     if wanted.fitted and len(readings) < MIN_FITTED:
         found = f"{len(readings)} configuration{'s' * (len(readings) > 1)}, whose errors a rigid fit takes up"
         raise InputError("task", found, f"{MIN_FITTED} or more, or errors in the base frame")

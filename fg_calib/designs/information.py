@@ -86,8 +86,7 @@ def gather_rows(problem: Problem, pose_of: Integers, references: Integers, *, al
     wide = np.vstack([*(np.pad(one, ((0, 0), (0, n_shared))) for one in fixed), of_references])
     rows[:, :, of_curves] = wide[:, of_curves] = 0.0
     errors = np.hstack([np.zeros((n_shared, n_columns)), np.eye(n_shared)])
-    scales = np.append(v.all_scales, np.ones(n_shared))
-    return PoseRows(rows, np.vstack([wide, errors]), scales, v.n_robot_columns)
+    return PoseRows(rows, np.vstack([wide, errors]), np.append(v.all_scales, np.ones(n_shared)), v.n_robot_columns)
 
 
 def _derivatives(problem: Problem, pose_of: Integers, references: Integers) -> tuple[Floats, Floats, Integers]:

@@ -184,8 +184,7 @@ def joint_travel(robot: Robot, readings: Floats) -> float:
 
     Motions of prismatic joints count as rotations that move the arm's reach by as much.
     """
-    steps = np.abs(np.diff(readings * _weights(robot), axis=0))
-    return float(np.sum(steps.max(axis=1, initial=0.0)))
+    return float(np.sum(np.abs(np.diff(readings * _weights(robot), axis=0)).max(axis=1, initial=0.0)))
 
 
 def order_by_nearest(robot: Robot, readings: Floats) -> Integers:

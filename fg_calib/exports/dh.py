@@ -455,8 +455,7 @@ def _fit(predict: Callable[[Floats], Poses], start: Floats, wanted: Robot, readi
     def residual(x: Floats) -> Floats:
         return np.concatenate([(weight * _miss(predict(x), at)).ravel(), hold * (x - start)])
 
-    found = least_squares(residual, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200)
-    return found.x
+    return least_squares(residual, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200).x
 
 
 def _miss(found: Poses, wanted: Poses) -> Floats:

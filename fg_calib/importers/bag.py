@@ -566,8 +566,7 @@ def _read_poses(
             p, q = (at.translation, at.rotation) if hasattr(at, "translation") else (at.position, at.orientation)
             frame, child = m.header.frame_id, getattr(m, "child_frame_id", "")
             pair = frame.removeprefix("/"), child.removeprefix("/")  # ROS 1 had a slash before names
-            sample = (_stamp(m.header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w))
-            samples.setdefault(pair, []).append(sample)
+            samples.setdefault(pair, []).append((_stamp(m.header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
     wanted = [None if frame is None else frame.removeprefix("/") for frame in frames]
     fitting = [pair for pair in samples if all(f in (None, g) for f, g in zip(wanted, pair, strict=True))]
     if len(fitting) != 1:

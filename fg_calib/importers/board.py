@@ -220,13 +220,11 @@ def _checkerboard(cv2: Any, image: Image, board: CalibrationBoard) -> tuple[Inte
         return "no board"
     columns, rows = board.shape
     uv = (uv.astype(np.float64) + 0.5) * scale - 0.5
-    grid = in_order(image, uv.reshape(rows, columns, 2))
-    return np.arange(columns * rows), grid.reshape(-1, 2)
+    return np.arange(columns * rows), in_order(image, uv.reshape(rows, columns, 2)).reshape(-1, 2)
 
 
 def _charuco(cv2: Any, image: Image, board: CalibrationBoard) -> tuple[Integers, Floats] | str:
-    detector = cv2.aruco.CharucoDetector(charuco_board(board, "board"))
-    uv, corners, _, _ = detector.detectBoard(image)
+    uv, corners, _, _ = cv2.aruco.CharucoDetector(charuco_board(board, "board")).detectBoard(image)
     if corners is None or len(corners) == 0:
         return "no board"
     return corners.ravel().astype(np.int64), uv.reshape(-1, 2).astype(np.float64)
@@ -484,8 +482,7 @@ def _view(one: Corners, fit: _Fit, of_all: float, taken: float) -> View:
     variance = (fit.squares + PRIOR_RESIDUALS * of_all) / (len(fit.J) - taken + PRIOR_RESIDUALS)
     rms, sigma = float(np.sqrt(fit.squares / len(fit.J))), float(np.sqrt(variance))
     covariance = np.asarray(variance * np.linalg.inv(fit.J.T @ fit.J), dtype=np.float64)
-    ambiguous = fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance
-    return View(*one, *fit.pose, rms, sigma, covariance, ambiguous)
+    return View(*one, *fit.pose, rms, sigma, covariance, fit.second - fit.squares < MAX_CHI2_DIFFERENCE * variance)
 
 
 def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:
@@ -522,8 +519,7 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
     """
     place = path.name
     file = io.validate(CalibrationBoard, io.read_yaml(path), place)
-    scaled = {key: getattr(file, key) * file.units.factor("m") for key in ("square", "marker")}
-    board = file.model_copy(update=scaled)
+    board = file.model_copy(update={key: getattr(file, key) * file.units.factor("m") for key in ("square", "marker")})
     if board.square > MAX_SQUARE_M:
         found = f"found {io.shown(file.square)} {file.units.length}"
         raise InputError(f"{place}: square", found, f"at most {MAX_SQUARE_M:g} m", "is it in mm? units: {length: mm}")

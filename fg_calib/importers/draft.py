@@ -202,8 +202,7 @@ def _guess_unit(table: Table, kind: str, columns: Mapping[str, int]) -> str:
     """The unit of columns without one in their headers, by their largest value."""
     given = [table.columns[k] for name, k in columns.items() if not name.startswith("sigma_")]
     _, usual, other, limit = _UNITS[kind]
-    large = given and np.nanmax(np.abs(table.numbers(given, optional=True)), initial=0.0) > limit
-    return other if large else usual
+    return other if given and np.nanmax(np.abs(table.numbers(given, optional=True)), initial=0.0) > limit else usual
 
 
 def _find_model(present: set[str]) -> Model | None:

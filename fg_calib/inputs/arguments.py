@@ -254,5 +254,4 @@ def listed(key: str, names: Iterable[Any], expected: str = "a list of names") ->
 def known_names(names: Iterable[str], limit: int = 12) -> str:
     """`one of a, b, c` for an error message, cut after `limit` names."""
     listed = list(names)
-    shown = ", ".join(listed[:limit])
-    return f"one of {shown}{', ...' if len(listed) > limit else ''}"
+    return f"one of {', '.join(listed[:limit])}{', ...' if len(listed) > limit else ''}"

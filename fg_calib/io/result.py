@@ -387,8 +387,7 @@ class Result(Section):
 
 def key_of(fit: statistics.KindFit, fits: tuple[statistics.KindFit, ...]) -> str:
     """A kind of noise, with the number of its table where several tables have that kind."""
-    several = sum(other.kind == fit.kind for other in fits) > 1
-    return f"{fit.kind}, table {fit.table + 1}" if several else fit.kind
+    return f"{fit.kind}, table {fit.table + 1}" if sum(other.kind == fit.kind for other in fits) > 1 else fit.kind
 
 
 def in_words(table: measurements.Table) -> str:
@@ -712,8 +711,7 @@ def read_calibrated_robot(folder: Path, result: Result) -> Robot:
     Raises:
         InputError: There is none, or it is that of another result.
     """
-    files = [folder / f"robot_calibrated.{ending}" for ending in ("yaml", "urdf")]
-    file = next(filter(exists, files), None)
+    file = next(filter(exists, [folder / f"robot_calibrated.{ending}" for ending in ("yaml", "urdf")]), None)
     if file is None:
         raise InputError(str(folder), "neither robot_calibrated.yaml nor robot_calibrated.urdf next to its result.json")
     links = result.links or (None, None)

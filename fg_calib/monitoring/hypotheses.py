@@ -141,8 +141,7 @@ def fit_change(hypothesis: ChangeHypothesis, rows: Linear, n: int) -> Hypothesis
         n: Number of hypotheses that are tested.
     """
     size = np.linalg.norm(hypothesis.columns, axis=0)
-    ordinary = np.array([rows.robot.scale_of(unit) if unit else 1.0 for unit in hypothesis.units])
-    acts = size * ordinary > SEEN
+    acts = size * np.array([rows.robot.scale_of(unit) if unit else 1.0 for unit in hypothesis.units]) > SEEN
     scale = np.where(acts, size, 1.0)
     U, s, Vt = np.linalg.svd(rows.new(np.where(acts, hypothesis.columns / scale, 0.0)), full_matrices=False)
     k = int(np.sum(s > SEEN))
@@ -358,5 +357,4 @@ def advise_configurations(rows: Linear, likely: Sequence[HypothesisTest]) -> Adv
     q, moved = random_configurations(rows.robot), motion(rows, one) - motion(rows, other)
     in_scale = moved / np.array([[rows.robot.scale_of("rad")], [rows.robot.scale_of("m")]])
     best = np.argsort(-np.linalg.norm(in_scale, axis=(1, 2)), kind="stable")[:N_ADVISED]
-    apart = np.linalg.norm(moved[best, 1], axis=1)
-    return Advice(q[best], (one.hypothesis.names, other.hypothesis.names), apart)
+    return Advice(q[best], (one.hypothesis.names, other.hypothesis.names), np.linalg.norm(moved[best, 1], axis=1))

@@ -201,8 +201,7 @@ def linearise_new_data(at: Placed) -> Linear:
     of_known = np.hstack([information, np.zeros((len(information), len(free)))])
     fitted = diagnostics.basis_of(np.vstack([J @ directions, of_known, J_priors @ directions]))
     r = np.concatenate([r, np.zeros(len(information)), r_priors])
-    n_given = len(information) + len(r_priors)
-    n_free = fitted.shape[1] - n_given
+    n_free = fitted.shape[1] - len(information) - len(r_priors)
     left, dof = r - fitted @ (fitted.T @ r), problem.n_independent - n_free
     return Linear(at, left, fitted, J[:, : v.n_robot_columns], dof, n_free)
 

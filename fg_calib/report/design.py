@@ -194,8 +194,7 @@ def write_design(folder: Path, design: Design, units: Units) -> tuple[str, ...]:
 def _is_touched(table: measurements.Table) -> bool:
     """Whether something is touched, so that it is the joint readings that are measured."""
     m = table.measurements
-    contact = table.model in ("anchor", "plane") and not np.any(m.columns.get("distance", 0.0))
-    return m.groups is not None or contact
+    return m.groups is not None or (table.model in ("anchor", "plane") and not np.any(m.columns.get("distance", 0.0)))
 
 
 def _configurations(design: Design, robot: Robot, units: Units) -> dict[str, Any]:

@@ -305,8 +305,7 @@ def parameter_table(result: Result) -> Table:
             rows.append((p.name, p.estimate, p.sigma, p.unit, *more, p.identifiability))
         elif not result.evaluated_only and (p.nominal != 0.0 or not p.name.startswith(("base.", "tool."))):
             rows.append((p.name, p.estimate, "", p.unit, "", "", "", "fixed"))
-    columns = ("", "estimate|q", "± sigma|q", "|unit", "correction|q:+", "nominal|q", "prior|q", "class")
-    return table_of(columns, rows)
+    return table_of(("", "estimate|q", "± sigma|q", "|unit", "correction|q:+", "nominal|q", "prior|q", "class"), rows)
 
 
 def _error_curves(result: Result) -> Table:

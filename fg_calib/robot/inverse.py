@@ -134,8 +134,7 @@ def _starts(robot: Robot, near: ArrayLike | None, shape: tuple[int, ...], genera
         return random_readings(robot, n_poses * n_starts, generator).reshape(shape)
     middle = as_floats("near", near, f"({n_joints})" if np.ndim(near) == 1 else f"({n_poses}, {n_joints})")
     spread = np.linspace(0.0, 1.0, n_starts)[:, None]  # [rad] (prismatic: [m]), 0 for the first start
-    starts = np.atleast_2d(middle)[:, None, :] + spread * generator.normal(size=shape)
-    return np.clip(starts, *robot.limits.T)
+    return np.clip(np.atleast_2d(middle)[:, None, :] + spread * generator.normal(size=shape), *robot.limits.T)
 
 
 class _Search:

@@ -239,8 +239,7 @@ def _without_idle(chain: Chain, changing: set[int]) -> Chain:
         changing: Indices of the parameters, and of the measurement frame's six, that `Chain.at` may change.
     """
     fixed = np.array([source not in changing for source in chain.source])
-    moved = (chain.joint >= 0) & (chain.basis < 0)
-    keep = ~(fixed & (chain.value == 0.0) & ~moved & (chain.column < 0))
+    keep = ~(fixed & (chain.value == 0.0) & ~((chain.joint >= 0) & (chain.basis < 0)) & (chain.column < 0))
     names = ("axis", "constant", "sign", "source", "value", "joint", "basis", "column")
     return replace(chain, **{name: getattr(chain, name)[keep] for name in names})
 

@@ -69,10 +69,8 @@ def nearest_rotation(M: Floats) -> Floats:
 def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
     """Angle in [0, pi] and axis times its sine of rotation matrices, shapes (n,) and (n, 3)."""
     R = rotation
-    pairs = (R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1])
-    axis = 0.5 * np.stack(pairs, axis=1)
-    cosine = 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)
-    return np.arctan2(np.linalg.norm(axis, axis=1), cosine), axis
+    axis = 0.5 * np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1)
+    return np.arctan2(np.linalg.norm(axis, axis=1), 0.5 * (np.trace(R, axis1=1, axis2=2) - 1.0)), axis
 
 
 def cross_matrix(v: Floats) -> Floats:
