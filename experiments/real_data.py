@@ -40,7 +40,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Calibration, Robot, build_problem, calibrate_job, read_job, solve
+from fg_calib import Calibration, Job, Robot, build_problem, calibrate_job, read_job, solve
 from fg_calib.robot import pose
 
 Floats = NDArray[np.float64]
@@ -247,6 +247,14 @@ def write_panda_job(data: Path, rows: list[dict[str, str]], folder: Path, way: s
     return folder / "job.yaml"
 
 
+def panda_job(data: Path, way: str) -> tuple[Job, list[dict[str, str]]]:
+    """The job of one way, and the rows of its table."""
+    with (data / "panda_3.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    with TemporaryDirectory() as folder:
+        return read_job(write_panda_job(data, rows, Path(folder), way)), rows
+
+
 def write_urdf(nominal: Row, path: Path) -> None:
     """Write the nominal arm as a URDF, which has the convention of its table."""
     end = {"name": "flange", "type": "fixed", "axis": [0, 0, 1]}
@@ -311,10 +319,7 @@ def panda(task: Task) -> Row:
     data = data_folder("panda_sockets")
     if data is None:
         return {}
-    with (data / "panda_3.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    with TemporaryDirectory() as folder:
-        job = read_job(write_panda_job(data, rows, Path(folder), way))
+    job, rows = panda_job(data, way)
     solution = solve(build_problem(job.robot, job.tables, job.options))
     before = job.robot.with_values(solution.before[: len(job.robot.parameters)])
     row: Row = {"iterations": solution.iterations, "converged": solution.converged}

@@ -17,7 +17,6 @@ Takes ten minutes. Without the data a question says so and is left out of the re
 
 from __future__ import annotations
 
-import csv
 import sys
 import time
 from collections.abc import Sequence
@@ -31,7 +30,7 @@ import numpy as np
 import yaml
 from common import MM, Question, Row, Task, data_folder, rms, run
 from numpy.typing import NDArray
-from real_data import LEAST_EIGENVALUE, NOISE, by_name, judge_sockets, write_panda_job
+from real_data import LEAST_EIGENVALUE, NOISE, by_name, judge_sockets, panda_job
 
 from fg_calib import Job, Solution, Table, build_problem, read_job, solve
 from fg_calib.assessment import solve_job
@@ -173,10 +172,7 @@ def sockets(task: Task) -> Row:
     data = data_folder("panda_sockets")
     if data is None:
         return {}
-    with (data / "panda_3.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    with TemporaryDirectory() as folder:
-        job = read_job(write_panda_job(data, rows, Path(folder), "group"))
+    job, rows = panda_job(data, "group")
     robot = job.robot.with_effects(*SOCKETS[name]) if SOCKETS[name] else job.robot
     solution = solve(build_problem(robot, job.tables, job.options))
     judged = judge_sockets(solution.robot, job.tables[0].measurements.readings, rows)
