@@ -76,7 +76,8 @@ def test_select_stands_for_the_standard_effects(read):
     assert [type(e).__name__ for e in robot.effects] == ["ErrorCurve", "Compliance", "Harmonics", "Gain"]
 
 
-def test_masses_of_a_urdf_are_where_its_links_are(tmp_path):
+@pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base")])
+def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
     """A mass behind a fixed joint, and axes that are not z: torques by the potential of all links."""
     from yourdfpy import URDF
 
@@ -91,14 +92,17 @@ def test_masses_of_a_urdf_are_where_its_links_are(tmp_path):
     text = "".join(LINK.format(name=n, com=com[n], mass=mass[n]) for n in com)
     text += "".join(JOINT.format(**dict(zip(names, joint, strict=True))) for joint in joints)
     (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
-    (tmp_path / "robot.yaml").write_text("urdf: arm.urdf\ntip_link: fore\neffects: {compliance: true}\n")
+    (tmp_path / "robot.yaml").write_text(
+        "urdf: arm.urdf\nbase_link: {}\ntip_link: {}\neffects: {{compliance: true}}\n".format(*ends)
+    )
     robot, q = read_robot(tmp_path / "robot.yaml"), np.array([[0.4, -0.9], [1.0, 0.3]])
-    assert [p.name for p in robot.parameters if p.kind == "compliance"] == ["shoulder.compliance", "elbow.compliance"]
+    turning = ["shoulder", "elbow"] if ends[0] == "base" else ["elbow", "shoulder"]
+    assert [p.name for p in robot.parameters if p.kind == "compliance"] == [f"{name}.compliance" for name in turning]
     urdf = URDF.load(str(tmp_path / "arm.urdf"), load_meshes=False, build_scene_graph=True)
 
     def potential(readings):
-        urdf.update_cfg(dict(zip(("shoulder", "elbow"), readings, strict=True)))
-        points = {n: urdf.get_transform(n, "base") @ [*map(float, com[n].split()), 1.0] for n in com}
+        urdf.update_cfg(dict(zip(turning, readings, strict=True)))
+        points = {n: urdf.get_transform(n, ends[0]) @ [*map(float, com[n].split()), 1.0] for n in com}
         return -9.81 * sum(mass[n] * points[n][2] for n in com)
 
     found = robot.effects[0].values(robot.geometry, q, {}, np.zeros(2))[:, :, 0]
