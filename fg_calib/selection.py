@@ -113,19 +113,23 @@ def estimate_curve_sigma(
     Raises:
         SolverError: GTSAM could not solve a step at all.
     """
-    specified, state = [e.sigma for e in problem.robot.effects if isinstance(e, ErrorCurve)], problem.state
+    specified = [e.sigma for e in problem.robot.effects if isinstance(e, ErrorCurve)]
     first = [sigma for v in problem.variables.nuisance if v.kind == "curve" and v.prior for sigma in v.prior[1]]
     if problem.evaluated or not first or any(specified):
         return solve_with(problem)
 
-    def refit(theta: Floats) -> tuple[graph.Solution, Floats, None]:
-        nonlocal state
-        sigma = first[0] * float(np.exp(theta[0]))
-        solution = solve_with(_with_sigma(replace(problem, state=state), sigma))
-        state = replace(state, factors=solution.problem.state.factors)  # where the next fit takes the noise up
-        return solution, np.array([np.log(_next_sigma(solution, sigma) / sigma)]), None
+    known = list[graph.Solution]()
 
-    return settle(refit, 1, SETTLED, "prior sigma of error curves")[0]
+    def refit(theta: Floats) -> tuple[graph.Solution, Floats, None]:
+        sigma, begun = first[0] * float(np.exp(theta[0])), problem
+        if known:  # the next fit takes arm and noise up where the last one left them
+            state = replace(problem.state, factors=known[-1].problem.state.factors)
+            begun = replace(problem, start=known[-1].parameters, state=state)
+        known.append(solve_with(_with_sigma(begun, sigma)))
+        return known[-1], np.array([np.log(_next_sigma(known[-1], sigma) / sigma)]), None
+
+    solution = settle(refit, 1, SETTLED, "prior sigma of error curves")[0]
+    return graph.begun_at(solution, known[0].before)
 
 
 def _with_sigma(problem: graph.Problem, sigma: float) -> graph.Problem:

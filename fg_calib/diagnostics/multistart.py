@@ -6,7 +6,7 @@ directions whose sigma is smaller at the estimate than at nominal start again fr
 directions that stay weak start again from 2 prior sigmas to either side. Planes and anchors start again from their
 mirror images, one after the other from the best optimum so far, if these explain the data nearly as well with the
 nominal arm. The best optimum is kept; those that chi-square cannot distinguish from it are reported in
-`Solution.others`.
+`Solution.others`. Error curves are taken as they were found: they have no other optima of their own.
 
 Note:
     Pairs whose sign is ambiguous within the priors are not searched: the verdict names them (see `verdict`).
@@ -17,7 +17,16 @@ from operator import attrgetter
 
 import numpy as np
 
-from fg_calib.graph import SIGNAL_FLOOR, Problem, Solution, SolverOptions, directions, solve, with_factors
+from fg_calib.graph import (
+    SIGNAL_FLOOR,
+    Problem,
+    Solution,
+    SolverOptions,
+    directions,
+    solve,
+    with_curves_held,
+    with_factors,
+)
 from fg_calib.inputs import CalibrationError, Floats, checked
 from fg_calib.measurements import Kind
 from fg_calib.parallel import one_blas_thread
@@ -65,6 +74,13 @@ def multistart(solution: Solution) -> Solution:
     """
     if solution.problem.evaluated or not solution.converged:
         return solution
+    if solution.problem.variables.n_curves:
+        problem = with_curves_held(solution.problem, solution.parameters)
+        cost = problem.system.cost
+        held = multistart(replace(solution, problem=problem, cost=cost, weighted_cost=cost))
+        if np.array_equal(held.parameters, solution.parameters):
+            return replace(solution, others=held.others, seconds=held.seconds)
+        return min(solution, *_solve_from(solution, solution.problem, held.parameters), key=_objective)
     found = [solution]
     with one_blas_thread:
         starts = [solution.problem.variables.moved(solution.parameters, step) for step in _steps(solution)]

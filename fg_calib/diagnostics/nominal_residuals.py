@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fg_calib.graph import Problem, build_variables, noises_at, problem_of_tables, tables_of, take_steps
 from fg_calib.inputs import Floats, InputError, Options, Pairing, ProblemError, Record, SolverError
 from fg_calib.measurements import INSTRUMENTS, Instrument, Table, residuals
-from fg_calib.robot import Robot
+from fg_calib.robot import EFFECT_KINDS, Robot
 
 USUAL = {"m": 2e-3, "rad": 5e-3}
 """1 sigma of true minus nominal where a parameter has no prior: 2 mm and 5 mrad (0.3 degrees)."""
@@ -120,7 +120,8 @@ def setup_of(robot: Robot, table: Table) -> Setup | None:
     if base and INSTRUMENTS[table.model].is_pose and table.frame == "known":  # the base is fitted as a frame
         robot = robot.with_estimated([p.name for p in robot.parameters if p.estimated and p.name not in base])
         some_rows = replace(some_rows, frame="unknown")
-    return Setup(robot, some_rows)
+    idle = not any(p.nominal for p in robot.parameters if p.kind in EFFECT_KINDS)
+    return Setup(robot.geometry if idle else robot.with_curves_held(robot.nominal), some_rows)
 
 
 def evenly(n: int, most: int) -> NDArray[np.int64]:

@@ -42,6 +42,7 @@ from .problem import (
     subsampled,
     tables_of,
     variables_of,
+    with_curves_held,
     with_factors,
 )
 from .robust import effect, tuning, weight
@@ -50,6 +51,7 @@ from .solver import (
     SolverOptions,
     ToleranceScale,
     ToleranceScales,
+    begun_at,
     solve,
     take_steps,
     unsolved,
@@ -91,6 +93,7 @@ __all__ = [
     "WhitenedBlock",
     "WhitenedRows",
     "all_errors",
+    "begun_at",
     "block_diagonal",
     "build_problem",
     "build_variables",
@@ -129,5 +132,6 @@ __all__ = [
     "weight",
     "whitener_of",
     "whitening_of",
+    "with_curves_held",
     "with_factors",
 ]

@@ -205,7 +205,7 @@ class Eliminated(Brief):
         A: The core's columns, minus what the landmark columns can explain of them, shape (m, n_core).
         b: The right-hand side, minus the same, shape (m,).
         follow: How the landmarks follow the core, shape (n_landmarks, n_core).
-        inverse: S with S S^T the landmarks' covariance at a given core, shape (n_landmarks, rank).
+        spread: Multiplies by `inverse`.
         unknown: Which landmark columns have a share in a direction that nothing determines, shape (n_landmarks,).
     """
 
@@ -213,13 +213,18 @@ class Eliminated(Brief):
     A: Floats
     b: Floats
     follow: Floats
-    inverse: Floats
+    spread: Callable[[Floats], Floats]
     unknown: Booleans
 
     @property
     def rank(self) -> int:
         """Number of directions of the landmarks that the system determines."""
         return len(self.own)
+
+    @cached_property
+    def inverse(self) -> Floats:
+        """S with S S^T the landmarks' covariance at a given core, shape (n_landmarks, rank)."""
+        return self.spread(np.eye(self.rank))
 
 
 class WhitenedBlock(Brief):
@@ -396,9 +401,10 @@ class WhitenedRows(Brief):
         U = scipy.linalg.cholesky(S, overwrite_a=True, check_finite=False)
         Z = scipy.linalg.cho_solve((U, False), L.T @ y, check_finite=False)
         rows = _reduced(y.shape[1], [np.concatenate([y - L @ Z, Z])])
-        inverse = curves.sigma[:, None] * scipy.linalg.lapack.dtrtri(U)[0]
-        own, follow = -U @ (Z[:, -1] + before), -curves.sigma[:, None] * Z[:, :-1]
-        return Eliminated(own, rows[:, :-1], -rows[:, -1], follow, inverse, np.zeros(len(own), dtype=np.bool_))
+        sigma = curves.sigma[:, None]
+        spread = lambda y: (sigma * scipy.linalg.solve_triangular(U, y.reshape(len(U), -1))).reshape(y.shape)  # noqa: E731
+        own, follow = -U @ (Z[:, -1] + before), -sigma * Z[:, :-1]
+        return Eliminated(own, rows[:, :-1], -rows[:, -1], follow, spread, np.zeros(len(own), dtype=np.bool_))
 
     def posterior_mean(self, at: State) -> Floats:
         """Posterior mean of the error states, shape (n_configurations, n_slots), [sigma]."""

@@ -91,7 +91,7 @@ def eliminate(A: Floats, b: Floats, n_core: int) -> Eliminated:
     left = left - Q @ (Q.T @ left)  # once more: rounding of the first time
     left[:, np.linalg.norm(left, axis=0) <= RANK_TOLERANCE * np.linalg.norm(core, axis=0)] = 0.0
     own = Q.T @ b
-    return Eliminated(own, left, b - Q @ own, -inverse @ explained, inverse, unknown)
+    return Eliminated(own, left, b - Q @ own, -inverse @ explained, lambda y: inverse @ y, unknown)
 
 
 def eliminate_more(first: Eliminated, rows: Floats, n_core: int) -> Eliminated:
@@ -104,13 +104,17 @@ def eliminate_more(first: Eliminated, rows: Floats, n_core: int) -> Eliminated:
     """
     A, b = np.vstack([rows[:, :-1], first.A]), np.concatenate([-rows[:, -1], first.b])
     then, (of_core, of_others) = eliminate(A, b, n_core), np.split(first.follow, [n_core], axis=1)
-    none = np.zeros((len(then.follow), len(first.own)))
+
+    def spread(y: Floats) -> Floats:
+        others = then.spread(y[first.rank :])
+        return np.concatenate([first.spread(y[: first.rank]) + of_others @ others, others])
+
     return Eliminated(
         np.concatenate([first.own, then.own]),
         then.A,
         then.b,
         np.vstack([of_core + of_others @ then.follow, then.follow]),
-        np.block([[first.inverse, of_others @ then.inverse], [none, then.inverse]]),
+        spread,
         np.concatenate([first.unknown, then.unknown]),
     )
 
@@ -177,7 +181,7 @@ class NormalSystem:
         self.root: Floats = self.directions[:rank].T / s[:rank]
         self.coordinates: Floats = np.concatenate([U[: len(b), :rank].T @ b, left.own])
         self.weights: Floats = np.concatenate([s[:rank] / s.max(initial=1e-300), np.ones(left.rank)])
-        self.step: Floats = self.full_root @ self.coordinates
+        self.step: Floats = self.spread(self.coordinates)
         self.decrement = float(np.linalg.norm(self.coordinates))
         self.cost = 0.5 * float(sum(np.sum(part**2) for part in (left.own, left.b, k[:, -1])))
         self._gather, self._states = rows, states
@@ -192,11 +196,20 @@ class NormalSystem:
         """Sum of squares of rows and priors after the step."""
         return 2.0 * self.cost - self.decrement**2
 
+    def spread(self, y: Floats) -> Floats:
+        """Multiply by `full_root`."""
+        core = self.root @ y[: self.rank]
+        return np.concatenate([core, self.left.follow @ core + self.left.spread(y[self.rank :])])
+
     @cached_property
     def full_root(self) -> Floats:
         """R with R R^T the covariance of core and landmarks, shape (n_all, rank + landmarks' rank)."""
-        own = np.vstack([np.zeros((len(self.root), self.left.rank)), self.left.inverse])
-        return np.hstack([np.vstack([self.root, self.left.follow @ self.root]), own])
+        return self.spread(np.eye(self.rank + self.left.rank))
+
+    @cached_property
+    def full_covariance(self) -> Floats:
+        """Covariance of core and landmarks, shape (n_all, n_all)."""
+        return self.full_root @ self.full_root.T
 
     # Statistics of single rows and of error states.
 
@@ -245,13 +258,14 @@ class NormalSystem:
     def project(self, f: Floats) -> Floats:
         """Data f, shape (n, k), times P = C^-1 - C^-1 A cov A^T C^-1; P r is `weighted_residual`."""
         weighed = self.states.weigh(f)
-        return weighed - self._weighed_root @ (self.full_root.T @ (self.A.T @ weighed))
+        return np.asarray(weighed - self._weighed @ (self.full_covariance @ (self.A.T @ weighed)))
 
     @cached_property
-    def _weighed_root(self) -> Floats:
-        """C^-1 A R, shape (n, rank)."""
-        return np.asarray((self.A - self.states.loadings @ self._follow) @ self.full_root)
+    def _weighed(self) -> Sparse:
+        """C^-1 A, shape (n, n_all): of error curves few columns a row."""
+        return Sparse(self.A - self.states.loadings @ self._follow)
 
     def trace(self, E: Sparse) -> float:
         """Trace of E^T P E, E sparse, shape (n, k); of large systems an estimate (see `error_states.N_PROBES`)."""
-        return self.states.trace(E) - float(np.sum((E.T @ self._weighed_root) ** 2))
+        of_rows = E.T @ self._weighed
+        return self.states.trace(E) - float(np.vdot((of_rows.T @ of_rows).toarray(), self.full_covariance))

@@ -539,6 +539,14 @@ def frames_only(problem: Problem) -> Problem | None:
     return with_factors(alone, start, robot=robot, variables=variables, options=options)
 
 
+def with_curves_held(problem: Problem, parameters: Floats) -> Problem:
+    """The problem started at a parameter vector, whose error curves are taken as known."""
+    robot = problem.robot.with_curves_held(parameters[problem.variables.robot_span])
+    variables = variables_of(robot, problem.data, problem.options)
+    whole = None if problem.whole is None else with_curves_held(problem.whole, parameters)
+    return with_factors(problem, parameters, robot=robot, variables=variables, whole=whole)
+
+
 def variables_of(robot: Robot, data: Dataset, options: Options) -> Variables:
     """The variables of a robot, its measurement frames and the measurements' unknowns."""
     frames = [table.unknown_frame for table in data.tables]

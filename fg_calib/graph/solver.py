@@ -236,6 +236,14 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
         return replace(found, seconds=time.perf_counter() - clock)
 
 
+def begun_at(solution: Solution, before: Floats) -> Solution:
+    """A solution as one that began at another parameter vector, with base, tool and measurement frame fitted there."""
+    if solution.before is before:
+        return solution
+    cost = relinearized_at(solution.problem, before, replace(solution.problem.state, weights=None)).system.cost
+    return replace(solution, before=before, initial_cost=cost)
+
+
 def unsolved(problem: Problem) -> Solution:
     """A problem at its start as if that were its solution: what could be known there."""
     return Solution(problem, problem.start, problem.start)
@@ -351,7 +359,7 @@ class _Point(Record):
         return self._along(optimizer.values().atVector(key)), DAMPING_FACTOR * following, following
 
     def _along(self, y: Floats) -> "_Point":
-        return self.after(self.system.full_root @ (self.system.weights * y))
+        return self.after(self.system.spread(self.system.weights * y))
 
 
 def _fit(problem: Problem, options: SolverOptions) -> Solution:

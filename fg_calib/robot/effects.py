@@ -189,8 +189,8 @@ class _Moments:
             end = self.robot.end_of(m.link)
             if end > place:
                 R_m, p_m = self.frame(end)
-                total += np.cross(p_m + R_m @ np.array(m.com) - p, m.mass * self.gravity)
-        return np.einsum("nji,nj->ni", R, total, dtype=np.float64)
+                total += m.mass * (p_m + R_m @ np.array(m.com) - p)
+        return np.einsum("nji,nj->ni", R, np.cross(total, self.gravity), dtype=np.float64)
 
     def of_unit(self, place: int, joint: int, axis: int) -> Floats:
         """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2]."""

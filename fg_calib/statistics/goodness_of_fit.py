@@ -313,11 +313,9 @@ class JudgedRows(Record):
 
     def degrees(self, chosen: Integers) -> float:
         """Degrees of freedom of some rows; where that is not known, no more than one configuration's errors."""
-        if self.covariance is not None:
-            trace, square = self.covariance.moments(chosen)
-        else:
-            trace, square = float(np.sum(self.means[chosen])), float(np.sum(self.means[chosen] ** 2))
-        nu = trace**2 / square if square > 0.0 else 1.0
+        means = self.means[chosen]
+        square = float(means @ means) if self.covariance is None else self.covariance.square(chosen, means)
+        nu = float(np.sum(means)) ** 2 / square if square > 0.0 else 1.0
         return nu if self.covariance is not None or not self.shared else min(nu, 3.0)
 
     def suspect_configurations(self) -> tuple[SuspectConfiguration, ...]:

@@ -70,18 +70,26 @@ class ResidualCovariance(Record):
         return replace(self, M=np.block([[K, cross], [cross, np.zeros_like(K)]])[:n, :n])
 
     def split(self) -> "ResidualCovariance":
-        """Copy with errors of more than one in `FEW` rows among the columns of P."""
-        many = FEW * np.bincount(self.L.indices, minlength=self.L.shape[1]) > len(self.d)
+        """Copy with errors of more than one in `FEW` rows among the columns of P; without those of none."""
+        n = np.bincount(self.L.indices, minlength=self.L.shape[1])
+        many, few = len(self.d) < FEW * n, (n > 0) & (len(self.d) >= FEW * n)
         P, M = np.hstack([self.P, self.L[:, many].toarray()]), block_diag(self.M, np.eye(int(many.sum())))
-        return ResidualCovariance(self.d, self.L[:, ~many], P, M)
+        return ResidualCovariance(self.d, self.L[:, few], P, M)
 
-    def moments(self, rows: Integers) -> tuple[float, float]:
-        """Trace, and trace of the square, of the part at some rows."""
+    def square(self, rows: Integers, variances: Floats) -> float:
+        """Trace of the square of the part at some rows.
+
+        Args:
+            rows: The rows.
+            variances: Their variances, shape (n_rows,).
+        """
         part = self.at(rows).split()
-        d, L, P, M, variances = part.d, part.L, part.P, part.M, part.diagonal
+        d, L, P, M = part.d, part.L, part.P, part.M
+        if len(rows) < len(M):
+            return float(np.sum((np.diag(d) + (L @ L.T).toarray() + P @ M @ P.T) ** 2))
         gram, PMP, LP = L @ L.T if L.shape[0] < L.shape[1] else L.T @ L, P.T @ P @ M, L.T @ P
         square = d @ (2.0 * variances - d) + gram.power(2).sum() + 2.0 * np.vdot(LP @ M, LP) + np.vdot(PMP, PMP.T)
-        return float(np.sum(variances)), float(square)
+        return float(square)
 
     def whitened(self, z: Floats, rows: Integers) -> tuple[float, float]:
         """Sum of squares of some rows, whitened together, and its mean.

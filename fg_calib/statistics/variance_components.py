@@ -207,16 +207,18 @@ def _settle(
         The solution, not converged where the factors have not settled, and the degrees of freedom of each origin that
         was estimated, next to the others.
     """
-    names, factors = _origins(problem), problem.state.factors
+    names, factors, known = _origins(problem), problem.state.factors, list[graph.Solution]()
 
     def refit(theta: Floats) -> tuple[graph.Solution, Floats, NoiseComponents]:
         moved = {name: float(np.exp(t)) for name, t in zip(names, theta, strict=True) if t}
         now = {name: factors.get(name, 1.0) * factor for name, factor in moved.items()}
-        solution = graph.solve(_scaled(problem, now), options)
-        found = noise_components(solution)
-        return solution, _steps(found, kept), found
+        start = known[-1].parameters if known and problem.options.loss == "none" else None
+        known.append(graph.solve(_scaled(problem, now), options, start=start))
+        found = noise_components(known[-1])
+        return known[-1], _steps(found, kept), found
 
     solution, found = settle(refit, len(names), SETTLED, "noise")
+    solution = graph.begun_at(solution, known[0].before)
     free = np.flatnonzero(_is_estimated(found, kept)).tolist()
     degrees = {names[i]: found.degrees(i, np.array(free)) for i in free}
     return replace(solution, estimated_noise=tuple(degrees)), degrees
