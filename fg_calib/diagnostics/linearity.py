@@ -17,17 +17,21 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.graph import Problem, Solution, noises_at, subsampled
 from fg_calib.inputs import Floats, Record, SolverError
-from fg_calib.robot import forward
+from fg_calib.robot import forward, pose, without_rigid_motion
 from fg_calib.statistics import Spread
 
 MAX_ROWS = 5_000
 """Residuals that suffice: of more, so many are drawn evenly where that is possible."""
 
-NEGLIGIBLE, NONLINEAR = 1e-3, 0.1
-"""Mean squared errors beyond the covariance, over it: below which one draw suffices, above which it matters."""
+NEGLIGIBLE, NONLINEAR, VERY_NONLINEAR = 1e-3, 0.1, 1.0
+"""Mean squared errors beyond the covariance, over it: below which one draw suffices, and above which it matters: of the
+tool, and of any directions."""
 
 MAX_SECOND_ORDER = 0.4
 """Mean lengthening of a vector by errors across, over the row's noise, above which its direction is ambiguous."""
+
+FEW = 200
+"""Configurations at which the tool is looked at."""
 
 N_DRAWS = 8
 """Draws of d: sums of all determined directions, each a sigma one way or the other."""
@@ -38,11 +42,18 @@ class Nonlinearity(Record):
 
     Attributes:
         directions: Of all determined directions, in the mean.
+        tool: Of the tool's position after the best rigid fit.
         rows: Names of the measurements with the largest second-order part over their noise; empty below `NONLINEAR`.
     """
 
     directions: float = 0.0
+    tool: float = 0.0
     rows: tuple[str, ...] = ()
+
+    @property
+    def matters(self) -> bool:
+        """Whether the tool's errors are larger than the covariance says, or those of any directions far larger."""
+        return self.tool >= NONLINEAR or self.directions >= VERY_NONLINEAR
 
 
 def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
@@ -57,21 +68,27 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
     scaled = root / scales[:, None]
     in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
     here = solution.system if problem is solution.problem else problem.linearize(solution.parameters)
-    shifts: list[Floats] = []
+    steps, shifts = list[Floats](), list[Floats]()
     try:
         while len(shifts) < N_DRAWS:
             core = root @ rng.choice([-1.0, 1.0], rank)
             step = np.concatenate([core, here.left.follow @ core])
             there = [problem.variables.moved(solution.parameters, d) for d in (step, -step)]
             plus, minus = (problem.linearize(x).step for x in there)
-            shifts.append((0.5 * (plus + minus) - here.step)[:n])
-            squares = np.mean((np.array(shifts) @ in_sigma.T) ** 2)
+            steps, shifts = [*steps, step], [*shifts, 0.5 * (plus + minus) - here.step]
+            squares = np.mean((np.array(shifts)[:, :n] @ in_sigma.T) ** 2)
             if len(shifts) == 1 and squares < NEGLIGIBLE:
                 break
     except SolverError:
-        return Nonlinearity(np.inf)
-    curved = squares >= NONLINEAR
-    return Nonlinearity(float(squares), _nonlinear_rows(problem, [solution.parameters, *there]) if curved else ())
+        return Nonlinearity(np.inf, np.inf)
+    if squares < NONLINEAR:
+        return Nonlinearity(float(squares))
+    few, points = problem.data.readings[:FEW], [solution.parameters, *there]
+    moved = [problem.variables.moved(solution.parameters, d) for d in (*steps, *shifts)]
+    p = [pose(problem.robot.with_values(x[problem.variables.robot_span]), few).position for x in (points[0], *moved)]
+    off, beyond = np.split(without_rigid_motion(p[0], np.stack(p[1:], axis=2) - p[0][:, :, None])[0], 2, axis=2)
+    tool = float(np.sum(beyond**2)) / max(float(np.sum(off**2)), 1e-300)
+    return Nonlinearity(float(squares), tool, _nonlinear_rows(problem, points))
 
 
 def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:

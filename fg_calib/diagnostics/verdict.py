@@ -190,7 +190,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     explained = bool(offsets) or any(s.severity == "error" for s in lacking)  # why residuals are systematic
     statements = [*check_setup(case, fits=fits), *check_optima(case)]
     statements += () if explained else check_systematic(case, doubts=doubts or much)
-    statements += [s for each in found.values() for s in each]
+    statements += [*(s for each in found.values() for s in each), *check_test_outliers(case)]
     statements += [Statement("note", text) for table in problem.data.tables for text in missing_values(table)]
     statements += [*check_excitation(identifiability), *offsets, *lacking]
     errors, warnings, notes = (texts(statements, severity) for severity in ("error", "warning", "note"))
@@ -297,10 +297,21 @@ def check_test_rows(case: Case) -> Iterator[Statement]:
     yield Statement("error", f"{text}: more than a robust loss can tell from noise", many)
     large = ratio >= NOTABLE_RATIO**2 and fit.p_value < SIGNIFICANT
     if large and not many and not FACTOR < of_fitted > ratio / FACTOR:  # noise specified too small is reported once
-        worst = [configuration.id for configuration in fit.configurations]
-        text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims"
-        text += f"; suspicious: {listed(worst)}" if worst else ""
-        yield Statement("error" if ratio > FACTOR else "warning", text)
+        text = f"{predicted_in_words(fit)}: the arm does not predict them as well as it claims{_suspicious(fit)}"
+        yield Statement("error" if ratio > FACTOR else "warning", text, not fit.has_outliers)
+
+
+def check_test_outliers(case: Case) -> Iterator[Statement]:
+    """Check whether a few test rows alone are predicted worse than they should be: they say nothing of the arm."""
+    fit = case.fit.goodness.test
+    if fit is not None and fit.has_outliers:
+        text = f"outliers in {predicted_in_words(fit)}{_suspicious(fit)}; {fit.others:.2g} times its mean without"
+        yield Statement("error", text)
+
+
+def _suspicious(fit: statistics.PredictedFit) -> str:
+    names = [configuration.id for configuration in fit.configurations]
+    return f"; suspicious: {listed(names)}" if names else ""
 
 
 def check_gain(case: Case) -> Iterator[Statement]:
@@ -390,8 +401,10 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
     most = f" (most: {listed(nonlinear.rows)})" * bool(nonlinear.rows)
     beyond = f"some {np.sqrt(1.0 + nonlinear.directions):.2g}" if np.isfinite(nonlinear.directions) else "many"
     text = f"the measurements are nonlinear within the posterior sigmas{most}, so the covariance is optimistic in weak"
-    text += f" directions: errors there are {beyond} times what it says; measure at more configurations, or specify"
-    yield Statement("warning", f"{text} smaller prior sigmas", curved and not ambiguous)
+    text += f" directions: errors there are {beyond} times what it says"
+    advice = "measure at more configurations, or specify smaller prior sigmas"
+    yield Statement("warning", f"{text}; {advice}", nonlinear.matters and curved and not ambiguous)
+    yield Statement("note", f"{text}; not those of the tool", curved and not nonlinear.matters and not ambiguous)
 
 
 def check_estimated_noise(case: Case) -> Iterator[Statement]:

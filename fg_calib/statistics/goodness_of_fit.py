@@ -39,7 +39,7 @@ from fg_calib.inputs import Booleans, Figure, Floats, FrozenArrays, Integers, Pr
 from fg_calib.statistics.covariance import Spread
 from fg_calib.statistics.priors import PriorFit
 from fg_calib.statistics.residual_covariance import ResidualCovariance, RowModel
-from fg_calib.statistics.residual_table import ALARM, ResidualTable, suspect_level
+from fg_calib.statistics.residual_table import ALARM, MAX_OUTLIER_SHARE, ResidualTable, suspect_level
 
 Codes = NDArray[np.int8]
 
@@ -197,6 +197,7 @@ class PredictedFit(FrozenArrays):
         expected: Its mean, were the noise as taken and the arm known as well as is claimed.
         p_value: Probability of a sum as large.
         configurations: Configurations whose rows are too large together, the worst first.
+        others: Chi-square of the rows of all others, over its mean.
     """
 
     kinds: tuple[KindFit, ...]
@@ -209,6 +210,13 @@ class PredictedFit(FrozenArrays):
     expected: Figure
     p_value: Probability
     configurations: tuple[SuspectConfiguration, ...]
+    others: float
+
+    @property
+    def has_outliers(self) -> bool:
+        """Whether a few configurations alone make chi-square too large."""
+        few = 0 < len(self.configurations) <= MAX_OUTLIER_SHARE * self.n_measurements
+        return few and self.others <= FACTOR < self.chi2 / self.expected
 
 
 class Goodness(FrozenArrays):
@@ -317,6 +325,13 @@ class JudgedRows(Record):
         square = float(means @ means) if self.covariance is None else self.covariance.square(chosen, means)
         nu = float(np.sum(means)) ** 2 / square if square > 0.0 else 1.0
         return nu if self.covariance is not None or not self.shared else min(nu, 3.0)
+
+    def whitened(self, chosen: Integers) -> tuple[float, float]:
+        """Sum of squares of some rows, whitened together where their covariance is known, and its mean."""
+        if self.covariance is None or not len(chosen):
+            return float(np.sum(self.squares[chosen])), float(len(chosen))
+        z = np.sign(self.table.after[self.rows[chosen]]) * np.sqrt(self.squares[chosen])
+        return self.covariance.whitened(z, chosen)
 
     def suspect_configurations(self) -> tuple[SuspectConfiguration, ...]:
         """Configurations whose rows are too large together, the least likely first."""
@@ -430,18 +445,16 @@ class RowStatistics:
         chosen = np.arange(n)
         if part.covariance is not None and n:
             chosen = np.unique(np.linspace(0, n - 1, min(n, MAX_WHITENED)).round().astype(np.int64))
-            z = np.sign(table.after[part.rows[chosen]]) * np.sqrt(part.squares[chosen])
-            chi2, expected = part.covariance.whitened(z, chosen)
-            nu = expected
-        else:
-            chi2, expected, nu = float(np.sum(part.squares)), float(n), part.degrees(chosen)
+        (chi2, expected), configurations = part.whitened(chosen), part.suspect_configurations() * (not self.robust)
+        nu = expected if part.covariance is not None and n else part.degrees(chosen)
+        wrong = np.append(np.isin(table.names, [one.id for one in configurations]), False)  # the last without an end
+        others, mean = part.whitened(chosen[~(wrong[table.a] | wrong[table.b])[part.rows[chosen]]])
         of_noise = self._degrees_of_noise(np.arange(len(self.fitted.rows)))
         kinds = tuple(self._fit_kinds(part, np.zeros(len(table.groups)), known=True))
         n_unknown = int(np.sum(~np.isfinite(self.leverage[test])))
         p_value = upper_probability(chi2 / expected, nu, of_noise) if n else 1.0
-        configurations = part.suspect_configurations() if not self.robust else ()
         counts = (n, len(chosen), n_measurements, n_measurements - n_judged, n_unknown)
-        return PredictedFit(kinds, *counts, chi2, expected, p_value, configurations)
+        return PredictedFit(kinds, *counts, chi2, expected, p_value, configurations, others / max(mean, 1e-300))
 
     def _degrees_of_noise(self, fitted: Integers) -> float:
         """Degrees of freedom by which some fitted rows estimated their noise; infinite where it is specified."""

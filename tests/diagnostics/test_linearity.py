@@ -73,12 +73,14 @@ def test_few_positions_of_a_wide_arm_are_warned_of_and_more_end_it():
 def test_nonlinearity_is_reported_with_its_size_and_rows():
     none = AmbiguousRows()
     assert check_linear(none, Nonlinearity(0.09)) == []
-    (some,), (lost,) = (check_linear(none, Nonlinearity(*of)) for of in ((3.0, ("0-1", "0-2")), (np.inf,)))
+    (some,), (lost,) = (check_linear(none, Nonlinearity(*of)) for of in ((3.0, 1.0, ("0-1", "0-2")), (np.inf, np.inf)))
     assert "within the posterior sigmas (most: 0-1, 0-2), so the covariance is optimistic" in some.text
     assert "errors there are some 2 times what it says; measure at more" in some.text
     assert "sigmas, so the covariance" in lost.text
     assert "many times" in lost.text
     assert some.severity == lost.severity == "warning"
+    (note,) = check_linear(none, Nonlinearity(0.9, 0.05))
+    assert (note.severity, note.text.endswith("what it says; not those of the tool")) == ("note", True)
 
 
 # --- rows --------------------------------------------------------------------------------------------------------
