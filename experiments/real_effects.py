@@ -35,7 +35,7 @@ from real_data import LEAST_EIGENVALUE, NOISE, by_name, judge_sockets, panda_job
 from fg_calib import Job, Solution, Table, build_problem, read_job, solve
 from fg_calib.assessment import solve_job
 from fg_calib.robot import Compliance, Harmonics
-from fg_calib.statistics import spread_of
+from fg_calib.statistics import judge_fit, spread_of
 from fg_calib.statistics.residual_table import residual_table
 
 Floats = NDArray[np.float64]
@@ -89,6 +89,14 @@ def position_errors(solution: Solution) -> Floats:
     return np.linalg.norm(table.after[chosen].reshape(-1, 3), axis=1) / MM
 
 
+def lag_one(solution: Solution) -> float:
+    """Largest correlation of a coordinate's residual with that of the next train row."""
+    table = residual_table(solution)
+    rows = np.flatnonzero(table.used)
+    columns = (table.after / table.sigma)[rows].reshape(-1, 6)  # positions and rotations of each pose
+    return float(max(np.corrcoef(c[1:], c[:-1])[0, 1] for c in columns.T))
+
+
 def figures(errors: Floats) -> Row:
     """Of held-out errors, [mm]."""
     fine = errors[errors < GROSS]
@@ -110,7 +118,7 @@ def held_out(task: Task) -> Row:
     solution = solve_job(ur10_job(data, SETS[name], noise=NOISE | {"estimate": True}))
     factors = solution.problem.state.factors
     curve = [p.tolerance for p in solution.problem.robot.parameters if p.kind == "curve"]
-    left = {f"{kind} left": factors[0, kind] * sigma for kind, sigma in NOISE.items()}
+    left = {f"{kind} left": factors[0, kind] * sigma for kind, sigma in NOISE.items()} | {"lag": lag_one(solution)}
     return figures(position_errors(solution)) | left | {"curve sigma": curve[0] if curve else 0.0}
 
 
@@ -127,7 +135,9 @@ def half(task: Task) -> Row:
     for which, test in (("upper", q2 > np.median(q2)), ("lower", q2 <= np.median(q2))):
         solution = solve(build_problem(job.robot, with_test(job, test), job.options))
         errors = position_errors(solution)
-        row |= {f"{which} {key}": value for key, value in figures(errors).items()}
+        z = judge_fit(solution, spread_of(solution), residual_table(solution)).studentised
+        z = z[residual_table(solution).test]
+        row |= {f"{which} {key}": value for key, value in (figures(errors) | {"z": rms(z[np.abs(z) < 8])}).items()}
     return row
 
 

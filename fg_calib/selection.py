@@ -123,8 +123,7 @@ def estimate_curve_sigma(
     def refit(theta: Floats) -> tuple[graph.Solution, Floats, None]:
         sigma, begun = first[0] * float(np.exp(theta[0])), problem
         if known:  # the next fit takes arm and noise up where the last one left them
-            state = replace(problem.state, factors=known[-1].problem.state.factors)
-            begun = replace(problem, start=known[-1].parameters, state=state)
+            begun = replace(problem, start=known[-1].parameters, state=known[-1].problem.state)
         known.append(solve_with(_with_sigma(begun, sigma)))
         return known[-1], np.array([np.log(_next_sigma(known[-1], sigma) / sigma)]), None
 

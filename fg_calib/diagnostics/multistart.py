@@ -105,6 +105,7 @@ _objective = attrgetter("objective")
 def _solve_from(solution: Solution, problem: Problem, start: Floats | None = None) -> list[Solution]:
     """The optimum from another start, as a later stage of a solution; none where there is no solution from there."""
     options = SolverOptions(MOST_ITERATIONS) if problem.options.loss == "none" else None  # weights take hundreds
+    problem = replace(problem, state=replace(problem.state, weights=None))
     try:
         other = solve(problem, options, start=start)
     except CalibrationError:  # says nothing against the first

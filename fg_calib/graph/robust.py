@@ -171,11 +171,12 @@ class Weighting:
 
     Args:
         loss: The loss.
+        final: Whether the loss has its final form from the first round.
     """
 
-    def __init__(self, loss: Loss) -> None:
+    def __init__(self, loss: Loss, *, final: bool = False) -> None:
         self._loss = loss
-        self._mu: float | None = None  # of gnc: from near 0, convex, upwards
+        self._mu = _LAST if final else None  # of gnc: from near 0, convex, upwards
 
     def update(self, e: Floats, residual_dim: NDArray[np.int64]) -> tuple[Floats, bool]:
         """Weights by the residuals of the last solution, and whether the loss has its final form.

@@ -367,11 +367,12 @@ def _fit(problem: Problem, options: SolverOptions) -> Solution:
 
     Rows stay as they are whitened until their optimum is near; then each step is one to rows whitened where it leads.
     With a robust loss the first weights are those of the residuals at the start: gross errors would lead least squares
-    astray.
+    astray. Weights that the problem has are those of another optimum near by.
     """
-    weighting, history, damping, tries = Weighting(problem.options.loss), list[Iteration](), FIRST_DAMPING, 0
+    weighted, history, damping, tries = problem.state.weights is not None, list[Iteration](), FIRST_DAMPING, 0
+    weighting = Weighting(problem.options.loss, final=weighted)
     start = problem.variables.parameters(problem.variables.values(problem.start))  # what is held is at nominal
-    if problem.options.loss != "none":
+    if problem.options.loss != "none" and not weighted:
         problem = relinearized_at(problem, start, _learn(problem, start, weighting)[0])
     here, converged, message, share = _Point(problem, start), False, "", 1.0
     del problem  # a million pairs once less in memory

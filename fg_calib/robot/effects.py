@@ -25,14 +25,12 @@ References:
     calibration of robots with flexible joints and links. J. Intelligent and Robotic Systems 34.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from fg_calib.inputs import Floats, InputError, Record, check_number, shown
-from fg_calib.robot.kinematics import build_chain, forward
 from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Parameter, Robot, Term
 
 Joints = Literal["all"] | Sequence[int]
@@ -169,33 +167,41 @@ class Mass(NamedTuple):
 class _Moments:
     """Moments of gravity about the origins of some joints' frames, in these frames just before they turn."""
 
-    def __init__(self, robot: Robot, readings: Floats, gravity: Floats) -> None:
-        self.robot, self.readings, self.gravity = robot, readings, gravity
-        self._frames: dict[int, tuple[Floats, Floats]] = {}
+    def __init__(self, robot: Robot, readings: Floats, gravity: Floats, masses: Sequence[Mass]) -> None:
+        self.robot, self.gravity = robot, gravity
+        ends = [robot.end_of(m.link) for m in masses]
+        of_joints = (_moving(robot, j)[0] + k for j in range(robot.n_joints) for k in (0, 1))
+        self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
+        each = ((m, *self._frames[end]) for m, end in zip(masses, ends, strict=True))
+        self._masses = [(end, m.mass, p + R @ m.com) for end, (m, R, p) in zip(ends, each, strict=True)]
 
-    def frame(self, n_elements: int) -> tuple[Floats, Floats]:
-        """Rotation (n, 3, 3) and origin (n, 3) behind the first elements of the chain."""
-        if n_elements not in self._frames:
-            part = replace(self.robot, elements=(Element(Axis.TX), *self.robot.elements[:n_elements]))
-            at = forward(build_chain(part), part.trig(self.readings))
-            self._frames[n_elements] = at.rotation, at.position
-        return self._frames[n_elements]
-
-    def of_masses(self, place: int, masses: Sequence[Mass]) -> Floats:
+    def of_masses(self, place: int) -> Floats:
         """Of the masses beyond an element, about the origin of the frame before it, shape (n, 3), [N m]."""
-        R, p = self.frame(place)
-        total = np.zeros(p.shape)
-        for m in masses:
-            end = self.robot.end_of(m.link)
-            if end > place:
-                R_m, p_m = self.frame(end)
-                total += m.mass * (p_m + R_m @ np.array(m.com) - p)
+        R, p = self._frames[place]
+        total = sum((mass * (at - p) for end, mass, at in self._masses if end > place), np.zeros(p.shape))
         return np.einsum("nji,nj->ni", R, np.cross(total, self.gravity), dtype=np.float64)
 
     def of_unit(self, place: int, joint: int, axis: int) -> Floats:
         """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2]."""
-        R, u = self.frame(place)[0], self.frame(_moving(self.robot, joint)[0] + 1)[0][:, :, axis]
+        R, u = self._frames[place][0], self._frames[_moving(self.robot, joint)[0] + 1][0][:, :, axis]
         return np.einsum("nji,nj->ni", R, np.cross(u, self.gravity), dtype=np.float64)
+
+
+def _frames(robot: Robot, readings: Floats, wanted: Collection[int]) -> dict[int, tuple[Floats, Floats]]:
+    """Rotation (n, 3, 3) and origin (n, 3) before some elements of a chain without effects."""
+    R, p, nominal, found = np.tile(np.eye(3), (len(readings), 1, 1)), np.zeros((len(readings), 3)), robot.nominal, {}
+    for i, e in enumerate((*robot.elements, Element(Axis.TX))):
+        if i in wanted:
+            found[i] = R.copy(), p.copy()
+        value = np.zeros(len(readings)) if e.joint is None else readings[:, e.joint]
+        value = (e.constant + e.sign * (value + (0.0 if e.parameter is None else nominal[e.parameter])))[:, None]
+        if e.axis < Axis.RX:
+            p += value * R[:, :, e.axis]
+        else:
+            x, y = ((e.axis + k) % 3 for k in (1, 2))
+            c, s = np.cos(value), np.sin(value)
+            R[:, :, x], R[:, :, y] = c * R[:, :, x] + s * R[:, :, y], c * R[:, :, y] - s * R[:, :, x]
+    return found
 
 
 class Compliance(Effect, Record):
@@ -256,8 +262,8 @@ class Compliance(Effect, Record):
             own = self._torques(robot, readings, joints, along)
         parts = [own]
         if self.lateral and self.masses is not None:
-            moments = _Moments(robot, readings, along)
-            parts += [moments.of_masses(_moving(robot, i)[0], self.masses)[:, :2] for i in joints]
+            moments = _Moments(robot, readings, along, self.masses)
+            parts += [moments.of_masses(_moving(robot, i)[0])[:, :2] for i in joints]
         if self.gravity == "estimate":  # tau is linear in gravity, so k tau is in either of both
             moved = [at[:n] * self._torques(robot, readings, joints, np.cross(e, gravity)) for e in np.eye(3)[:2]]
             parts += [*moved, -(tilts[0] * moved[0] + tilts[1] * moved[1])]
@@ -265,11 +271,11 @@ class Compliance(Effect, Record):
 
     def _torques(self, robot: Robot, readings: Floats, joints: Sequence[int], gravity: Floats) -> Floats:
         """Torque in each joint's own sense, of each load, shape (n, n_own), [N m] or [m/s^2]."""
-        moments, columns = _Moments(robot, readings, gravity), list[Floats]()
+        moments, columns = _Moments(robot, readings, gravity, self.masses or ()), list[Floats]()
         for i in joints:
             place, e = _moving(robot, i)
             each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
-            each = each or [moments.of_masses(place, self.masses or ())]
+            each = each or [moments.of_masses(place)]
             columns += [e.sign * m[:, 2] for m in each]
         return np.stack(columns, axis=1)
 
@@ -291,8 +297,8 @@ class Bending(Effect, Record):
         return [Term("base.bending", 1e-5, 0, robot.end_of(0) - 1, axis) for axis in (Axis.RX, Axis.RY)]
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
-        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64))
-        return _with_slopes(moments.of_masses(robot.end_of(0), self.masses)[:, :2])
+        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64), self.masses)
+        return _with_slopes(moments.of_masses(robot.end_of(0))[:, :2])
 
 
 class Backlash(Effect, Record):

@@ -212,8 +212,9 @@ def _settle(
     def refit(theta: Floats) -> tuple[graph.Solution, Floats, NoiseComponents]:
         moved = {name: float(np.exp(t)) for name, t in zip(names, theta, strict=True) if t}
         now = {name: factors.get(name, 1.0) * factor for name, factor in moved.items()}
-        start = known[-1].parameters if known and problem.options.loss == "none" else None
-        known.append(graph.solve(_scaled(problem, now), options, start=start))
+        start, weights = (known[-1].parameters, known[-1].problem.state.weights) if known else (None, None)
+        begun = replace(problem, state=replace(problem.state, weights=weights)) if weights else problem
+        known.append(graph.solve(_scaled(begun, now), options, start=start))
         found = noise_components(known[-1])
         return known[-1], _steps(found, kept), found
 
