@@ -29,10 +29,10 @@ import scipy.linalg
 from scipy import special
 
 from fg_calib import graph
-from fg_calib.inputs import Figure, Floats, Integers, Probability, Record
+from fg_calib.inputs import Booleans, Figure, Floats, Integers, Probability, Record
 from fg_calib.job import Job
 from fg_calib.parallel import single_threaded
-from fg_calib.robot import EFFECTS, ErrorCurve
+from fg_calib.robot import EFFECTS, Effect, ErrorCurve
 from fg_calib.statistics.variance_components import settle
 
 SETTLED = 3e-3
@@ -170,25 +170,32 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
         ProblemError: The measurements do not suffice for the geometry.
         SolverError: GTSAM could not solve a step at all.
     """
-    effects, kept = job.robot.effects, frozenset[int]()
+    effects, kept = job.robot.effects, frozenset[_Group]()
     solution = solve(_with_effects(job, kept)) if job.robot.select_effects and effects else None
     if solution is None or solution.problem.evaluated:
         return job, ()
-    choice, found, of = _Choice(job, solution), dict[int, EffectTest](), list(EFFECTS.values())
+    choice, found, order = _Choice(job, solution), dict[int, EffectTest](), list(EFFECTS.values())
     for _ in range(N_PASSES):
         before = kept
-        for i in sorted(range(len(effects)), key=lambda i: of.index(type(effects[i]))):
-            found[i] = choice.test(kept - {i}, i)
-            kept = kept | {i} if found[i].kept else kept - {i}
+        for i in sorted(range(len(effects)), key=lambda i: order.index(type(effects[i]))):
+            others = frozenset(group for group in kept if group[0] != i)
+            found[i], of = choice.test(others, frozenset(group for group in choice.groups if group[0] == i))
+            kept = others | of
         if kept == before:
             break
     return _with_effects(job, kept), tuple(found.values())
 
 
-def _with_effects(job: Job, kept: Collection[int]) -> Job:
-    """The job with some of its robot's effects, by their numbers; their parameters stay as specified."""
-    robot = job.robot
-    effects = (e for i, e in enumerate(robot.effects) if i in kept)
+_Group = tuple[int, int]
+"""Number of an effect, and of the joint that it acts on, from 1; 0 where it has no choice of joints."""
+
+
+def _with_effects(job: Job, kept: Collection[_Group]) -> Job:
+    """The job with some of its robot's effects on some joints; their parameters stay as specified."""
+    robot, effects = job.robot, list[Effect]()
+    for i, effect in enumerate(robot.effects):
+        joints = [joint for of, joint in sorted(kept) if of == i]
+        effects += [replace(effect, **({"joints": joints} if any(joints) else {}))] if joints else []  # type: ignore[type-var]
     found = replace(robot.geometry, select_effects=False).with_effects(*effects)
     as_specified = tuple(robot.parameters[robot.index(p.name)] for p in found.parameters)
     return replace(job, robot=replace(found, parameters=as_specified))
@@ -217,9 +224,15 @@ class _Choice:
         self.robot, self.n, v, parts = robot, problem.n_residuals, problem.variables, problem.rows.parts
         of_curves = (robot.parameters[i].name for one in v.nuisance if one.kind == "curve" for i in one.parameters)
         names = [*v.names, *of_curves, *(v.n_nuisance - v.n_curves) * ("landmark",)]
-        effect_of = {t.name: i for i, e in enumerate(robot.effects) for t in e.terms(robot.geometry)}
+        effect_of = {
+            t.name: (i, t.owner if hasattr(e, "joints") else 0)
+            for i, e in enumerate(robot.effects)
+            for t in e.terms(robot.geometry)
+        }
+        self.groups = sorted(set(effect_of.values()))
         scale_of = {p.name: p.scale for p in robot.parameters}
-        self.effect = np.array([effect_of.get(name, -1) for name in names])
+        group = {name: self.groups.index(of) for name, of in effect_of.items()}
+        self.group = np.array([group.get(name, -1) for name in names])
         self.is_curve = np.char.find(names, ".curve[") > 0
         self.rows = problem.rows.private(v.at(start)) * [*(scale_of.get(name, 1e-3) for name in names), 1.0]
         units = np.concatenate([p.block.n * p.block.kind.units for p in parts])
@@ -235,10 +248,14 @@ class _Choice:
         self.gram = self.rows.T @ self.rows
         self.fit, self.held_out = cache(self._fit), cache(self._held_out)
 
-    def _fit(self, kept: frozenset[int]) -> _Fit:
+    def _columns(self, kept: Collection[_Group]) -> Booleans:
+        """Columns of some groups."""
+        return np.isin(self.group, [self.groups.index(group) for group in kept])
+
+    def _fit(self, kept: frozenset[_Group]) -> _Fit:
         """The fit with some effects, noise and prior sigma of curves at their maximum likelihood."""
-        c = np.flatnonzero(np.isin(self.effect, [-1, *kept]))
-        curve, base, noise, sigma = self.is_curve[c], self.effect[c] < 0, 1.0, 1.0
+        c = np.flatnonzero((self.group < 0) | self._columns(kept))
+        curve, base, noise, sigma = self.is_curve[c], self.group[c] < 0, 1.0, 1.0
         G, h = self.gram[np.ix_(c, c)], self.gram[c, -1]
         for _ in range(FIT_ROUNDS):
             prior = np.where(base, RIDGE**2, np.where(curve, sigma**-2.0, 1.0))
@@ -254,7 +271,7 @@ class _Choice:
                 break
         return found
 
-    def _held_out(self, kept: frozenset[int]) -> Floats:
+    def _held_out(self, kept: frozenset[_Group]) -> Floats:
         """Whitened residuals of all rows, each predicted without its block of a joint, shape (n_joints, n)."""
         c, noise, prior, *_ = self.fit(kept)
         ix, out = np.ix_(c, c), np.tile(self.rows[:, -1], (self.robot.n_joints, 1))
@@ -264,16 +281,32 @@ class _Choice:
             out[j, rows] += self.rows[np.ix_(rows, c)] @ x
         return out
 
-    def test(self, kept: frozenset[int], i: int) -> EffectTest:
-        """Whether an effect is to be added to some that are kept."""
-        effect, (_, _, _, before, _, _) = self.robot.effects[i], self.fit(kept)
-        c, _, _, after, x, U = self.fit(kept | {i})
-        own = self.effect[c] == i
+    def test(self, kept: frozenset[_Group], added: frozenset[_Group]) -> tuple[EffectTest, frozenset[_Group]]:
+        """Whether an effect is to be added to some that are kept, and on which joints.
+
+        Where it is of no use on all its joints, it is tried on those for which there is evidence.
+        """
+        effect = self.robot.effects[min(added)[0]]
+        found = self._test(kept, added, effect)
+        if found.kept or isinstance(effect, ErrorCurve):
+            return found, added if found.kept else frozenset()
+        fewer = frozenset(group for group in added if self._p_value(kept | added, {group}) < MAX_P_VALUE)
+        again = self._test(kept, fewer, effect) if fewer and fewer != added else found
+        return (again, fewer) if again.kept else (found, frozenset())
+
+    def _p_value(self, kept: frozenset[_Group], of: Collection[_Group]) -> float:
+        """Of an F test of some of the groups that are kept."""
+        c, _, _, _, x, U = self.fit(kept)
+        own = self._columns(of)[c]
         square, k = float(x[own] @ np.linalg.solve(U[:, own].T @ U[:, own], x[own])), max(int(own.sum()), 1)
-        p_value = float(special.fdtrc(k, self.n, square / k))
+        return float(special.fdtrc(k, self.n, square / k))
+
+    def _test(self, kept: frozenset[_Group], added: frozenset[_Group], effect: Effect) -> EffectTest:
+        p_value = self._p_value(kept | added, added)
         if isinstance(effect, ErrorCurve):  # sigma is on the boundary where there is no curve
-            p_value = 0.5 * float(special.chdtrc(1, 2.0 * max(after - before, 0.0)))
-        old, new, bare = map(self.held_out, (kept, kept | {i}, frozenset[int]()))
+            gain = self.fit(kept | added)[3] - self.fit(kept)[3]
+            p_value = 0.5 * float(special.chdtrc(1, 2.0 * max(gain, 0.0)))
+        old, new, bare = map(self.held_out, (kept, kept | added, frozenset[_Group]()))
         change = new**2 - bare**2
         blocks = ((j + 1, change[j, rows]) for j, rows, _ in self.held)
         worse = [j for j, d in blocks if d.mean() > MAX_SCORE * d.std() / np.sqrt(len(d))]
@@ -282,6 +315,6 @@ class _Choice:
             reason = "held-out blocks are not predicted better"
         reason = reason if p_value < MAX_P_VALUE else "no evidence"
         name = next(key for key, of in EFFECTS.items() if of is type(effect))
-        joints = tuple(sorted({t.owner for t in effect.terms(self.robot.geometry)} - {0}))
+        joints = tuple(sorted({joint for _, joint in added} - {0}))
         rms, new_rms = (float(np.linalg.norm(e * self.sigma)) / np.sqrt(len(e) * self.n_lengths) for e in (old, new))
         return EffectTest(name, joints, p_value, rms, new_rms, not reason, reason, self.unit)

@@ -76,6 +76,12 @@ LISTED = (Harmonics([1, 2]), Compliance(MASSES, [2, 3]), Gain(), ErrorCurve([2, 
 """Effects that are to be chosen from, not in the order in which they are tried."""
 
 
+def of(*effects):
+    """What is chosen from, of some of them: each of their joints."""
+    joints = {0: (1, 2, 3, 4), 1: (2, 3), 2: (1, 2, 3, 4), 3: (2, 3)}
+    return frozenset((i, joint) for i in effects for joint in joints[i])
+
+
 def choosing(robot):
     return replace(robot, select_effects=True)
 
@@ -133,9 +139,12 @@ def test_effects_are_tried_until_nothing_changes(monkeypatch):
         def __init__(self, job, solution):
             self.effects = job.robot.effects
 
-        def test(self, kept, i):
-            name = ("harmonics", "compliance", "gain", "error_curve")[i]
-            return EffectTest(name, (), 1.0, 1.0, 1.0, of_use.get(name, lambda kept: False)(kept))
+            self.groups = of(0, 1, 2, 3)
+
+        def test(self, kept, added):
+            name = ("harmonics", "compliance", "gain", "error_curve")[min(added)[0]]
+            useful = of_use.get(name, lambda kept: False)({i for i, _ in kept})
+            return EffectTest(name, (), 1.0, 1.0, 1.0, useful), added if useful else frozenset()
 
     monkeypatch.setattr(selection, "_Choice", Scripted)
     job = Job(None, choosing(arm_with(*LISTED)), measured(arm_with(), 0), Options(model="position"))
@@ -150,7 +159,7 @@ def choice():
 
 @pytest.mark.parametrize("kept", [(), (1,), (1, 3)])
 def test_evidence_is_the_density_of_the_residuals(choice, kept):
-    columns, noise, prior, evidence, x, U = choice.fit(frozenset(kept))
+    columns, noise, prior, evidence, x, U = choice.fit(of(*kept))
     A, b = choice.rows[:, columns], choice.rows[:, -1]
     C = noise * np.eye(len(b)) + (A / prior) @ A.T
     density = -0.5 * (b @ np.linalg.solve(C, b) + np.linalg.slogdet(C)[1])
@@ -162,7 +171,7 @@ def test_evidence_is_the_density_of_the_residuals(choice, kept):
 
 def test_noise_and_sigma_are_those_of_largest_evidence(choice):
     """Neighbours by 10 % have a smaller one."""
-    columns, noise, prior, best, *_ = choice.fit(frozenset((1, 3)))
+    columns, noise, prior, best, *_ = choice.fit(of(1, 3))
     A, b, of_curves = choice.rows[:, columns], choice.rows[:, -1], choice.is_curve[columns]
 
     def evidence(by_noise, by_sigma):
@@ -173,9 +182,9 @@ def test_noise_and_sigma_are_those_of_largest_evidence(choice):
 
 
 def test_blocks_are_predicted_by_the_other_rows(choice):
-    columns, noise, prior, *_ = choice.fit(frozenset((1, 3)))
+    columns, noise, prior, *_ = choice.fit(of(1, 3))
     A, b = choice.rows[:, columns], choice.rows[:, -1]
-    found = choice.held_out(frozenset((1, 3)))
+    found = choice.held_out(of(1, 3))
     assert [np.sum([len(rows) for j, rows, _ in choice.held if j == k]) for k in range(4)] == [len(b)] * 4
     for j, rows, _ in choice.held[1::3]:
         rest = np.setdiff1d(np.arange(len(b)), rows)
@@ -187,8 +196,20 @@ def test_an_effect_that_makes_a_block_worse_than_the_geometry_is_left(choice, mo
     j, rows, _ = choice.held[5]
     with_curve = np.full((4, len(choice.rows)), 0.5)
     with_curve[j, rows] = 1.1
-    monkeypatch.setattr(choice, "held_out", lambda kept: with_curve if 3 in kept else np.ones(with_curve.shape))
-    found = choice.test(frozenset((1,)), 3)
+    monkeypatch.setattr(choice, "held_out", lambda kept: with_curve if kept & of(3) else np.ones(with_curve.shape))
+    found, kept = choice.test(of(1), of(3))
+    assert not kept
     assert (found.kept, found.reason) == (False, "a block of joint 2 is predicted worse than by the geometry alone")
     with_curve[j, rows] = 0.9
-    assert choice.test(frozenset((1,)), 3).kept
+    assert choice.test(of(1), of(3))[1] == of(3)
+
+
+def test_an_effect_of_some_joints_is_kept_on_these():
+    """An eccentricity of joint 3 alone, tried on all four."""
+    true = arm_with(Harmonics([1], [3]))
+    true = true.with_values([1e-3 if p.kind in ("sin", "cos") else p.nominal for p in true.parameters])
+    tried, kept = (Harmonics([1, 2, 3, 4], joints) for joints in ("all", [3]))
+    job = Job(None, choosing(arm_with(tried)), measured(true, 4, n=20), Options(model="position"))
+    chosen, (test,) = select_effects(job, solve_job)
+    assert (test.kept, test.joints) == (True, (3,))
+    assert chosen.robot.effects == (kept,)

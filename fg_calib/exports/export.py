@@ -162,6 +162,8 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
     values = {name: value for name, value in mapping.pop("values", {}).items() if not name.endswith(".curve")}
     error = dh.errors(robot.geometry, robot, dh.drawn(robot, dh.N_JUDGED, 1) if measured is None else measured)
     note = f"it cannot hold {', '.join(mapping)}, without which the tool is off {where}: {_error_words(error)}"
+    assumed = ", ".join(effect.assumed for effect in robot.effects if effect.assumed)
+    note += f" (at {assumed}: more elsewhere)" * bool(assumed)
     if to == "zeros":  # which are fitted to the arm with them
         return [note], {}
     rows, files, angle = list[str](), dict[str, str](), np.radians(np.arange(-180.0, 180.0, 0.5))
@@ -173,7 +175,8 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
     if rows:
         files["_curves.csv"] = "\n".join(["joint,angle,correction", *rows, ""])
     if mapping.keys() - {"error_curve"}:
-        files["_effects.yaml"] = dumped({"effects": mapping | {"values": values}})
+        of = f"# in the frames, and with the names, of {robot.name} as {robot.convention}\n"
+        files["_effects.yaml"] = of + dumped({"effects": mapping | {"values": values}})
     return [f"{note}; next to it: {', '.join(f'*{end}' for end in files)} in rad and SI units"], files
 
 

@@ -38,6 +38,10 @@ class _Mass(Schema):
     com: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
 
 
+class _Payload(_Mass):
+    column: str = ""
+
+
 def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any], n_joints: int) -> list[Effect]:
     """The effects that a mapping lists.
 
@@ -58,6 +62,9 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
         masses = masses or _masses(one, f"{place}: {key}", links, n_joints)
     if not loaded and "urdf" in links:
         masses = tuple(links["urdf"])
+    compliance = given.get("compliance")
+    gravity = compliance.get("gravity") if isinstance(compliance, Mapping) else None
+    gravity = None if gravity == "estimate" else gravity
     for key in (key for key in given if key in EFFECTS and given[key] is not False):
         of, options, here = EFFECTS[key], given[key], f"{place}: {key}"
         names = [f.name for f in fields(of)]  # type: ignore[arg-type]
@@ -66,8 +73,14 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
         if "masses" in names:
             free = key == "compliance" and isinstance(given[key], Mapping) and given[key].get("masses") == "free"
             if not masses and not free and (key != "backlash" or options.get("side") == "load"):
-                raise InputError(here, "no masses", NO_MASSES)
-            options["masses"] = None if free else masses
+                raise InputError(
+                    here, "no masses", NO_MASSES if key == "compliance" else "the mass and com of each link"
+                )
+            if free and "payload" in given[key]:
+                raise InputError(here, "a payload with free masses", "masses: urdf, or by link")
+            options["masses"] = None if free else masses or ()
+        if "gravity" in names and gravity is not None:
+            options.setdefault("gravity", gravity)
         with within(here):
             effects.append(_checked(of, names, options, here))
     return effects
@@ -102,8 +115,8 @@ def _masses(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any]
     elif wanted not in (None, "free"):
         raise InputError(f"{place}: masses", f"found {shown(wanted)}", "urdf, free, or masses by link")
     if "payload" in given:
-        payload = validate(_Mass, given["payload"], f"{place}: payload")
-        found.append(Mass(n_joints, payload.mass, payload.com))
+        payload = validate(_Payload, given["payload"], f"{place}: payload")
+        found.append(Mass(n_joints, payload.mass, payload.com, payload.column))
     return tuple(found)
 
 
@@ -131,7 +144,10 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
     for effect in robot.effects:
         options = {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
         if "masses" in options:
-            options["masses"] = _mapping_of(options["masses"])
+            masses = options["masses"]
+            options["masses"] = "free" if masses is None else _mapping_of([m for m in masses if not m.column])
+            for m in (m for m in masses or () if m.column):
+                options["payload"] = {"mass": m.mass, "com": list(m.com), "column": m.column}
         if type(effect) not in keys:
             raise InputError(robot.name, f"an effect {type(effect).__name__}", f"of {', '.join(EFFECTS)}")
         out[keys[type(effect)]] = {name: _plain(value) for name, value in options.items()}
@@ -145,10 +161,8 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
     return out | ({"values": values} if values else {})
 
 
-def _mapping_of(masses: Sequence[Mass] | None) -> Any:
+def _mapping_of(masses: Sequence[Mass]) -> dict[int, Any]:
     """Masses by link; those on one link together."""
-    if masses is None:
-        return "free"
     out = {}
     for link in dict.fromkeys(one.link for one in masses):
         each = [one for one in masses if one.link == link]

@@ -13,7 +13,7 @@ from fg_calib.initialization import Frame, FrameStart
 from fg_calib.inputs import NEAR, Booleans, Brief, Floats, Integers, ProblemError, did_you_mean
 from fg_calib.measurements import Labels, Landmarks, MeasurementBlock, Measurements, Table, is_ours
 from fg_calib.measurements.kinds import INSTRUMENTS, LANDMARKS
-from fg_calib.robot import Robot, build_chain, forward
+from fg_calib.robot import Context, Robot, build_chain, forward
 
 _log = logging.getLogger(__name__)
 
@@ -73,6 +73,15 @@ class Dataset(Brief):
         out = np.empty((self.n_configurations, self.tables[0].measurements.readings.shape[1]))
         for table, place in zip(self.tables, self.places, strict=True):
             out[place] = table.measurements.readings
+        return out
+
+    @property
+    def context(self) -> Context:
+        """What effects depend on besides readings, of every configuration."""
+        out = dict[str, Floats]()
+        for table, place in zip(self.tables, self.places, strict=True):
+            for name, values in table.measurements.context.items():
+                out.setdefault(name, np.full((self.n_configurations, *values.shape[1:]), np.nan))[place] = values
         return out
 
     def _at(self, rows: Callable[[MeasurementBlock], Integers | Booleans]) -> Booleans:

@@ -176,7 +176,11 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats,
         first = reach(robot.geometry, position, rotation, near, anywhere=anywhere).readings
         found = solve_inverse(robot, position, rotation, near=first, n_starts=1)
         q, rows = found.readings.copy(), np.flatnonzero(~found.reached)
-        q[rows] = solve_inverse(robot, position[rows], near=first[rows], n_starts=1).readings
+        points = solve_inverse(robot, position[rows], near=first[rows], n_starts=1)
+        q[rows] = points.readings
+        if rotation is not None:
+            for k in rows[points.reached]:
+                q[k] = _rotate(robot, q[k], position[k], rotation[k])
         return Inverse(q, *misses(robot, q, position, rotation))
 
     def solve(rows: Integers, near: Floats | None, n_starts: int) -> Inverse:

@@ -80,7 +80,8 @@ def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedE
     """
     judged, at = judged_configurations(problem.data)
     chosen = _evenly(judged)
-    base, fitted = errors_at(covariance, problem.data.readings[chosen])
+    context = {name: values[chosen] for name, values in problem.data.context.items()}
+    base, fitted = errors_at(covariance, problem.data.readings[chosen], context)
     return ExpectedError(base, fitted, at, len(chosen), len(judged), ObservedQuantities.of(problem).blind_to_base)
 
 
@@ -96,15 +97,20 @@ def _evenly(rows: Integers) -> Integers:
     return rows[np.unique(np.linspace(0, len(rows) - 1, MAX_CONFIGURATIONS).round().astype(np.int64))]
 
 
-def errors_at(covariance: TangentCovariance, readings: Floats) -> tuple[PoseRms, PoseRms]:
+def errors_at(
+    covariance: TangentCovariance, readings: Floats, context: Context | None = None
+) -> tuple[PoseRms, PoseRms]:
     """Expected errors over configurations, in the base frame and after the best rigid fit.
 
     Args:
         covariance: The covariance at the estimate.
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        context: What effects depend on besides: see `Robot.trig`.
     """
-    few = readings[_evenly(np.arange(len(readings)))] if len(covariance.curves) else readings
-    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), few)
+    every = np.arange(len(readings))
+    few = _evenly(every) if len(covariance.curves) else every
+    there = {name: values[few] for name, values in (context or {}).items()}
+    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), readings[few], there)
     return pose_rms(points, motion, covariance.variance)
 
 

@@ -217,6 +217,7 @@ def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
 
 def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
     yield "Errors are RMS, from the specified noise and prior sigmas. Unmodelled effects are not included."
+    yield from () if found.context else _assumed(robot)
     if not found.given:
         unlimited = [j.name for j in robot.joints if not np.isfinite(j.upper - j.lower)]
         instead = f" ({', '.join(unlimited)} without any: +-180 deg, or +-1 m)" if unlimited else ""
@@ -270,7 +271,7 @@ def build_correction_report(ids: Sequence[str], correction: Correction, robot: R
         line(""),
         _target_errors(correction),
         *section("Joint positions to command", _commands(ids, correction, robot)),
-        *section("Notes", *_correction_notes(ids, correction)),
+        *section("Notes", *_correction_notes(ids, correction, robot)),
     )
 
 
@@ -293,7 +294,13 @@ def _commands(ids: Sequence[str], correction: Correction, robot: Robot) -> Table
     return table_of(columns, rows, wrap=True, most=MAX_LISTED)
 
 
-def _correction_notes(ids: Sequence[str], correction: Correction) -> Iterator[str]:
+def _assumed(robot: Robot) -> Iterator[str]:
+    if words := [effect.assumed for effect in robot.effects if effect.assumed]:
+        yield f"Taken for granted: {', '.join(words)}."
+
+
+def _correction_notes(ids: Sequence[str], correction: Correction, robot: Robot) -> Iterator[str]:
+    yield from _assumed(robot)
     yield "Give the controller the joint positions; or the poses that --out writes, with its nominal model unchanged."
     point = correction.missed[:, 0] < 1e-9
     doubts = {

@@ -26,6 +26,7 @@ References:
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -157,23 +158,33 @@ class Mass(NamedTuple):
         link: Number of the joint that moves it; 0 for the base.
         mass: [kg].
         com: Where it is in the frame behind that joint's figures (a DH frame, a URDF's link), [m].
+        column: Column of the table that has the mass of each row instead, [kg], such as a payload that is put on.
     """
 
     link: int
     mass: float
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    column: str = ""
+
+
+def _payloads(masses: Sequence[Mass] | None, read: Callable[[Sequence[str]], Floats]) -> Context:
+    """Masses that the rows of a table have."""
+    return {m.column: read([m.column])[:, 0] for m in masses or () if m.column}
 
 
 class _Moments:
     """Moments of gravity about the origins of some joints' frames, in these frames just before they turn."""
 
-    def __init__(self, robot: Robot, readings: Floats, gravity: Floats, masses: Sequence[Mass]) -> None:
-        self.robot, self.gravity = robot, gravity
+    def __init__(
+        self, robot: Robot, readings: Floats, context: Context, gravity: Floats, masses: Sequence[Mass]
+    ) -> None:
+        self.robot, self.readings, self.gravity = robot, readings, gravity
         ends = [robot.end_of(m.link) for m in masses]
         of_joints = (_moving(robot, j)[0] + k for j in range(robot.n_joints) for k in (0, 1))
         self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
-        each = ((m, *self._frames[end]) for m, end in zip(masses, ends, strict=True))
-        self._masses = [(end, m.mass, p + R @ m.com) for end, (m, R, p) in zip(ends, each, strict=True)]
+        each = [np.reshape(context.get(m.column, m.mass), (-1, 1)) for m in masses]
+        at = [p + R @ m.com for m, (R, p) in zip(masses, map(self._frames.get, ends), strict=True)]  # type: ignore[misc]
+        self._masses = list(zip(ends, each, at, strict=True))
 
     def of_masses(self, place: int) -> Floats:
         """Of the masses beyond an element, about the origin of the frame before it, shape (n, 3), [N m]."""
@@ -182,8 +193,12 @@ class _Moments:
         return np.einsum("nji,nj->ni", R, np.cross(total, self.gravity), dtype=np.float64)
 
     def of_unit(self, place: int, joint: int, axis: int) -> Floats:
-        """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2]."""
-        R, u = self._frames[place][0], self._frames[_moving(self.robot, joint)[0] + 1][0][:, :, axis]
+        """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2].
+
+        Along the axis of a slide it is that of a unit mass, in proportion to the reading.
+        """
+        R, (i, e) = self._frames[place][0], _moving(self.robot, joint)
+        u = self._frames[i + 1][0][:, :, axis] * (self.readings[:, [joint]] if axis == e.axis else 1.0)
         return np.einsum("nji,nj->ni", R, np.cross(u, self.gravity), dtype=np.float64)
 
 
@@ -232,13 +247,15 @@ class Compliance(Effect, Record):
 
     def _loads(self, robot: Robot, joint: int) -> list[tuple[int, int]]:
         """Free first moments that turn a joint: number of the link from 1, and axis; none of known masses."""
-        return [(i + 1, axis) for i in range(joint, robot.n_joints) for axis in (0, 1) if self.masses is None]
+        links = [] if self.masses is not None else range(joint, robot.n_joints)
+        slides = [(i + 1, int(_moving(robot, i)[1].axis)) for i in links if i > joint and robot.joints[i].prismatic]
+        return [(i + 1, axis) for i in links for axis in (0, 1)] + [one for one in slides if one[1] == Axis.TZ]
 
     def terms(self, robot: Robot) -> list[Term]:
         joints = _joints(robot, self.joints, "compliance")
         if self.masses is None:
             loads = [(i, link, axis) for i in joints for link, axis in self._loads(robot, i)]
-            return [_own(robot, i, f"load{link}{'xy'[axis]}", 1e-3, -1) for i, link, axis in loads]
+            return [_own(robot, i, f"load{link}{'xyz'[axis]}", 1e-3, -1) for i, link, axis in loads]
         terms = [_own(robot, i, "compliance", 1e-4, -1) for i in joints]
         for i, axis in [(i, axis) for i in joints for axis in (Axis.RX, Axis.RY) if self.lateral]:
             name = f"{_prefix(robot, i)}.compliance_{'xy'[axis - Axis.RX]}"
@@ -254,24 +271,34 @@ class Compliance(Effect, Record):
         if self.gravity == "estimate":
             tilts = at[[-3 * n, -2 * n]]
         along = gravity + np.cross([*tilts, 0.0], gravity)
-        own = self._torques(robot, readings, joints, along)
+        own = self._torques(robot, readings, context, joints, along)
         if np.any(at[: own.shape[1]]):  # as the joints have turned
             counts = [len(self._loads(robot, i)) or 1 for i in joints]
             readings = readings.copy()
             readings[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
-            own = self._torques(robot, readings, joints, along)
+            own = self._torques(robot, readings, context, joints, along)
         parts = [own]
         if self.lateral and self.masses is not None:
-            moments = _Moments(robot, readings, along, self.masses)
+            moments = _Moments(robot, readings, context, along, self.masses)
             parts += [moments.of_masses(_moving(robot, i)[0])[:, :2] for i in joints]
         if self.gravity == "estimate":  # tau is linear in gravity, so k tau is in either of both
-            moved = [at[:n] * self._torques(robot, readings, joints, np.cross(e, gravity)) for e in np.eye(3)[:2]]
+            turned = [np.cross(e, gravity) for e in np.eye(3)[:2]]
+            moved = [at[:n] * self._torques(robot, readings, context, joints, g) for g in turned]
             parts += [*moved, -(tilts[0] * moved[0] + tilts[1] * moved[1])]
         return _with_slopes(np.hstack(parts))
 
-    def _torques(self, robot: Robot, readings: Floats, joints: Sequence[int], gravity: Floats) -> Floats:
+    @property
+    def assumed(self) -> str:
+        return ", ".join(f"{m.column} {m.mass:g} kg" for m in self.masses or () if m.column)
+
+    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+        return _payloads(self.masses, read)
+
+    def _torques(
+        self, robot: Robot, readings: Floats, context: Context, joints: Sequence[int], gravity: Floats
+    ) -> Floats:
         """Torque in each joint's own sense, of each load, shape (n, n_own), [N m] or [m/s^2]."""
-        moments, columns = _Moments(robot, readings, gravity, self.masses or ()), list[Floats]()
+        moments, columns = _Moments(robot, readings, context, gravity, self.masses or ()), list[Floats]()
         for i in joints:
             place, e = _moving(robot, i)
             each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
@@ -297,8 +324,11 @@ class Bending(Effect, Record):
         return [Term("base.bending", 1e-5, 0, robot.end_of(0) - 1, axis) for axis in (Axis.RX, Axis.RY)]
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
-        moments = _Moments(robot, readings, np.asarray(self.gravity, dtype=np.float64), self.masses)
+        moments = _Moments(robot, readings, context, np.array(self.gravity), self.masses)
         return _with_slopes(moments.of_masses(robot.end_of(0))[:, :2])
+
+    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+        return _payloads(self.masses, read)
 
 
 class Backlash(Effect, Record):
@@ -309,15 +339,21 @@ class Backlash(Effect, Record):
         side: `moves`: sign of the last move, by the order of rows, 0 before the first; `load`: sign of the torque of
             gravity by `masses`; else how the columns of the table begin: side for side1, side2, ...
         masses: The masses on the arm, for `load`.
+        gravity: In the base frame, shape (3,), [m/s^2].
     """
 
     joints: Joints = "all"
     side: str = "moves"
     masses: Sequence[Mass] = ()
+    gravity: Sequence[float] = GRAVITY
 
     @property
     def by_loads(self) -> bool:
         return self.side == "load"
+
+    @property
+    def assumed(self) -> str:
+        return "" if self.by_loads else "no side of approach"
 
     def terms(self, robot: Robot) -> list[Term]:
         return [_own(robot, i, "backlash", 1e-3, -1) for i in _joints(robot, self.joints, "backlash")]
@@ -325,12 +361,13 @@ class Backlash(Effect, Record):
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         joints = _joints(robot, self.joints, "backlash")
         if self.side == "load":
-            return _with_slopes(np.sign(Compliance(self.masses)._torques(robot, readings, joints, np.array(GRAVITY))))
+            of, gravity = Compliance(self.masses), np.array(self.gravity)
+            return _with_slopes(np.sign(of._torques(robot, readings, context, joints, gravity)))
         return _with_slopes(context.get(self.side, np.zeros(readings.shape))[:, joints])
 
     def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
         if self.side == "load":
-            return {}
+            return _payloads(self.masses, read)
         if self.side != "moves":
             return {self.side: read([f"{self.side}{i + 1}" for i in range(robot.n_joints)])}
         sides, moves = np.zeros(readings.shape), np.diff(readings, axis=0)
@@ -363,21 +400,32 @@ class Thermal(Effect, Record):
 
     Attributes:
         reference: Temperature at which nominal values hold, in the unit of the column.
-        lengths: Whether lengths of 2 cm or more grow: value (1 + expansion (T - reference)).
+        lengths: Whether lengths of 2 cm or more grow: value (1 + expansion (T - reference)); or the names of those.
         zeros: Whether joint zeros drift.
         column: The column of the temperature.
     """
 
     reference: float = 20.0
-    lengths: bool = True
+    lengths: bool | Sequence[str] = True
     zeros: bool = False
     column: str = "temperature"
 
+    def bound(self, robot: Robot) -> "Thermal":
+        """Of the nominal arm: a calibration finds no further lengths, and loses none."""
+        if self.lengths is not True:
+            return self
+        of_links = (p for p in robot.parameters if p.unit == "m" and 1 <= p.owner <= robot.n_joints)
+        return replace(self, lengths=tuple(p.name for p in of_links if abs(p.nominal) >= LEAST_LENGTH))
+
     def _lengths(self, robot: Robot) -> list[tuple[int, Element, Parameter]]:
-        """Place, element and parameter of each length that grows: none that a calibration may find, or lose."""
-        places = enumerate(robot.elements if self.lengths else ())
-        of = [(i, e, robot.parameters[e.parameter]) for i, e in places if e.axis < Axis.RX and e.parameter is not None]
-        return [(i, e, p) for i, e, p in of if 1 <= p.owner <= robot.n_joints and abs(p.nominal) >= LEAST_LENGTH]
+        """Place, element and parameter of each length that grows."""
+        names = self.bound(robot).lengths or ()
+        of = ((i, e, robot.parameters[e.parameter]) for i, e in enumerate(robot.elements) if e.parameter is not None)
+        return [(i, e, p) for i, e, p in of if p.name in names]  # type: ignore[operator]
+
+    @property
+    def assumed(self) -> str:
+        return f"{self.column} {self.reference:g}"
 
     def _drifting(self, robot: Robot) -> list[int]:
         return _joints(robot, "all" if self.zeros else (), "thermal")

@@ -229,6 +229,10 @@ class Effect(ABC):
         """Whether its values are loads, which depend on the robot's parameters."""
         return False
 
+    def bound(self, robot: "Robot") -> "Effect":
+        """The effect as it is on a nominal robot without effects."""
+        return self
+
     @abstractmethod
     def terms(self, robot: "Robot") -> list[Term]:
         """The terms for a robot without effects.
@@ -236,6 +240,11 @@ class Effect(ABC):
         Raises:
             InputError: The robot has no such joint.
         """
+
+    @property
+    def assumed(self) -> str:
+        """What is taken where nothing is known of what it depends on besides readings."""
+        return ""
 
     @abstractmethod
     def values(self, robot: "Robot", readings: Floats, context: Context, at: Floats) -> Floats:
@@ -455,6 +464,7 @@ class Robot(inputs.Record):
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise InputError("effects", f"found {shown(effect)}", "effects, such as Harmonics([1, 2])")
+        effects = tuple(effect.bound(self) for effect in effects)
         parameters, more = list(self.parameters), dict[int, list[Element]]()
         places = {p.name: i for i, p in enumerate(parameters)}
         number = 0
@@ -475,7 +485,7 @@ class Robot(inputs.Record):
         elements = list(more.get(-1, []))
         for i, element in enumerate(self.elements):
             elements += [element, *more.get(i, [])]
-        return replace(self, parameters=tuple(parameters), elements=tuple(elements), effects=tuple(effects))
+        return replace(self, parameters=tuple(parameters), elements=tuple(elements), effects=effects)
 
     @property
     def nominal(self) -> Floats:

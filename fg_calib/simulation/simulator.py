@@ -153,10 +153,14 @@ class Measuring:
         return forward(build_chain(self.true_robot), self.true_robot.trig(self.visits.true_readings, self.context))
 
     def read(self, names: Sequence[str]) -> Floats:
-        """Columns that effects depend on, shape (n, k): temperatures, or sides of approach; by configuration."""
-        thermal = {effect.column for effect in self.true_robot.effects if isinstance(effect, Thermal)}
+        """Columns that effects depend on, shape (n, k): temperatures, payloads or sides of approach."""
+        effects = self.true_robot.effects
+        thermal = {effect.column for effect in effects if isinstance(effect, Thermal)}
+        payloads = {m.column: m.mass for effect in effects for m in getattr(effect, "masses", None) or ()}
         each = [[generator_of(self.seed, i, name).uniform() for name in names] for i in self.visits.ids.tolist()]
         drawn, (cold, warm) = np.reshape(each, (self.n, len(names))), self.scenario.temperature
+        if names[0] in payloads:  # on or off
+            return payloads[names[0]] * np.round(drawn)
         return cold + (warm - cold) * drawn if names[0] in thermal else np.sign(drawn - 0.5)
 
     def noise(self, kind: str, *shape: int) -> Floats:

@@ -5,7 +5,7 @@ import pytest
 from refusals import refusal
 
 from fg_calib.io import read_robot, write_robot
-from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass
+from fg_calib.robot import Backlash, Compliance, ErrorCurve, Harmonics, Mass
 
 HEAD = """\
 name: arm
@@ -22,7 +22,8 @@ effects:
   compliance:
     joints: [2, 3]
     masses: {2: {mass: 12.0, com: [0.3, 0, 0.1]}, 3: {mass: 4.0}}
-    payload: {mass: 2.0, com: [0, 0, 0.06]}
+    payload: {mass: 2.0, com: [0, 0, 0.06], column: load}
+    gravity: [0, 0, 9.81]
   harmonics: {orders: [1, 2.5]}
   gain: true
   error_curve: {knots: 8, joints: [2]}
@@ -49,7 +50,10 @@ def read(tmp_path):
 def test_effects_are_read_with_their_options(read):
     robot = read(HEAD + EFFECTS)
     compliance, harmonics = robot.effects[:2]
-    assert compliance == Compliance([Mass(2, 12.0, (0.3, 0.0, 0.1)), Mass(3, 4.0), Mass(3, 2.0, (0, 0, 0.06))], [2, 3])
+    masses = [Mass(2, 12.0, (0.3, 0.0, 0.1)), Mass(3, 4.0), Mass(3, 2.0, (0, 0, 0.06), "load")]
+    assert compliance == Compliance(masses, [2, 3], gravity=[0.0, 0.0, 9.81])
+    assert robot.effects[-1].gravity == compliance.gravity
+    assert read(HEAD + "effects: {backlash: true}\n").effects == (Backlash(),)
     assert harmonics == Harmonics([1, 2.5])
     assert robot.effects[3] == ErrorCurve([2], knots=8)
     values = {p.name: p.nominal for p in robot.parameters}
@@ -62,7 +66,8 @@ def test_a_robot_with_effects_is_written_and_read_back(read, tmp_path):
     again = read_robot(tmp_path / "again.yaml")
     q = np.random.default_rng(0).uniform(-2, 2, (5, 3))
     assert again.nominal == pytest.approx(robot.nominal, abs=1e-15)
-    assert again.trig(q) == pytest.approx(robot.trig(q), abs=1e-12)  # masses on one link are one
+    loaded = {"load": np.full(5, 3.0)}
+    assert again.trig(q, loaded) == pytest.approx(robot.trig(q, loaded), abs=1e-12)  # masses on one link are one
 
 
 def test_gravity_is_estimated_by_two_angles(read):

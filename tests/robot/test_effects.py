@@ -162,6 +162,31 @@ def test_splines_sum_to_one_and_repeat_each_turn(arm):
     assert found.position == pytest.approx(expected.position, abs=1e-13)
 
 
+def test_free_loads_hold_the_torques_of_masses_beyond_a_slide():
+    rows = [[0, -1.5, 0.4, 0], [0, 1.5, 0.15, 0], [0, 0, 0.3, 0], [0.1, 0, 0.2, 0]]
+    robot = Robot.from_dh(rows, "dh", types=["revolute", "revolute", "prismatic", "revolute"])
+    q = np.random.default_rng(0).uniform(-2, 2, (60, 4)) * [1, 1, 0.3, 1]
+    loads, known = Compliance(None, [2]), Compliance(MASSES, [2]).values(robot, q, {}, np.zeros(1))[:, 0, 0]
+    found = loads.values(robot, q, {}, np.zeros(len(loads.terms(robot))))[:, :, 0]
+    assert found @ np.linalg.lstsq(found, known)[0] == pytest.approx(known, abs=1e-9)
+
+
+def test_a_payload_of_each_row_weighs_what_its_column_says(arm):
+    masses, q = (*MASSES, Mass(4, 2.0, (0.0, 0.1, 0.1), "load")), np.repeat(Q[:1], 2, axis=0)
+    of = Compliance(masses, [2, 3])
+    found = of.values(arm, q, of.context(arm, q, lambda names: np.array([[0.0], [7.0]])), np.zeros(2))[:, :, 0]
+    none, seven = (Compliance((*MASSES, *m), [2, 3]) for m in ((), (masses[-1]._replace(mass=7.0, column=""),)))
+    for row, one in zip(found, (none, seven), strict=True):
+        assert row == pytest.approx(one.values(arm, q[:1], {}, np.zeros(2))[0, :, 0])
+
+
+def test_a_length_that_shrinks_below_what_grows_keeps_its_expansion():
+    nominal = Robot.from_dh([[0.021, 0.3, 0.2, 0], [0.3, 0.1, 0, 0]], "dh").with_effects(Thermal())
+    robot = nominal.with_values(nominal.nominal - 2e-3 * (np.array(nominal.nominal) == 0.021))
+    assert robot.terms == nominal.terms
+    assert robot.trig(np.zeros((1, 2))).shape == nominal.trig(np.zeros((1, 2))).shape
+
+
 def test_lengths_grow_and_zeros_drift_with_temperature(arm):
     robot = with_coefficients(arm.with_effects(EFFECTS["thermal"]))
     c, values = {p.name: p.nominal for p in robot.parameters}, arm.nominal
