@@ -203,7 +203,7 @@ def map_jobs(
         try:
             with local_processes(1) as fresh:
                 results[k] = fresh.submit(_call, function, given[k], named[k]).result()
-        except BrokenExecutor:
+        except (BrokenExecutor, InputError):
             pass
     return results
 
@@ -247,10 +247,14 @@ def local_processes(n_workers: int) -> ProcessPoolExecutor:
         n_workers: Number of processes.
 
     Raises:
-        InputError: The number of processes is no number from 1 to 1000.
+        InputError: The number of processes is no number from 1 to 1000, or this machine starts none.
     """
     check_number("workers", n_workers, above=True, whole=True, most=MOST)
-    return ProcessPoolExecutor(n_workers, get_context("spawn"), _start_worker, (max(1, processors() // n_workers),))
+    n_threads = (max(1, processors() // n_workers),)
+    try:
+        return ProcessPoolExecutor(n_workers, get_context("spawn"), _start_worker, n_threads)
+    except OSError as error:  # a broken pipe would be taken for one that the user closed
+        raise InputError("workers", f"no process starts: {error}", "none, which runs the jobs here") from None
 
 
 def _start_worker(n_threads: int) -> None:

@@ -4,6 +4,7 @@ import json
 import pickle
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import get_args
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -70,6 +71,12 @@ def test_folders_get_different_names():
 
 
 @pytest.mark.slow
+def test_workers_that_cannot_start_are_one_line(monkeypatch):
+    monkeypatch.setattr("fg_calib.parallel.ProcessPoolExecutor", Mock(side_effect=BrokenPipeError(32, "Broken pipe")))
+    with pytest.raises(InputError, match=r"workers: no process starts: .*Broken pipe"):
+        local_processes(2)
+
+
 def test_a_job_that_kills_its_process_is_a_failure_of_its_own_and_once_costs_nothing(tmp_path):
     with local_processes(2) as executor:
         assert map_jobs(work, [1, "deadly", 2, 3], executor) == [2, Failure("job 2", DIED), 4, 6]

@@ -163,7 +163,7 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
     error = dh.errors(robot.geometry, robot, dh.drawn(robot, dh.N_JUDGED, 1) if measured is None else measured)
     note = f"it cannot hold {', '.join(mapping)}, without which the tool is off {where}: {_error_words(error)}"
     assumed = ", ".join(effect.assumed for effect in robot.effects if effect.assumed)
-    note += f" (at {assumed}: more elsewhere)" * bool(assumed)
+    note += f" (at {assumed}; more otherwise)" * bool(assumed)
     if to == "zeros":  # which are fitted to the arm with them
         return [note], {}
     rows, files, angle = list[str](), dict[str, str](), np.radians(np.arange(-180.0, 180.0, 0.5))
