@@ -17,16 +17,8 @@ from operator import attrgetter
 
 import numpy as np
 
-from fg_calib.graph import (
-    SIGNAL_FLOOR,
-    Problem,
-    Solution,
-    SolverOptions,
-    directions,
-    solve,
-    with_curves_held,
-    with_factors,
-)
+from fg_calib import graph
+from fg_calib.graph import SIGNAL_FLOOR, Problem, Solution, SolverOptions, directions, solve
 from fg_calib.inputs import CalibrationError, Floats, checked
 from fg_calib.measurements import Kind
 from fg_calib.parallel import one_blas_thread
@@ -75,7 +67,7 @@ def multistart(solution: Solution) -> Solution:
     if solution.problem.evaluated or not solution.converged:
         return solution
     if solution.problem.variables.n_curves:
-        problem = with_curves_held(solution.problem, solution.parameters)
+        problem = graph.with_curves_held(solution.problem, solution.parameters)
         cost = problem.system.cost
         held = multistart(replace(solution, problem=problem, cost=cost, weighted_cost=cost))
         if np.array_equal(held.parameters, solution.parameters):
@@ -189,4 +181,4 @@ def _mirrored(solution: Solution, landmark: tuple[int, ...]) -> Problem | None:
     there, whole = replace(problem.data, landmarks=unknowns), problem.whole
     if whole is not None:
         whole = replace(whole, data=there, variables=replace(whole.variables, others=others))
-    return with_factors(problem, start, data=there, variables=replace(variables, others=others), whole=whole)
+    return graph.with_factors(problem, start, data=there, variables=replace(variables, others=others), whole=whole)

@@ -180,6 +180,8 @@ class Table(Record):
 
         values = np.empty((self.n_rows, len(columns)))
         for k, column in enumerate(columns):
+            if column not in self.frame.columns:
+                raise InputError(self.name, f"no column {column}", hint=f"it has {', '.join(self.columns)}")
             cells = self.frame[column]
             if cells.dtype == pl.String:
                 texts = self.texts(column)
@@ -509,6 +511,13 @@ def read_table(
 ) -> Table:
     """A table of configurations of a robot; for `columns` and `skip_lines` see `read_measurements`."""
     joints, known = {joint.name for joint in robot.joints}, {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
+
+    def note(names: Sequence[str]) -> Floats:
+        known.update(names)
+        return np.zeros((1, len(names)))
+
+    for effect in robot.effects:
+        effect.context(robot, np.zeros((1, robot.n_joints)), note)
     return Table.read(path, "frame", known, joints=joints, columns=columns, skip_lines=skip_lines)
 
 

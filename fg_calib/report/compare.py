@@ -292,7 +292,8 @@ def _explanations(explanations: Sequence[monitoring.Explanation]) -> Table:
 def _conclusions(found: monitoring.Check) -> Iterator[str]:
     likely = [e for e in found.explanations if e.likely]
     if likely and likely[0].same:
-        yield f"{likely[0].parameters[0]} is equivalent to {', '.join(likely[0].same)} for every position of the tool"
+        others = ", ".join(name for name in likely[0].same if name != likely[0].parameters[0])
+        yield f"{likely[0].parameters[0]} is equivalent to {others} for every position of the tool"
     if len(likely) > 1:
         yield f"not distinguishable by these rows: {', '.join(named(e.parameters) for e in likely)}"
         yield "do not deploy any of these changes yet: measure more configurations"

@@ -167,11 +167,6 @@ class Mass(NamedTuple):
     column: str = ""
 
 
-def _payloads(masses: Sequence[Mass] | None, read: Callable[[Sequence[str]], Floats]) -> Context:
-    """Masses that the rows of a table have."""
-    return {m.column: read([m.column])[:, 0] for m in masses or () if m.column}
-
-
 class _Moments:
     """Moments of gravity about the origins of some joints' frames, in these frames just before they turn."""
 
@@ -238,8 +233,9 @@ class Compliance(Effect, Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.masses is None and self.gravity == "estimate":
-            raise InputError("gravity", "found 'estimate' with free masses", "masses", "free masses tell no tilt")
+        if self.masses is None and (self.gravity == "estimate" or self.lateral):
+            what = "lateral" if self.lateral else "gravity: estimate"
+            raise InputError("masses", f"found free masses with {what}", "urdf, or masses by link")
 
     @property
     def by_loads(self) -> bool:
@@ -287,13 +283,6 @@ class Compliance(Effect, Record):
             parts += [*moved, -(tilts[0] * moved[0] + tilts[1] * moved[1])]
         return _with_slopes(np.hstack(parts))
 
-    @property
-    def assumed(self) -> str:
-        return ", ".join(f"{m.column} {m.mass:g} kg" for m in self.masses or () if m.column)
-
-    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
-        return _payloads(self.masses, read)
-
     def _torques(
         self, robot: Robot, readings: Floats, context: Context, joints: Sequence[int], gravity: Floats
     ) -> Floats:
@@ -327,9 +316,6 @@ class Bending(Effect, Record):
         moments = _Moments(robot, readings, context, np.array(self.gravity), self.masses)
         return _with_slopes(moments.of_masses(robot.end_of(0))[:, :2])
 
-    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
-        return _payloads(self.masses, read)
-
 
 class Backlash(Effect, Record):
     """Half the dead zone of a gear, times the side that it lies on.
@@ -353,7 +339,7 @@ class Backlash(Effect, Record):
 
     @property
     def assumed(self) -> str:
-        return "" if self.by_loads else "no side of approach"
+        return super().assumed if self.by_loads else "no side of approach"
 
     def terms(self, robot: Robot) -> list[Term]:
         return [_own(robot, i, "backlash", 1e-3, -1) for i in _joints(robot, self.joints, "backlash")]
@@ -367,9 +353,11 @@ class Backlash(Effect, Record):
 
     def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
         if self.side == "load":
-            return _payloads(self.masses, read)
+            return super().context(robot, readings, read)
         if self.side != "moves":
-            return {self.side: read([f"{self.side}{i + 1}" for i in range(robot.n_joints)])}
+            joints, sides = _joints(robot, self.joints, "backlash"), np.zeros(readings.shape)
+            sides[:, joints] = read([f"{self.side}{i + 1}" for i in joints])
+            return {self.side: sides}
         sides, moves = np.zeros(readings.shape), np.diff(readings, axis=0)
         for k, move in enumerate(moves):
             sides[k + 1] = np.where(np.abs(move) < LEAST_MOVE, sides[k], np.sign(move))

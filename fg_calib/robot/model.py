@@ -243,8 +243,8 @@ class Effect(ABC):
 
     @property
     def assumed(self) -> str:
-        """What is taken where nothing is known of what it depends on besides readings."""
-        return ""
+        """What is taken where nothing is known of what it depends on besides readings; without masses of rows empty."""
+        return ", ".join(f"{m.column} {m.mass:g} kg" for m in getattr(self, "masses", None) or () if m.column)
 
     @abstractmethod
     def values(self, robot: "Robot", readings: Floats, context: Context, at: Floats) -> Floats:
@@ -258,14 +258,14 @@ class Effect(ABC):
         """
 
     def context(self, robot: "Robot", readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
-        """What else the values depend on, for the rows of a table.
+        """What else the values depend on, for the rows of a table: of loads the masses that the rows have.
 
         Args:
             robot: The robot.
             readings: Joint readings in the rows' order, shape (n, n_joints), [rad] (prismatic: [m]).
             read: Columns of the table, shape (n, k), by their names.
         """
-        return {}
+        return {m.column: read([m.column])[:, 0] for m in getattr(self, "masses", None) or () if m.column}
 
 
 class Element(inputs.Record):

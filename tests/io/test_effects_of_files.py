@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusals import refusal
 
-from fg_calib.io import read_robot, write_robot
+from fg_calib.io import Column, read_measurements, read_robot, write_robot
 from fg_calib.robot import Backlash, Compliance, ErrorCurve, Harmonics, Mass
 
 HEAD = """\
@@ -73,6 +73,15 @@ def test_a_robot_with_effects_is_written_and_read_back(read, tmp_path):
 def test_gravity_is_estimated_by_two_angles(read):
     robot = read(f"{HEAD}effects: {{compliance: {{masses: {{2: {{mass: 5}}}}, gravity: estimate}}}}\n")
     assert [p.name for p in robot.parameters if p.kind == "tilt"] == ["base.tilt_x", "base.tilt_y"]
+
+
+def test_columns_that_effects_need_are_known_and_missed_by_name(read, tmp_path):
+    robot = read(HEAD + "effects: {thermal: true, backlash: {joints: [3], side: side}}\n")
+    table = tmp_path / "t.csv"
+    table.write_text("q1,q2,q3,x,y,z,T,side3\n0,0,0,1,2,3,25,-1\n")
+    assert refusal(lambda: read_measurements(table, robot)).startswith("t.csv: no column temperature")
+    found = read_measurements(table, robot, columns={"temperature": Column(name="T")}).context
+    assert (found["temperature"].tolist(), found["side"].tolist()) == ([25.0], [[0.0, 0.0, -1.0]])
 
 
 def test_select_stands_for_the_standard_effects(read):
