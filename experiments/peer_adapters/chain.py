@@ -14,6 +14,12 @@ THETA = 3
 """Turning or not, and the axis, of the transforms of a frame and of a joint; the joint's reading is added to theta."""
 
 
+GRAVITY = np.array([0.0, 0.0, -9.81])
+"""In the base frame, [m/s^2]."""
+
+NO_MASSES = np.empty((0, 5))
+
+
 def elements(n_joints: int) -> list[tuple[int, int, int]]:
     """Whether it turns, its axis, and the joint whose reading is added or -1, of each transform."""
     chain = [(turns, "xyz".index(axis), -1) for turns, axis in FRAME]
@@ -61,6 +67,23 @@ def forward(values: np.ndarray, q: np.ndarray, wanted: np.ndarray | None = None)
         if turns:
             turn[:, :, k] = u
     return p, R, shift, turn
+
+
+def gravity_torques(values: np.ndarray, q: np.ndarray, masses: np.ndarray) -> np.ndarray:
+    """Torque of gravity about each joint, the sum of m g . dx/dq_i, shape (n, n_joints), [N m].
+
+    Args:
+        values: See `forward`.
+        q: Joint positions, shape (n, n_joints), [rad].
+        masses: Joint that moves it from 1, mass [kg], x, y, z in that joint's frame [m], shape (n_masses, 5).
+    """
+    torques = np.zeros(q.shape)
+    for joint, mass, *at in masses:
+        n = int(joint)
+        wanted = np.array([joint >= 0 for _, _, joint in elements(n)])
+        shift = forward(np.concatenate([values[: 6 + 5 * n], at, np.zeros(3)]), q[:, :n], wanted)[2]
+        torques[:, :n] += mass * GRAVITY @ shift
+    return torques
 
 
 def rotation_vector(R: np.ndarray) -> np.ndarray:
@@ -115,8 +138,11 @@ def frame_matrix(values: np.ndarray) -> np.ndarray:
     return T
 
 
-def urdf(values: np.ndarray) -> str:
-    """The arm as a URDF: joint i turns about z of its origin; base before the first joint, tool as a fixed last one."""
+def urdf(values: np.ndarray, masses: np.ndarray = NO_MASSES) -> str:
+    """The arm as a URDF: joint i turns about z of its origin; base before the first joint, tool as a fixed last one.
+
+    Its links have inertials where there are `masses` (see `gravity_torques`).
+    """
     n_joints = (len(values) - 12) // 5
     rows = values[6:-6].reshape(n_joints, 5)
     before = frame_matrix(values[:6])
@@ -128,7 +154,7 @@ def urdf(values: np.ndarray) -> str:
         x[1:3, 1:3] = _turn(link["alpha"])
         y[:2, :2] = _turn(link["theta"])
         parent = f"link{i}" if i else "base"
-        lines.append(f'<link name="link{i + 1}"/>')
+        lines.append(f'<link name="link{i + 1}">{_inertial(masses[masses[:, 0] == i + 1])}</link>')
         lines.append(_joint(f"q{i + 1}", "revolute", parent, f"link{i + 1}", before @ x @ y))
         before = np.eye(4)
         before[0, 0] = before[2, 2] = np.cos(row[4])
@@ -140,6 +166,14 @@ def urdf(values: np.ndarray) -> str:
 
 def _turn(angle: float) -> np.ndarray:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _inertial(masses: np.ndarray) -> str:
+    if not len(masses):
+        return ""
+    at = " ".join(f"{x:.17g}" for x in np.average(masses[:, 2:], axis=0, weights=masses[:, 1]))
+    inertia = '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>'  # poses at rest do not feel it
+    return f'<inertial><origin xyz="{at}"/><mass value="{masses[:, 1].sum():.17g}"/>{inertia}</inertial>'
 
 
 def _joint(name: str, kind: str, parent: str, child: str, T: np.ndarray) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import protocol
 
 import fg_calib
-from fg_calib.robot import pose
+from fg_calib.robot import Compliance, Mass, pose
 
 FRAME = ("x", "y", "z", "yaw", "pitch", "roll")
 JOINT = ("a", "alpha", "d", "theta", "beta")
@@ -27,8 +27,13 @@ def robot_of(work: dict) -> fg_calib.Robot:
 class Prepared(protocol.Peer):
     """Robot and measurements in memory."""
 
+    compliance = True
+
     def __init__(self, work: dict) -> None:
         self.robot = robot_of(work)
+        if self.compliance and len(work["masses"]):
+            masses = [Mass(int(joint), mass, tuple(at)) for joint, mass, *at in work["masses"].tolist()]
+            self.robot = self.robot.with_effects(Compliance(masses, range(2, self.robot.n_joints + 1)))
         q, sigma = work["q"], work["sigma"]
         if work["kind"] == "distance":
             pairs = {"a": work["a"], "b": work["b"], "distance": work["distance"], "sigma_distance": sigma[0]}
@@ -57,7 +62,9 @@ class Calibrate(Prepared):
         """Covariance of what it predicts, and sigmas of the parameters that are determined."""
         there = self.result.predict(q, world=self.choices["frame"] == "unknown")
         parameters = [p for p in self.result.parameters.values() if p.identifiability != "fixed"]
+        k = [(p.estimate, p.sigma) for p in parameters if p.name.endswith("compliance")]
         return {
+            "compliance": np.array(k).T,
             "states": "covariance of any prediction; sigma of each parameter, none where it is not determined",
             "covariance": there.covariance[:, :3, :3],
             "parameters": np.array([p.estimate for p in parameters]),
@@ -86,5 +93,11 @@ class Solve(Prepared):
         return world[:3, 3] + there.position @ world[:3, :3].T, world[:3, :3] @ there.rotation
 
 
+class Geometry(Solve):
+    """Without compliance."""
+
+    compliance = False
+
+
 if __name__ == "__main__":
-    protocol.main({"calibrate": Calibrate, "solve": Solve})
+    protocol.main({"calibrate": Calibrate, "solve": Solve, "geometry": Geometry})

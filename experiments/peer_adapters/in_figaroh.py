@@ -47,6 +47,8 @@ class Distances(Weighted):
 class Figaroh(protocol.Peer):
     """A subclass with a weighted cost, as its documentation asks for."""
 
+    compliance = True
+
     def __init__(self, work: dict) -> None:
         logging.disable(logging.CRITICAL)
         self.folder = tempfile.TemporaryDirectory()
@@ -54,7 +56,7 @@ class Figaroh(protocol.Peer):
         values = work["values"].copy()
         if not work["frames_known"]:
             values[:6] = values[-6:] = 0.0  # it finds both frames in closed form
-        (folder / "arm.urdf").write_text(chain.urdf(values))
+        (folder / "arm.urdf").write_text(chain.urdf(values, work["masses"]))
         position, rotation = work.get("position"), work.get("rotation")
         if work["kind"] == "distance":  # it wants a table of poses all the same
             position, rotation = chain.forward(values, work["q"])
@@ -62,7 +64,7 @@ class Figaroh(protocol.Peer):
         table = np.concatenate([work["q"], position, chain.roll_pitch_yaw(rotation)], axis=1)
         header = ",".join((*joints, *MEASURED))
         np.savetxt(folder / "poses.csv", table, delimiter=",", header=header, comments="", fmt="%.17g")
-        (folder / "calibration.yaml").write_text(json.dumps(self.configuration(folder, joints, n)))
+        (folder / "calibration.yaml").write_text(json.dumps(self.configuration(folder, joints, n, work)))
         kind = Distances if work["kind"] == "distance" else Weighted
         with contextlib.redirect_stdout(io.StringIO()):
             self.calibration = kind(load_robot(str(folder / "arm.urdf")), str(folder / "calibration.yaml"))
@@ -71,16 +73,16 @@ class Figaroh(protocol.Peer):
             self.calibration.sigma, self.calibration.work = work["sigma"], work
             self.calibration.initialize()
 
-    @staticmethod
-    def configuration(folder: Path, joints: list[str], n: int) -> dict:
+    def configuration(self, folder: Path, joints: list[str], n: int, work: dict) -> dict:
         """Its settings; JSON is YAML."""
+        elastic = self.compliance and len(work["masses"]) > 0
         return {
             "robot": {"name": "arm", "properties": {"joints": {"active_joints": joints}}},
             "tasks": {
                 "calibration": {
                     "enabled": True,
                     "type": "kinematic_calibration",
-                    "parameters": {"calibration_level": "full_params"},
+                    "parameters": {"calibration_level": "full_params", "include_non_geometric": elastic},
                     "kinematics": {"base_frame": "universe", "tool_frame": "tool"},
                     "measurements": {"markers": [{"measurable_dof": [True] * 6}], "poses": {}},
                     "data": {"source_file": str(folder / "poses.csv"), "number_of_samples": n},
@@ -104,12 +106,22 @@ class Figaroh(protocol.Peer):
 
     def says(self, q: np.ndarray) -> dict:
         """Sigma of each parameter that it selected."""
+        names, sigma = self.calibration.calib_config["param_name"], np.array(self.calibration.std_dev, dtype=float)
+        places = [names.index(name) for name in (f"k_RZ_q{i}" for i in range(2, 7)) if name in names]
         return {
+            # its torque is what holds the arm, not what gravity does
+            "compliance": np.stack([-np.array(self.found.x)[places], sigma[places]]),
             "states": "sigma of each parameter that it selected",
             "parameters": np.array(self.found.x),
-            "sigma": np.array(self.calibration.std_dev, dtype=float),
+            "sigma": sigma,
         }
 
 
+class Geometry(Figaroh):
+    """Without elasticity."""
+
+    compliance = False
+
+
 if __name__ == "__main__":
-    protocol.main({"figaroh": Figaroh})
+    protocol.main({"figaroh": Figaroh, "geometry": Geometry})

@@ -9,7 +9,8 @@ A peer's script has a class a variant, with
 - `solve()`: from the nominal start to the estimate, timed by the clock and in processor time of all its threads;
 - `predict(q)`: tool positions (n, 3) [m], and rotations (n, 3, 3) or None, by what was estimated;
 - `says(q)`: its own uncertainty: `states` in words and, where it has them, `covariance` of the positions at `q`,
-  shape (n, 3, 3), [m^2], and `parameters` with the `sigma` that it claims, shape (n_parameters,).
+  shape (n, 3, 3), [m^2], and `parameters` with the `sigma` that it claims, shape (n_parameters,); of an arm that gives
+  way `compliance` and its sigma, shape (2, n_joints - 1), [rad/(N m)].
 
 The first draw is solved twice where that takes less than `AGAIN` seconds, and the first time kept apart: it imports,
 compiles and fills caches. A solve that takes more than `CAP` seconds by the clock is ended, and once all together have
@@ -31,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 AGAIN = 5.0
-SHARED = ("q_val", "values", "estimated", "sigma")
+SHARED = ("q_val", "values", "estimated", "sigma", "masses")
 """Arrays of a work file that do not have one row a draw."""
 
 
