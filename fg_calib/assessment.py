@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from fg_calib import diagnostics, graph, monitoring, parallel, statistics
 from fg_calib.diagnostics.multistart import multistart
-from fg_calib.inputs import Floats, FrozenArrays, InputError, Record, SolverError, as_figures, checked, escaped
+from fg_calib.inputs import Floats, FrozenArrays, InputError, Record, SolverError, as_figures, checked
 from fg_calib.job import Job
 from fg_calib.observability import Identifiability, Observability, identifiability_of
 from fg_calib.prediction import ExpectedError, expected_error
@@ -79,14 +79,8 @@ class Assessment(FrozenArrays):
         return replace(self, acceptance=statistics.accept(limits, held_out, self.verdict.errors, tool))
 
     def __repr__(self) -> str:
-        known = sum(p.sigma is not None for p in self.estimates.parameters if p.identifiability != "fixed")
-        chi2 = self.fit.chi_square
-        lines = [
-            f"Assessment of {self.robot.name!r}: {known} of {len(self.names)} parameters have a known sigma",
-            f"  chi-square {chi2.value:.6g}, {chi2.dof} degrees of freedom",
-            *(f"  DOUBTFUL: {finding}" for finding in self.verdict.errors[:6]),
-        ]
-        return "\n".join(escaped(line if len(line) <= 100 else f"{line[:96]} ...") for line in lines)
+        chi2, doubts = self.fit.chi_square, len(self.verdict.errors)
+        return f"<Assessment: chi-square {chi2.value:.6g}, {chi2.dof} degrees of freedom, {doubts} reasons for doubt>"
 
     @parallel.single_threaded
     def predict(self, function: Callable[[Robot], ArrayLike]) -> Prediction:

@@ -15,7 +15,7 @@ lies on a ring about the vector's axis, and the estimate may be opposite it, wha
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.graph import Problem, Solution, noises_at, subsampled
+from fg_calib.graph import Solution, subsampled
 from fg_calib.inputs import Floats, Record, SolverError
 from fg_calib.robot import forward, pose, without_rigid_motion
 from fg_calib.statistics import Spread
@@ -43,12 +43,10 @@ class Nonlinearity(Record):
     Attributes:
         directions: Of all determined directions, in the mean.
         tool: Of the tool's position after the best rigid fit.
-        rows: Names of the measurements with the largest second-order part over their noise; empty below `NONLINEAR`.
     """
 
     directions: float = 0.0
     tool: float = 0.0
-    rows: tuple[str, ...] = ()
 
     @property
     def matters(self) -> bool:
@@ -73,8 +71,9 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
         while len(shifts) < N_DRAWS:
             core = root @ rng.choice([-1.0, 1.0], rank)
             step = np.concatenate([core, here.left.follow @ core])
-            there = [problem.variables.moved(solution.parameters, d) for d in (step, -step)]
-            plus, minus = (problem.linearize(x).step for x in there)
+            plus, minus = (
+                problem.linearize(problem.variables.moved(solution.parameters, d)).step for d in (step, -step)
+            )
             steps, shifts = [*steps, step], [*shifts, 0.5 * (plus + minus) - here.step]
             squares = np.mean((np.array(shifts)[:, :n] @ in_sigma.T) ** 2)
             if len(shifts) == 1 and squares < NEGLIGIBLE:
@@ -83,24 +82,12 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
         return Nonlinearity(np.inf, np.inf)
     if squares < NONLINEAR:
         return Nonlinearity(float(squares))
-    few, points = problem.data.readings[:FEW], [solution.parameters, *there]
-    moved = [problem.variables.moved(solution.parameters, d) for d in (*steps, *shifts)]
-    p = [pose(problem.robot.with_values(x[problem.variables.robot_span]), few).position for x in (points[0], *moved)]
+    few, none = problem.data.readings[:FEW], np.zeros_like(steps[0])
+    moved = [problem.variables.moved(solution.parameters, d) for d in (none, *steps, *shifts)]
+    p = [pose(problem.robot.with_values(x[problem.variables.robot_span]), few).position for x in moved]
     off, beyond = np.split(without_rigid_motion(p[0], np.stack(p[1:], axis=2) - p[0][:, :, None])[0], 2, axis=2)
     tool = float(np.sum(beyond**2)) / max(float(np.sum(off**2)), 1e-300)
-    return Nonlinearity(float(squares), tool, _nonlinear_rows(problem, points))
-
-
-def _nonlinear_rows(problem: Problem, points: list[Floats]) -> tuple[str, ...]:
-    """Names of the measurements with the largest second-order part over their noise at points x, x + d, x - d."""
-    found = dict[str, float]()
-    for here, plus, minus in zip(*(noises_at(problem, point) for point in points), strict=True):
-        q = 0.5 * (plus.residual() + minus.residual()) - here.residual()
-        size = np.max(np.abs(q) / here.sigma * here.block.used, axis=1)
-        for ends, of in zip(problem.data.places[here.block.table][here.block.ends], size.tolist(), strict=True):
-            found["-".join(problem.end_names[i + 1] for i in ends)] = of
-    least = 0.5 * max(found.values(), default=0.0)
-    return tuple(sorted((name for name in found if found[name] >= least), key=lambda name: -found[name]))
+    return Nonlinearity(float(squares), tool)
 
 
 class AmbiguousRows(Record):

@@ -398,9 +398,8 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
     text += " may be too small; leave these out, or measure longer and wider motions, in which more joints move"
     ambiguous = sign or (bool(rows.turned) and not curved)
     yield Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text, ambiguous)
-    most = f" (most: {listed(nonlinear.rows)})" * bool(nonlinear.rows)
     beyond = f"some {np.sqrt(1.0 + nonlinear.directions):.2g}" if np.isfinite(nonlinear.directions) else "many"
-    text = f"the measurements are nonlinear within the posterior sigmas{most}, so the covariance is optimistic in weak"
+    text = "the measurements are nonlinear within the posterior sigmas, so the covariance is optimistic in weak"
     text += f" directions: errors there are {beyond} times what it says"
     advice = "measure at more configurations, or specify smaller prior sigmas"
     yield Statement("warning", f"{text}; {advice}", nonlinear.matters and curved and not ambiguous)
