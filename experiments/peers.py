@@ -181,15 +181,15 @@ def answer(found: Row) -> str:
     for peer, row in found["peers"].items():
         if "over optimum" in row:
             z = f", z of k {row['z of k']:.2f}" if "z of k" in row else ""
-            cells.append(f"{peer} {row['over optimum']:.2f}, {1e3 * row['seconds']:.3g}{z}")
+            cells.append(f"{peer.removeprefix('fg_calib, ')} {row['over optimum']:.2f}, {1e3 * row['seconds']:.3g}{z}")
         else:
             cells.append(f"{peer}: {row.get('reason', '')}")
-    ratios = ", ".join(
-        f"{value:.0f} times {who.removeprefix('fg_calib, ')}"
-        for who, value in found["fastest package as accurate takes times ours"].items()
-    )
-    text = f"Error over the optimum, processor time [ms]: {'; '.join(cells)}"
-    return f"{text}. Fastest package as accurate: {ratios or '-'}"
+    ours = {
+        who.removeprefix("fg_calib, "): x for who, x in found["fastest package as accurate takes times ours"].items()
+    }
+    ratios = ", ".join(f"{x:.0f} {'times ' * (k == 0)}{who}" for k, (who, x) in enumerate(ours.items()))
+    text = f"Error over optimum, processor ms: {'; '.join(cells)}"
+    return f"{text}. Fastest accurate package takes {ratios or '-'}"
 
 
 def draw(found: Row, path: Path) -> None:
@@ -213,16 +213,16 @@ def draw(found: Row, path: Path) -> None:
 def question(name: str, words: str, draws: int) -> Question:
     """The question of one work: every peer runs all draws."""
     tasks: Any = lambda n, s: [(name, peer, n) for peer in peers_of(name)]  # noqa: E731
-    return Question(name, f"How do other packages do on {words}?", tasks, run_peer, summarise, answer, (draws, 1),
+    return Question(name, words, tasks, run_peer, summarise, answer, (draws, 1),
                     draw if peers_of(name) is PEERS else None, timed=True)  # fmt: skip
 
 
 QUESTIONS = (
-    question("poses", "60 poses of a UR10", 20),
-    question("distances", "300 distances between 60 poses", 20),
-    question("compliance", "60 poses of a UR10 whose joints give way to gravity", 20),
-    question("many", "5000 poses", 3),
-    question("real", "a real UR10", 3),
+    question("poses", "How do other packages do on 60 poses of a UR10?", 20),
+    question("compliance", "And where its joints give way?", 20),
+    question("distances", "And on 300 distances between 60 poses?", 20),
+    question("many", "And on 5000 poses?", 3),
+    question("real", "And on a real UR10?", 3),
 )
 
 if __name__ == "__main__":
