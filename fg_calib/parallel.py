@@ -10,9 +10,8 @@ import os
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import field
 from functools import cache, wraps
@@ -32,9 +31,6 @@ THREADS, POLARS_THREADS = "FG_CALIB_THREADS", "POLARS_MAX_THREADS"
 
 MOST = 1000
 """The largest number of threads, and of processes."""
-
-SCHEDULER_TIMEOUT_S = 30.0
-"""Time in which a scheduler must answer."""
 
 DIED = "its process died, twice; is there enough memory, and is a script guarded by __name__ == '__main__'?"
 
@@ -181,7 +177,7 @@ def map_jobs(
     Args:
         function: Takes a job; worker processes must be able to import it.
         jobs: Any number of picklable objects.
-        executor: Where: `local_processes(n)`, `dask_executor(address)`, or any other; this process if None.
+        executor: Where: `local_processes(n)`, or any other, Dask's too; this process if None.
         names: Name of each job, for failures; `job 1`, `job 2`, ... if None.
 
     Returns:
@@ -270,29 +266,3 @@ def _start_worker(n_threads: int) -> None:
             os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-@checked
-@contextmanager
-def dask_executor(address: str) -> Iterator[Executor]:
-    """An executor of a Dask cluster, for a `with` block.
-
-    Its workers need the same version of this package. Anyone who reaches a scheduler can run code on its workers.
-
-    Args:
-        address: Of the scheduler, such as `tcp://10.0.0.5:8786`.
-
-    Raises:
-        InputError: Dask is not installed, or no scheduler answers.
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError("scheduler", "Dask is not installed", hint="pip install 'fg-calib[distributed]'") from None
-    try:
-        client: Any = Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        found = printable(str(error)) or "no answer"
-        raise InputError(f"scheduler {address}", found, "a Dask scheduler, such as tcp://10.0.0.5:8786") from None
-    with client:
-        yield client.get_executor()

@@ -12,7 +12,7 @@ from deadly import die_once, work
 
 from fg_calib import InputError, ProblemError, calibrate_jobs
 from fg_calib.batch import JobSummary, Verdict, exit_code, job_names
-from fg_calib.parallel import DIED, Failure, dask_executor, listener, local_processes, map_jobs
+from fg_calib.parallel import DIED, Failure, listener, local_processes, map_jobs
 
 JOBS = [1, "refused", 2, "a bug", "too large", 3]
 
@@ -94,25 +94,14 @@ def test_workers_import_no_file_of_the_folder_that_they_start_in(example, fg_cal
 
 
 @pytest.mark.slow
-def test_many_jobs_are_the_same_here_on_local_processes_and_on_dask(example):
-    from distributed import LocalCluster
-
+def test_many_jobs_are_the_same_here_and_on_other_processes(example):
     job = example / "calibration.yaml"
     (here,) = calibrate_jobs([job])
     with local_processes(2) as executor:
         there = calibrate_jobs([job, job], executor)
-    cluster = LocalCluster(n_workers=1, processes=False, dashboard_address=None)
-    with cluster, dask_executor(cluster.scheduler_address) as executor:
-        there += calibrate_jobs([job], executor)
     for found in there:
         assert np.array_equal(found.solution.parameters, here.solution.parameters)
         assert np.array_equal(found.covariance(), here.covariance(), equal_nan=True)
-
-
-def test_no_scheduler_is_one_line(monkeypatch):
-    monkeypatch.setattr("fg_calib.parallel.SCHEDULER_TIMEOUT_S", 0.1)
-    with pytest.raises(InputError, match=r"scheduler nowhere: .*, expected a Dask scheduler, such as"):
-        dask_executor("nowhere").__enter__()
 
 
 def test_many_jobs_are_written_to_a_folder_each_with_one_table(example, tmp_path, fg_calib):

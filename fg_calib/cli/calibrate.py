@@ -25,28 +25,22 @@ def calibrate(
     figures: Annotated[bool, option("--figures", None, "Write the page's figures there too, as SVG files.")] = False,
     residuals: Annotated[Residuals, option("--residuals", None, "How single residuals are written.")] = "csv",
     workers: Annotated[int | None, option("--workers", "N", "Run jobs or folds on so many processes.", min=1)] = None,
-    scheduler: Annotated[str | None, option("--scheduler", "ADDRESS", "Run them on a Dask cluster.")] = None,
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
     from fg_calib import batch, io
-    from fg_calib.parallel import dask_executor, local_processes
+    from fg_calib.parallel import local_processes
 
     if out is None and (report or figures):
         raise typer.BadParameter("needs --out, the folder to write to", param_hint="--report and --figures")
-    if workers is not None and scheduler is not None:
-        raise typer.BadParameter("is of this machine: either this or --scheduler", param_hint="--workers")
     several = len(jobs) > 1
     names = batch.job_names(jobs) if several else [""]
     if out is not None and several:
         io.require_writable(out)
-    if scheduler is not None:  # its workers run on other machines
-        jobs, out = [job.absolute() for job in jobs], None if out is None else out.absolute()
     saved = {"report": report, "figures": figures, "residuals": residuals}
     folders = [None if out is None else out / name for name in names]
     orders = [batch.Order(*one, folds, saved) for one in zip(names, jobs, folders, strict=True)]
-    run_on = dask_executor(scheduler) if scheduler else local_processes(workers) if workers else nullcontext()
-    with run_on as executor:
+    with local_processes(workers) if workers else nullcontext() as executor:
         if several:
             _calibrate_many(orders, out, executor, as_json)
         else:

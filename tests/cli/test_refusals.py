@@ -93,7 +93,6 @@ USAGE = {
     "no job": (("calibrate",), "JOB"),
     "an example without folder": (("example", "space-robot"), "--out"),
     "a page without folder": (("calibrate", JOB, "--report"), "needs --out"),
-    "processes and a scheduler": (("calibrate", JOB, "--workers", 2, "--scheduler", "tcp://a:1"), "--scheduler"),
     "an unknown model": (("observe", ROBOT, "--model", "poses"), "--model"),
     "noise below zero": ((*OBSERVE, "--joint-noise", -1), "--joint-noise"),
     "stops and an accuracy": ((*DESIGN, "--n", 3, "--target", "1mm"), "--n and --target"),
