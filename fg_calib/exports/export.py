@@ -183,13 +183,7 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
 _Content = tuple[str, Sequence[str], dict[str, Any]]
 """Text of a format, without comments unless it is XML; notes, and details as in `Export`."""
 
-_ONLY_IN = {
-    "configurations": ["zeros"],
-    "tool": ["zeros"],
-    "far": ["dh", "mdh"],
-    "ur_base": ["ur"],
-    "ur_hash": ["ur"],
-}
+_ONLY_IN = {"configurations": ["zeros"], "tool": ["zeros"], "far": ["dh", "mdh"], "ur_base": ["ur"], "ur_hash": ["ur"]}
 """The formats for which an option means something."""
 
 
