@@ -205,8 +205,7 @@ def test_all_that_is_imported_is_installed_with_the_package():
         for library in libraries(path):
             used.setdefault(library, set()).add(name)
     extras = {"camera": ("opencv-python-headless", "cv2", "importers/board"),
-              "ros": ("rosbags", "rosbags", "importers/bag"),
-              "distributed": ("distributed", "distributed", "parallel")}  # fmt: skip
+              "ros": ("rosbags", "rosbags", "importers/bag")}  # fmt: skip
     for extra, (distribution, module, name) in extras.items():
         assert [re.match(r"[\w-]+", line)[0] for line in project["optional-dependencies"][extra]] == [distribution]
         assert used.pop(module) == {name}

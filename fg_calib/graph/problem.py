@@ -16,7 +16,7 @@ from fg_calib.graph.error_states import Eliminated, WhitenedRows, correlation_of
 from fg_calib.graph.factors import linearize_factors, measurement_factors, prior_factors, with_added
 from fg_calib.graph.knowledge import Knowledge
 from fg_calib.graph.noise_models import JOINT_NOISE, POSE_SLOTS, NoiseState, RowNoise, TableState, same_everywhere
-from fg_calib.graph.normal_system import RANK_TOLERANCE, NormalSystem, eliminate_more
+from fg_calib.graph.normal_system import NormalSystem, eliminate, eliminate_more
 from fg_calib.graph.robust import effect
 from fg_calib.graph.variables import Variables, build_variables, frame_of, pose_of, prior_rows, unknown_prior_rows
 from fg_calib.initialization import Frame
@@ -473,16 +473,8 @@ def named_rows(variables: Variables, parameters: Floats, J: Floats) -> Floats:
     At a pitch of 90 degrees of base or tool the columns of yaw and roll are parallel: only their sum acts.
     """
     n = variables.n_robot_columns
-    out: Floats = J @ variables.tangent_derivative(parameters)[:, :n]
-    if n == variables.n_columns:
-        return out
-    length = np.linalg.norm(out, axis=0)
-    U, s, _ = np.linalg.svd(J[:, n:], full_matrices=False)
-    Q = U[:, s > RANK_TOLERANCE * s.max(initial=0.0)]
-    out = out - Q @ (Q.T @ out)
-    # What projecting leaves of a column that was all frame is rounding.
-    out[:, np.linalg.norm(out, axis=0) <= RANK_TOLERANCE * length] = 0.0
-    return out
+    wide = np.hstack([J @ variables.tangent_derivative(parameters)[:, :n], J[:, n:]])
+    return eliminate(wide, np.zeros(len(wide)), n).A
 
 
 def directions(problem: Problem, parameters: Floats) -> tuple[Floats, Floats]:

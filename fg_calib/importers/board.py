@@ -33,7 +33,7 @@ from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__, io, measurements, parallel
-from fg_calib.initialization import Camera
+from fg_calib.initialization import Camera, boards_from_image, refine_board
 from fg_calib.inputs import Floats, InputError, Integers, Record, check
 
 Image = NDArray[np.uint8]
@@ -254,36 +254,6 @@ def in_order(image: Image, grid: Floats) -> Floats:
     return grid
 
 
-def both_poses(points: Floats, uv: Floats, camera: Camera) -> list[tuple[Floats, Floats]]:
-    """Poses of a plane from which its points would be seen there, nearest first.
-
-    A plane that is seen small has two: tilted one way or the other (Collins and Bartoli 2014, *Infinitesimal
-    plane-based pose estimation*). Each is refined to least squares of the distances in the image.
-
-    Args:
-        points: Points of the plane, x and y, shape (n, 2), [m].
-        uv: Where they are seen, shape (n, 2), [px].
-        camera: The camera.
-
-    Returns:
-        Axes of the plane in the camera's frame, (3, 3), and its origin, (3,), [m]; one or two poses, or none.
-    """
-    cv2 = load_opencv()
-    K, lens = _matrices(camera)
-    places = np.column_stack([points, np.zeros(len(points))])
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
-    found = []
-    try:
-        _, turns, shifts, _ = cv2.solvePnPGeneric(places, uv, K, lens, flags=cv2.SOLVEPNP_IPPE)
-        for turn, shift in zip(turns, shifts, strict=True):
-            v, t = cv2.solvePnPRefineLM(places, uv, K, lens, turn.copy(), shift.copy(), criteria)
-            if np.isfinite(v).all() and np.isfinite(t).all():
-                found.append((cv2.Rodrigues(v)[0], t.ravel()))
-    except cv2.error:
-        return []
-    return found
-
-
 def estimate_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
     """The camera that explains views of a plane best (Zhang 2000, *A flexible new technique for camera calibration*).
 
@@ -487,7 +457,9 @@ def _view(one: Corners, fit: _Fit, of_all: float, taken: float) -> View:
 
 def _fit(camera: Camera, points: Floats, uv: Floats) -> _Fit | None:
     """The better of the poses that explain some corners, and how well the other one does; None if there is none."""
-    fits = [_rows(camera, points, uv, R, t) for R, t in both_poses(points, uv, camera)]
+    image, one = np.hstack([uv, points]), np.ones(uv.shape)
+    poses = (refine_board(camera, image, one, start) for _, start in boards_from_image(camera, image))
+    fits = [_rows(camera, points, uv, at.rotation, at.translation) for at in poses if at is not None]
     fits = [fit for fit in fits if np.isfinite(fit.squares) and np.linalg.matrix_rank(fit.J) == 6]
     if not fits:
         return None

@@ -1,4 +1,4 @@
-from .boards import boards_from_image
+from .boards import boards_from_image, refine_board
 from .camera import Camera
 from .hand_eye import Frame
 from .landmarks import anchors_from_lengths, offset_from_lengths, plane_from_distances, targets_from_positions
@@ -12,5 +12,6 @@ __all__ = [
     "boards_from_image",
     "offset_from_lengths",
     "plane_from_distances",
+    "refine_board",
     "targets_from_positions",
 ]

@@ -159,7 +159,7 @@ def _refined_on_most(camera: Camera, image: Floats, weight: Floats, start: Frame
     n, frame = len(image), start
     kept, limit = np.arange(n), np.inf
     for step in range(MAX_ROUNDS):
-        refined = _refined(camera, image[kept], weight[kept], frame)
+        refined = refine_board(camera, image[kept], weight[kept], frame)
         if refined is None:
             return None
         frame = refined
@@ -177,7 +177,7 @@ def _refined_on_most(camera: Camera, image: Floats, weight: Floats, start: Frame
     return float(np.sum(np.minimum(off, limit) ** 2)), frame
 
 
-def _refined(camera: Camera, image: Floats, weight: Floats, start: Frame) -> Frame | None:
+def refine_board(camera: Camera, image: Floats, weight: Floats, start: Frame) -> Frame | None:
     """The pose of least squares on the pixels; None where a point is not ahead of the camera."""
     from scipy.optimize import leastsq  # here, for it takes as long to import as a small calibration
 

@@ -150,7 +150,7 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
                 options["payload"] = {"mass": m.mass, "com": list(m.com), "column": m.column}
         if type(effect) not in keys:
             raise InputError(robot.name, f"an effect {type(effect).__name__}", f"of {', '.join(EFFECTS)}")
-        out[keys[type(effect)]] = {name: _plain(value) for name, value in options.items()}
+        out[keys[type(effect)]] = options
     curves = defaultdict[str, list[float]](list)
     for p in robot.parameters:
         if p.kind == "curve":
@@ -170,8 +170,3 @@ def _mapping_of(masses: Sequence[Mass]) -> dict[int, Any]:
         com = np.array([one.mass for one in each]) @ np.array([one.com for one in each]) / total
         out[link] = {"mass": total, "com": com.tolist()}
     return out
-
-
-def _plain(value: Any) -> Any:
-    """Tuples as lists: YAML has no others."""
-    return [_plain(one) for one in value] if isinstance(value, list | tuple) else value

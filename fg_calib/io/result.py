@@ -562,7 +562,7 @@ MOST_VALUE = 1e100
 ResidualFile = Literal["csv", "parquet", "none"]
 """How single residuals are written, if at all."""
 
-FIGURES = ("accuracy", "joints", "parameters", "correlations", "residuals", "workspace")
+FIGURES = ("accuracy", "joints", "parameters", "correlations", "residuals", "workspace", "curves", "compliances")
 
 RESULT_FILES = {
     "result.json": b'{\n "schema": "fg-calib/result/',

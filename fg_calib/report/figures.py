@@ -181,7 +181,8 @@ def joint_errors(data: ReportData) -> Floats | None:
     error[table["rms_position"].is_null()] = np.nan
     arm = data.robot.geometry
     J = robot.forward(robot.build_chain(arm).with_joint_columns(), arm.trig(data.readings)).jacobian[:, 3:]
-    return np.einsum("ni,nij->nj", error, J) / np.sum(J**2, axis=1)
+    lever = np.sum(J**2, axis=1)
+    return np.einsum("ni,nij->nj", error, J) / np.where(lever > 0.0, lever, np.nan)  # on its axis a joint moves nothing
 
 
 def correlation_matrix(data: ReportData) -> list[Chart]:

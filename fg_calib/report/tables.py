@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from pydantic_core import to_json
-from rich.cells import cell_len
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
@@ -48,19 +47,7 @@ def plain_text(report: RenderableType, width: int = WIDTH) -> str:
 
 def width_for(report: RenderableType, width: int) -> int:
     """`width`, or more where a table or the longest word of a report needs it."""
-    return max(width, _least_width(report))
-
-
-def _least_width(part: Any) -> int:
-    """Columns that a part needs at least; rich measures the same in ten times the time."""
-    if isinstance(part, (Group, Section)):
-        return max(map(_least_width, part.renderables if isinstance(part, Group) else part.content), default=0)
-    if isinstance(part, Padding):
-        return part.left + _least_width(part.renderable)
-    if isinstance(part, Table):
-        columns = [max(map(_least_width, (column.header, *column.cells))) for column in part.columns]
-        return sum(columns) + 2 * (len(columns) - 1)
-    return max(map(cell_len, str(part).split()), default=0)
+    return max(width, Console(width=10_000).measure(report).minimum)
 
 
 def line(text: str, style: str = "") -> Text:

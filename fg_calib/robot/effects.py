@@ -355,7 +355,7 @@ class Backlash(Effect, Record):
         if self.side == "load":
             return super().context(robot, readings, read)
         if self.side != "moves":
-            joints, sides = _joints(robot, self.joints, "backlash"), np.zeros(readings.shape)
+            joints, sides = _joints(robot, self.joints, "backlash"), np.full(readings.shape, np.nan)
             sides[:, joints] = read([f"{self.side}{i + 1}" for i in joints])
             return {self.side: sides}
         sides, moves = np.zeros(readings.shape), np.diff(readings, axis=0)

@@ -410,26 +410,8 @@ def _contract(chain, n_ends, T, D, panel, at):  # type: ignore[no-untyped-def]
             for h in range(residual_dim):
                 wrench = D[(e * residual_dim + h) * size : (e * residual_dim + h + 1) * size]
                 if own or e == 0:
-                    _write_product(chain.turns[t], wrench, twist, panel[column, h, at : at + LANES])
-                else:
-                    _add_product(chain.turns[t], wrench, twist, panel[column, h, at : at + LANES])
-
-
-@inlined
-def _write_product(turns, D, T, out):  # type: ignore[no-untyped-def]
-    if turns:
-        for i in range(LANES):
-            out[i] = (
-                D[i] * T[i] + D[LANES + i] * T[LANES + i] + D[2 * LANES + i] * T[2 * LANES + i]
-                + D[3 * LANES + i] * T[3 * LANES + i] + D[4 * LANES + i] * T[4 * LANES + i]
-                + D[5 * LANES + i] * T[5 * LANES + i]
-            )  # fmt: skip
-    else:
-        for i in range(LANES):
-            out[i] = (
-                D[3 * LANES + i] * T[3 * LANES + i] + D[4 * LANES + i] * T[4 * LANES + i]
-                + D[5 * LANES + i] * T[5 * LANES + i]
-            )  # fmt: skip
+                    panel[column, h, at : at + LANES] = 0.0
+                _add_product(chain.turns[t], wrench, twist, panel[column, h, at : at + LANES])
 
 
 @inlined
@@ -464,7 +446,7 @@ def _fill_nuisances(derivatives, weight, first, panel):  # type: ignore[no-untyp
                 panel[panel.shape[0] - 1 - n_nuisances + k, h, first + i] = rows[h, i]
 
 
-DISTANCE, ROTATION_ANGLE, POSITION, ORIENTATION, SAME_POINT = range(5)
+DISTANCE, ROTATION_ANGLE, POSITION, ORIENTATION = range(4)
 """Codes of the twins."""
 
 
@@ -482,8 +464,6 @@ def _run_twin(twin, R, p, data, first, derived, r, D):  # type: ignore[no-untype
         D[0, h : h + 3] = 0.0
         for i in range(LANES):
             _orientation(R[0], data[min(first + i, data.shape[0] - 1), column:], i, derived, r[h:], D[0, h:])
-    elif code == SAME_POINT:
-        _same_point(p, r[h:], D[0, h:], D[1, h:])
 
 
 @inlined
@@ -542,17 +522,6 @@ def _position(p, data, first, column, r, D):  # type: ignore[no-untyped-def]
         for i in range(LANES):
             r[c, i] = p[c, i] - data[min(first + i, data.shape[0] - 1), column + c]
             D[c, 3 + c, i] = 1.0
-
-
-@part
-def _same_point(p, r, D_A, D_B):  # type: ignore[no-untyped-def]
-    D_A[:3] = 0.0
-    D_B[:3] = 0.0
-    for c in range(3):
-        for i in range(LANES):
-            r[c, i] = p[1, c, i] - p[0, c, i]
-            D_A[c, 3 + c, i] = -1.0
-            D_B[c, 3 + c, i] = 1.0
 
 
 @inlined

@@ -75,10 +75,7 @@ def rotation_angle(rotation: Floats) -> tuple[Floats, Floats]:
 
 def cross_matrix(v: Floats) -> Floats:
     """[v]x with `[v]x w = v x w`, shape (n, 3, 3)."""
-    out = np.zeros((len(v), 3, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = v[:, 2], -v[:, 1], v[:, 0]
-    return out
+    return np.cross(np.eye(3), v[:, None])
 
 
 def left_jacobian(v: Floats) -> Floats:

@@ -210,7 +210,7 @@ class PredictedFit(FrozenArrays):
     expected: Figure
     p_value: Probability
     configurations: tuple[SuspectConfiguration, ...]
-    others: float
+    others: Figure = np.nan
 
     @property
     def has_outliers(self) -> bool:

@@ -22,12 +22,12 @@ from fg_calib.robot import LANES, build_chain
 
 CONVENTIONS = ["dh", "mdh", "mdh-hayati", "dh-hayati", "urdf"]
 COMPILED = [
-    *(Distance(), RotationAngle(), Position(), Orientation(), SamePoint()),
+    *(Distance(), RotationAngle(), Position(), Orientation()),
     *(Stacked(Distance(), RotationAngle()), Stacked(Orientation(), Position()), Stacked(Position(), Orientation())),
 ]
 INSTRUMENTS = [TargetPosition(), AnchorDistance(), AnchorContact(), PlaneDistance(), BoardPose()]
 INSTRUMENTS += [Stacked(Orientation(), TargetPosition())]
-KINDS = [*COMPILED, TouchedPoint(), PointDistance(), *INSTRUMENTS]
+KINDS = [*COMPILED, SamePoint(), TouchedPoint(), PointDistance(), *INSTRUMENTS]
 
 
 def name_of(kind):

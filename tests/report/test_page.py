@@ -13,8 +13,9 @@ from simulated import measure, plus, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
 from fg_calib.calibration import write_report
+from fg_calib.io.result import FIGURES
 from fg_calib.report.charts import Scale
-from fg_calib.report.figures import error_curves, errors_over_torque, joint_errors
+from fg_calib.report.figures import error_curves, errors_over_torque, figures_of, joint_errors
 from fg_calib.report.html import build_page
 from fg_calib.robot import Compliance, ErrorCurve, Mass
 
@@ -115,7 +116,8 @@ def test_names_are_text_and_nothing_else():
     assert not any("alert" in (script.text or "") for script in page.xpath("//script[not(@type)]"))
 
 
-def test_figures_are_svg_files_of_their_own(folder):
+def test_figures_are_svg_files_of_their_own(folder, made):
+    assert set(figures_of(made.report_data)) <= set(FIGURES)
     names = {file.stem for file in folder.glob("*.svg")}
     assert names == {"joints", "parameters", "correlations", "residuals", "workspace"}
     for file in folder.glob("*.svg"):

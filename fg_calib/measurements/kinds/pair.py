@@ -25,7 +25,6 @@ class SamePoint(Coincidence):
     """
 
     ends, turned_back = 2, True
-    code = kernels.SAME_POINT
 
 
 class TouchedPoint(Coincidence):
