@@ -15,7 +15,6 @@ the truth.
 | anchors | lengths to three unknown anchors without priors, over the Cramer-Rao bound |
 | outliers | 10 and 30 % of rows wrong by up to 50 sigma, by loss, over the fit without them |
 | monitoring | `check` of healthy arms and of slipped joints, `update` against a calibration of all rows |
-| prior_scales | `tolerance: estimate` where true errors are 0.1 to 10 times the prior sigmas |
 
 Values: NEES, e^T C^-1 e over the number of parameters, 1 where the covariance is true, with 99 % bounds by chance;
 share of errors within 1.96 sigma; RMS error of the tool point after the best rigid fit over what the covariance
@@ -60,7 +59,6 @@ from fg_calib import (
 from fg_calib.observability.cramer_rao import cramer_rao
 from fg_calib.robot import pose
 from fg_calib.simulation import read_scenario
-from fg_calib.statistics import estimate_tolerances
 
 Floats = NDArray[np.float64]
 Cell = Mapping[str, Any]
@@ -553,63 +551,6 @@ def monitor_answer(found: Row) -> str:
 
 
 SCALES = (0.1, 0.3, 1.0, 3.0, 10.0)
-ESTIMATORS = ("known", "specified", "estimated", "without")
-
-
-def scale_cells() -> dict[str, Cell]:
-    """Poses and stars of pairs at 100 and at 10 poses, and true errors of some times the prior sigmas."""
-    return {
-        f"{way}, {n} poses, x {scale:g}": {
-            "arm": "UR10", "scale": scale, "instruments": [OUTLIER_WAYS[way]],
-            "configurations": {"random": {"count": n}},
-        }
-        for way, n in (("pose", 100), ("pose", 10), ("star", 100)) for scale in SCALES
-    }  # fmt: skip
-
-
-def scale_draw(task: Task) -> Row:
-    """Squared tool errors with prior scales known, as specified, estimated, and without priors."""
-    cell, seed = task
-    scenario, q = scenario_of("prior_scales", cell), judged_at("prior_scales", cell)
-    scale = CELLS["prior_scales"][cell]["scale"]
-    true_priors = replace(
-        scenario.robot,
-        parameters=tuple(
-            p if p.tolerance is None else replace(p, tolerance=scale * p.tolerance) for p in scenario.robot.parameters
-        ),
-    )
-    simulation = simulate(replace(scenario, robot=true_priors), seed)
-    at = pose(simulation.true_robot, q).position
-    row: Row = {}
-    for who in ESTIMATORS:
-        options: Row = {"gauge": "none"} if who == "without" else {}
-        if who == "estimated":
-            options["estimate_tolerance"] = "kind"
-        robot = true_priors if who == "known" else scenario.robot
-        solution = estimate_tolerances(build_problem(robot, simulation.tables, **options))
-        off = (pose(solution.robot, q).position - at)[:, :, None]
-        row[who] = float(3.0 * np.mean(without_rigid_motion(at, off) ** 2))
-    return row
-
-
-def scale_summary(tasks: Sequence[Task], rows: Sequence[Row]) -> Row:
-    """RMS errors over those with known scales, by cell."""
-    return {
-        cell: {who: float(np.sqrt(np.mean(of[who]) / np.mean(of["known"]))) for who in ESTIMATORS[1:]}
-        for cell, of in by_cell(tasks, rows).items()
-    }
-
-
-def scale_answer(found: Row) -> str:
-    """Largest ratios over all scales, by way and number of poses."""
-    groups: dict[str, list[Row]] = {}
-    for cell, row in found.items():
-        groups.setdefault(cell.rpartition(",")[0], []).append(row)
-    cells = [
-        f"{group}: " + ", ".join(f"{who} {max(row[who] for row in rows):.2f}" for who in ESTIMATORS[1:])
-        for group, rows in groups.items()
-    ]
-    return f"Largest tool error over that with known prior sigmas; {'; '.join(cells)}"
 
 
 class _Cells(dict[str, Any]):
@@ -627,7 +568,6 @@ _MAKERS = {
     "instruments": instrument_cells,
     "anchors": anchor_cells,
     "outliers": outlier_cells,
-    "prior_scales": scale_cells,
 }
 CELLS = _Cells()
 
@@ -652,8 +592,6 @@ QUESTIONS = (
     Question("monitoring", "Is what check and update say next month true?",
              lambda n, first: [(way, slip, first + k) for way in MONITORED for slip in SLIPS for k in range(n)],
              monitor_draw, monitor_summary, monitor_answer, (40, 1)),
-    Question("prior_scales", "May prior sigmas be estimated?", cells_and_seeds("prior_scales"), scale_draw,
-             scale_summary, scale_answer, (20, 1)),
 )  # fmt: skip
 
 if __name__ == "__main__":

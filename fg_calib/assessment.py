@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -144,7 +143,7 @@ def _figures(function: Callable[[Robot], ArrayLike], robot: Robot) -> Floats:
 
 @checked
 def solve_job(job: Job, problem: graph.Problem | None = None) -> graph.Solution:
-    """The solution of a job: the best optimum that is found, with noise and prior scales estimated if it asks for that.
+    """The solution of a job: the best optimum that is found, with noise estimated if it asks for that.
 
     Args:
         job: The job.
@@ -157,7 +156,7 @@ def solve_job(job: Job, problem: graph.Problem | None = None) -> graph.Solution:
     problem = problem or graph.problem_of(job)
     try:
         solve_with = statistics.estimate_noise if job.options.estimate_noise else graph.solve
-        solution = statistics.estimate_tolerances(problem, partial(estimate_curve_sigma, solve_with=solve_with))
+        solution = estimate_curve_sigma(problem, solve_with)
     except SolverError as error:
         for table in job.tables:
             if table.model is not None:

@@ -101,9 +101,9 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> "C
             folds = cross_validate(given, solve_job, options.folds, executor=executor)
             assessment = replace(assessment.with_held_out(folds.by_table, solution), cross_validation=folds)
     except (ArithmeticError, np.linalg.LinAlgError) as error:
-        if not options.estimate_noise and options.estimate_tolerance is None:
+        if not options.estimate_noise:
             raise
-        found = "noise and tolerance cannot be estimated from these rows, which leave no error: specify them"
+        found = "noise cannot be estimated from these rows, which leave no error: specify it"
         raise SolverError(found) from error
     return Calibration.of(solution, assessment, inputs=given.inputs, job=given.document, effects=effects)
 

@@ -34,8 +34,8 @@ class Job(Brief):
 
     def __post_init__(self) -> None:
         check_fields(self, "job: ")
-        as_usual = self.options.gauge == "prior" and self.options.estimate_tolerance is None
-        if as_usual and self.robot.estimates_zeros_freely:  # a zero that nothing determines stays nominal
+        if self.options.gauge == "prior" and self.robot.estimates_zeros_freely:
+            # a zero that nothing determines stays nominal
             object.__setattr__(self, "options", replace(self.options, gauge="keep"))
 
     @property

@@ -215,7 +215,7 @@ class _Choice:
     def __init__(self, job: Job, solution: graph.Solution) -> None:
         robot, x, n = job.robot, solution.parameters, len(solution.problem.robot.parameters)
         options = replace(job.options, encoder="propagated", pair_errors="independent")
-        options = replace(options, gauge="none", estimate_tolerance=None)
+        options = replace(options, gauge="none")
         full = graph.problem_of_tables(robot, graph.tables_of(job.measurements, options), options)
         start = np.concatenate([x[:n], np.zeros(len(robot.parameters) - n), x[n:]])
         problem = graph.with_factors(full, start, solution.problem.state)

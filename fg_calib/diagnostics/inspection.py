@@ -304,7 +304,6 @@ def _check_tables(found: Inspection, job: Job) -> Iterator[Statement]:
         yield Statement("note", text, t.n_leaked)
     text = "is to be estimated: sigmas and accuracy here are for what is specified, or 1 mm and 1 mrad"
     yield Statement("note", f"noise {text}", job.options.estimate_noise)
-    yield Statement("note", f"the scale of prior sigmas {text}", job.options.estimate_tolerance)
 
 
 CHECKS = (_check_setups, _check_result, _check_tables)

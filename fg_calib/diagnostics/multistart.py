@@ -103,8 +103,7 @@ def _solve_from(solution: Solution, problem: Problem, start: Floats | None = Non
     except CalibrationError:  # says nothing against the first
         return []
     other = replace(other, before=solution.before, initial_cost=solution.initial_cost) if start is not None else other
-    noise, tolerances = solution.estimated_noise, solution.estimated_tolerances
-    return [replace(other, estimated_noise=noise, estimated_tolerances=tolerances)] if other.converged else []
+    return [replace(other, estimated_noise=solution.estimated_noise)] if other.converged else []
 
 
 def _steps(solution: Solution) -> list[Floats]:

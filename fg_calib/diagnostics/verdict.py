@@ -361,16 +361,6 @@ def check_priors(case: Case) -> Iterator[Statement]:
     yield Statement("error" if certain else "note", text, p_value < SIGNIFICANT)
 
 
-def check_prior_scales(case: Case) -> Iterator[Statement]:
-    """Check prior sigmas that were estimated."""
-    estimated = case.solution.estimated_tolerances
-    scales = () if estimated is None else estimated.scales
-    far = [f"{one.group} {one.scale:.3g}" for one in scales if one.scale > MAX_PRIOR_SCALE]
-    text = f"corrections are far larger than the prior sigmas specified ({', '.join(far)} times)"
-    text += ": residuals are too large as well, so corrections may hide unmodelled effects" * case.too_large
-    yield Statement("note", text, far)
-
-
 def check_signs(case: Case) -> Iterator[Statement]:
     """Check lengths and angles near 0 and 180 degrees, and what is not linear within the posterior.
 
@@ -430,7 +420,7 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
 
 CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (
     *(check_solver, check_change, check_fit, check_kept_noise, check_test_rows, check_gain, check_priors),
-    *(check_prior_scales, check_signs, check_estimated_noise),
+    *(check_signs, check_estimated_noise),
 )
 """The checks of every solution, in the order of their statements; for what comes before and after them see `judge`."""
 

@@ -49,8 +49,6 @@ from .robust import effect, tuning, weight
 from .solver import (
     Solution,
     SolverOptions,
-    ToleranceScale,
-    ToleranceScales,
     begun_at,
     solve,
     take_steps,
@@ -87,8 +85,6 @@ __all__ = [
     "Solution",
     "SolverOptions",
     "State",
-    "ToleranceScale",
-    "ToleranceScales",
     "Variables",
     "WhitenedBlock",
     "WhitenedRows",

@@ -21,9 +21,6 @@ _log = logging.getLogger(__name__)
 QUARTER_TURN = 1e-3
 """Cosine of a pitch at which yaw and roll of a frame are no longer distinct."""
 
-FIRST_TOLERANCE = 1e-3
-"""Prior sigma that a joint's parameter starts from where scales are estimated and none is specified, [m] and [rad]."""
-
 
 @single_threaded
 def build_problem(robot: Robot, measurements: Tables, options: Options | None = None, **choices: Any) -> Problem:
@@ -73,11 +70,6 @@ def problem_of_tables(robot: Robot, tables: Sequence[Table], options: Options) -
         free = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= robot.n_joints]
         robot, tables = robot.with_estimated(free), [table.all_train() for table in tables]
         options = replace(options, gauge="none" if options.gauge == "keep" else options.gauge, encoder="propagated")
-    elif options.estimate_tolerance is not None:
-        n, parameters = robot.n_joints, robot.parameters
-        none = [p.tolerance is None and p.estimated and 1 <= p.owner <= n for p in parameters]
-        first = (replace(p, tolerance=FIRST_TOLERANCE) if t else p for p, t in zip(parameters, none, strict=True))
-        robot = replace(robot, parameters=tuple(first))
     data = build.build_dataset(robot, tables)
     variables = variables_of(robot, data, options)
     start = start_of(robot, data, variables)

@@ -93,38 +93,6 @@ class Iteration(Record):
     decrement: float
 
 
-class ToleranceScale(Record):
-    """A factor on the tolerances specified of a group of parameters, estimated with them.
-
-    Attributes:
-        group: Parameters that share the scale: `a`, `theta`, `tool`; or a joint's name.
-        parameters: The parameters.
-        scale: Tolerance estimated over tolerance specified.
-        low: Lower end of its 95 % interval.
-        high: Upper end.
-        seen: How many of the parameters' corrections the data tell of.
-    """
-
-    group: str
-    parameters: tuple[str, ...]
-    scale: float
-    low: float
-    high: float
-    seen: float
-
-
-class ToleranceScales(FrozenArrays):
-    """The scales of all groups.
-
-    Attributes:
-        scales: Group by group.
-        added: Added covariance of the estimate by not knowing them, shape (n_columns, n_columns).
-    """
-
-    scales: tuple[ToleranceScale, ...]
-    added: Floats
-
-
 class Solution(FrozenArrays):
     """Result of the solver.
 
@@ -140,7 +108,6 @@ class Solution(FrozenArrays):
         weighted_cost: The cost with every measurement by its robust weight.
         seconds: Time taken.
         estimated_noise: Tables and kinds whose noise was estimated; None where it was taken as specified.
-        estimated_tolerances: Scales on the robot's tolerances; None where they are taken as specified.
         others: Parameter vectors of other optima that the data cannot distinguish from this one.
     """
 
@@ -155,7 +122,6 @@ class Solution(FrozenArrays):
     weighted_cost: float = np.nan
     seconds: float = 0.0
     estimated_noise: tuple[tuple[int, str], ...] | None = None
-    estimated_tolerances: ToleranceScales | None = None
     others: tuple[Floats, ...] = ()
 
     def __getstate__(self) -> dict[str, Any]:

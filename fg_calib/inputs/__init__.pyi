@@ -61,7 +61,6 @@ from .options import (
     Options,
     PairErrors,
     Pairing,
-    SharedScale,
     Strategy,
 )
 
@@ -100,7 +99,6 @@ __all__ = [
     "ProblemError",
     "Reader",
     "Record",
-    "SharedScale",
     "Sigma",
     "SolverError",
     "Strategy",

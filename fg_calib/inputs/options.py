@@ -49,9 +49,6 @@ EncoderNoise = Literal["propagated", "estimated"]
 Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
 """Treatment of large residuals: least squares, or a robust loss."""
 
-SharedScale = Literal["kind", "joint"]
-"""Whether the tolerances of a kind of parameters, or those of a joint, are off by the same factor."""
-
 LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 
@@ -128,8 +125,6 @@ class Options(Record):
             the true joint values of every configuration are estimated too, with the readings as their priors.
         loss: Treatment of large residuals: `none` or a robust loss (see `graph.robust`).
         estimate_noise: Whether the sigmas specified are only a start, and scaled to what is seen.
-        estimate_tolerance: Whether the robot's tolerances are only a start, and scaled to the corrections seen: one
-            scale for each kind of parameters, or each joint; None if they are taken as specified.
         max_iterations: Steps after which the solver gives up; None for its default.
         accept: How large errors may be where rows are held out; by name (`{"position": 5e-4}`) as well.
         folds: Into how many folds configurations are dealt for cross-validation; None for none.
@@ -147,7 +142,6 @@ class Options(Record):
     encoder: EncoderNoise = "propagated"
     loss: Loss = "none"
     estimate_noise: bool = False
-    estimate_tolerance: SharedScale | None = None
     max_iterations: int | None = None
     accept: Limits = field(default_factory=Limits)
     folds: int | None = None
@@ -157,9 +151,6 @@ class Options(Record):
             check_names("accept", self.accept, list(LIMITED), "limit")
             object.__setattr__(self, "accept", Limits(**self.accept))
         check_fields(self)
-        if self.estimate_tolerance is not None and self.gauge != "prior":
-            found = f"to be estimated with gauge: {self.gauge}"
-            raise InputError("tolerance", found, "gauge: prior, the scale of which it is")
         for key, least in (("max_iterations", 1), ("folds", 2)):
             if getattr(self, key) is not None:
                 check_number(key, getattr(self, key), least=least, whole=True)

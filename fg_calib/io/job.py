@@ -67,7 +67,6 @@ class _KeepOut(Schema):
 
 
 class _Tolerances(Schema):
-    estimate: Any = None
     targets: Positive | None = None
     anchors: Positive | None = None
 
@@ -108,9 +107,7 @@ class _JobKeys(_TableKeys):
     targets: Mapping[str, _Point] = Field(default_factory=dict)
     anchors: Mapping[str, _Point] = Field(default_factory=dict)
     keep_out: tuple[Annotated[_KeepOut, BeforeValidator(corners_of)], ...] = ()
-    tolerance: Annotated[
-        _Tolerances, BeforeValidator(lambda one: {"estimate": "kind"} if one == "estimate" else one or {})
-    ] = _Tolerances()
+    tolerance: _Tolerances = _Tolerances()
 
     def options(self, robot: Robot, model: Model, *, estimate_noise: bool = False) -> Options:
         """The options of a calibration of a robot.
@@ -121,7 +118,7 @@ class _JobKeys(_TableKeys):
         choices = {key: getattr(self, key) for key in (*_CHOICES, "frame") if key in self.model_fields_set}
         inputs.check_names("prefer", choices.get("prefer", ()), names_of(robot.parameters))
         choices |= {"pairing": pairing_of(self.pairing), "accept": _limits(self.accept, self.units), "model": model}
-        return Options.of(**choices, estimate_noise=estimate_noise, estimate_tolerance=self.tolerance.estimate)
+        return Options.of(**choices, estimate_noise=estimate_noise)
 
 
 _CHECKED_LATER: dict[str, Any] = dict.fromkeys(_CHOICES, (Any, None))

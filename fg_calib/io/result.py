@@ -29,7 +29,7 @@ from pydantic import AliasPath, BaseModel, BeforeValidator, ConfigDict, Field, P
 from pydantic.functional_serializers import PlainSerializer, WrapSerializer
 
 from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
-from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, ToleranceScale, Variables
+from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, Variables
 from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, Probability, checked
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
@@ -274,7 +274,7 @@ class Result(Section):
     sigma_joint: Floats = of("problem.sigma_joint", np.zeros(0))
     noise_factors: dict[str, float] | None = None
     noise_kept: tuple[str, ...] = ()
-    tolerance_scales: tuple[ToleranceScale, ...] | None = of("solution.estimated_tolerances.scales", None)
+    tolerance_scales: Any = None  # of results that had them
     residual_rms: dict[str, dict[str, Rms | None]]
     residual_statistics: dict[str, dict[str, dict[str, Statistics] | None]] = Field(default_factory=dict)
     parameters: tuple[statistics.ParameterEstimate, ...] = of("assessed.estimates.parameters")

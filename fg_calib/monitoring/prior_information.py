@@ -68,7 +68,7 @@ class Calibrated(inputs.Record):
     @property
     def fixed_options(self) -> inputs.Options:
         """Options with noise and prior sigmas as estimated."""
-        return replace(self.options, estimate_noise=False, estimate_tolerance=None)
+        return replace(self.options, estimate_noise=False)
 
     def noise_of(self, like: Sequence[str]) -> graph.NoiseState:
         """The noise of new tables: as it was found, of the only table if there was one.

@@ -113,7 +113,6 @@ def build_sections(found: ReportData, most: int = 5) -> list[Section]:
         *section("Effects beyond the geometry (folds: RMS of held-out blocks of joint positions)", *_effects(result)),
         *section(PARAMETERS, parameter_table(result)),
         *section(CURVES, _error_curves(result)),
-        *section("Prior sigmas estimated (ratio to the specified ones, with its 95 % interval)", _tolerances(result)),
         *section("Combinations that the kept parameters stand for", _combinations(result)),
         *section("Suspicious rows", *_suspicious_rows(found.residuals, "train", most)),
         *section("Suspicious test rows", *_suspicious_rows(found.residuals, "test", most)),
@@ -317,17 +316,6 @@ def _error_curves(result: Result) -> Table:
         rms = np.linalg.norm(measured, axis=0) / np.sqrt(max(len(measured), 1))
         rows.append((name, len(curve), len(measured), *rms, "rad", curve[0].prior_sigma))
     return table_of(("", "coefficients|d", "measured|d", "RMS|q", "± sigma|q", "|unit", "prior|q"), rows)
-
-
-def _tolerances(result: Result) -> Table:
-    """Each scale of prior sigmas; these themselves only where those of a scale are all the same."""
-    sigma_of, rows = {p.name: (p.unit, p.prior_sigma) for p in result.parameters}, []
-    for one in result.tolerance_scales or ():
-        (unit, sigma), *others = {sigma_of[name] for name in one.parameters}
-        sigmas = ("", "", "") if others or sigma is None else (sigma / one.scale, sigma, unit)
-        rows.append((one.group, *sigmas, one.scale, one.low, one.high, f"{one.seen:.1f} of {len(one.parameters)}"))
-    columns = ("", "specified|q:.3g", "estimated|q:.3g", "|unit", "ratio|.3g", "from|.2g", "to|.2g")
-    return table_of((*columns, "corrections that count|>"), rows)
 
 
 def _combinations(result: Result) -> Table:

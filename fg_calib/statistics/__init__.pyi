@@ -19,7 +19,7 @@ from .goodness_of_fit import (
     upper_probability,
 )
 from .outliers import FINE, judge_without_outliers
-from .priors import PriorFit, estimate_tolerances, judge_priors
+from .priors import PriorFit, judge_priors
 from .residual_table import MAX_OUTLIER_SHARE, HeldOut, ResidualTable, root_mean_square
 from .variance_components import LEAST_REDUNDANCY, estimate_noise, has_joint_noise
 
@@ -58,7 +58,6 @@ __all__ = [
     "covariance_of_rows",
     "cross_validate",
     "estimate_noise",
-    "estimate_tolerances",
     "estimates_at",
     "has_joint_noise",
     "judge_fit",

@@ -222,16 +222,13 @@ def covariance_of_rows(variables: graph.Variables, parameters: Floats, rows: Flo
 def with_left_out(solution: graph.Solution, spread: Spread) -> Spread:
     """The covariance of all parameters, those among them that were left out to fix the gauge: see the module's head.
 
-    Where prior sigmas were estimated, what is not known of these is added.
-
     Args:
         solution: The solution.
         spread: Covariance of what was estimated.
     """
     problem = solution.problem
     if problem.whole is None:
-        added = 0.0 if solution.estimated_tolerances is None else solution.estimated_tolerances.added
-        return replace(spread, tangent=spread.tangent + added, actual=spread.actual + added)
+        return spread
     variables, own_scales = problem.whole.variables, spread.variables.scales
     tolerances = [p.tolerance for p in problem.whole.estimated if p.name not in spread.variables.names]
     known = np.array([t is not None for t in tolerances], dtype=np.bool_)

@@ -574,7 +574,7 @@ def chi_square(solution: Solution, spread: Spread) -> ChiSquare:
     dof -= solution.system.left.rank
     expected = max(0.0, dof - spread.excess - (1.0 - of_loss) * n_rows)
     known = dof > 0 and problem.state.weights is None
-    known = known and solution.estimated_noise is None and solution.estimated_tolerances is None
+    known = known and solution.estimated_noise is None
     p_value = float(special.chdtrc(dof, chi2)) if known and not problem.rows.counted_as_private else None
     return ChiSquare(chi2, dof, expected, chi2_bounds(dof, expected), p_value)
 

@@ -1,4 +1,4 @@
-r"""Priors: whether corrections contradict their prior sigmas, and scales of these estimated from the corrections.
+r"""Priors: whether corrections contradict their prior sigmas.
 
 A prior says that a parameter is nominal within a prior sigma T. With K the covariance of the estimate, the prior
 residuals `z = (estimate - nominal) / T` of a model that holds have covariance `A = 1 - P K P^T`, P their derivatives: a
@@ -10,32 +10,6 @@ The sum `z^T z` is compared with its mean tr A as sums of squares are in `goodne
 landmark, with rows i of z and A, `z_i^T A_i^-1 z_i` is by how much chi-square falls without its prior. The one whose
 fall is the least likely is taken first, and the others are judged by what is left of z without its prior.
 
-Scales of the prior sigmas are estimated from the corrections by empirical Bayes, iterated with the fit.
-
-Nobody knows how far an arm is from its nominal model; the corrections of all its parameters together tell. With u the
-corrections in units of the specified prior sigmas, the data say of them to first order an information matrix G and a
-vector g: `-(u^T G u) / 2 + g^T u` is their log-likelihood. What has no prior, such as a measurement frame, is
-eliminated. Where u has the variance s^2, s the scale of its group, W = diag(s), `M = 1 + W G W` and `a = M^-1 W g`,
-
-    L(s) = (g^T W a - log det M) / 2
-
-is the likelihood with u integrated out. The estimate is `u = W a`, its covariance W C W with C = M^-1. In theta = log s
-
-    dL / dtheta_k           = sum over k of (a_i^2 + C_ii - 1)
-    d2L / dtheta_k dtheta_l = 4 a_k^T C_kl a_l + 2 |C_kl|^2 - delta_kl 2 sum over k of (a_i^2 + C_ii)
-
-`sum over k of (1 - C_ii)` is how many corrections of a group the data determine.
-
-The scales have priors themselves: all may be off by a common factor, 1 sigma of which is 5 (`COMMON_SIGMA`), and each
-group by another of 3 (`GROUP_SIGMA`). So a group that the data do not determine follows the others, and one of a single
-correction that happens to be nil does not collapse. The posterior of theta is integrated along the axes of its
-curvature at the mode (Laplace), one by one, for it is skew where few corrections are determined. The scale taken is the
-mean. What unknown scales add to the covariance of the corrections is by the law of total variance, with the same
-points: the mean of W C W, minus that at the mean scales, and the covariance of W a.
-
-At each solution the scales are estimated, then everything is solved again with their prior sigmas, until no scale
-moves: two or three rounds where the arm is nearly linear. In others they may oscillate, so steps back are shortened.
-
 References:
     Baarda (1968), A testing procedure for use in geodetic networks. Netherlands Geodetic Commission 2(5).
     Satterthwaite (1946), An approximate distribution of estimates of variance components. Biometrics Bulletin 2(6).
@@ -45,215 +19,15 @@ References:
     Gelman (2006), Prior distributions for variance parameters in hierarchical models. Bayesian Analysis 1(3).
 """
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
 
 import numpy as np
 from scipy import special
 
-from fg_calib import graph, parallel
-from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Probability, Record, SharedScale
-from fg_calib.robot import Parameter, Robot, tolerance_kind
+from fg_calib import graph
+from fg_calib.inputs import Figure, Floats, FrozenArrays, Integers, Probability, Record
+from fg_calib.robot import Parameter
 from fg_calib.statistics.covariance import Spread
-from fg_calib.statistics.variance_components import settle
-
-SETTLED = 1e-3
-"""Relative change of a scale below which it has settled: a hundredth of what it is known to at best."""
-
-COMMON_SIGMA, GROUP_SIGMA = float(np.log(5.0)), float(np.log(3.0))
-"""Prior sigma of the logarithm of a scale: of all together, and of each group."""
-
-STARTS = (0.0, float(np.log(0.1)), float(np.log(10.0)))
-"""Logarithms of all scales that ascents start from: where few corrections are determined there may be two modes."""
-
-GRID = np.linspace(-6.0, 6.0, 25)
-"""Points on an axis over which the posterior is integrated, in sigma."""
-
-LEAST_CURVATURE = 1e-2
-"""Information on the logarithm of a scale, at least: the guess alone holds more."""
-
-GTOL = 1e-6
-"""Largest slope of the logarithm of the posterior at a mode."""
-
-QUANTILE = 1.959963984540054
-"""Half width of the 95 % interval, in sigma."""
-
-
-@parallel.single_threaded
-def estimate_tolerances(
-    problem: graph.Problem, solve_with: Callable[[graph.Problem], graph.Solution] = graph.solve
-) -> graph.Solution:
-    """Estimate the parameters and, with them, a scale on the prior sigmas of each group.
-
-    Args:
-        problem: The problem; its options say what shares a scale, its prior sigmas are where the scales start from.
-        solve_with: Solver at given prior sigmas: `solve`, or `estimate_noise`.
-
-    Returns:
-        The solution with the prior sigmas it ends with, and their scales in its `estimated_tolerances`. It has not
-        converged if the scales have not settled.
-
-    Raises:
-        SolverError: GTSAM could not solve a step at all.
-    """
-    by, specified = problem.options.estimate_tolerance, problem.variables
-    parameters = _prior_parameters(specified)
-    if by is None or problem.evaluated or not parameters:
-        return solve_with(problem)
-    names = [_group_of(problem.robot, p, by) for p in parameters]
-    groups = tuple(dict.fromkeys(names))
-    group = np.array([groups.index(name) for name in names], dtype=np.int64)
-    members = tuple(tuple(p.name for p, k in zip(parameters, group, strict=True) if k == j) for j in range(len(groups)))
-
-    def refit(theta: Floats) -> tuple[graph.Solution, Floats, tuple[Floats, EstimatedScales, Floats]]:
-        solution = solve_with(_with_scales(problem, by, dict(zip(groups, np.exp(theta).tolist(), strict=True))))
-        corrections, follow = _corrections(solution, specified, np.exp(theta)[group], group)
-        found = fit_scales(corrections)
-        return solution, found.mean.theta - theta, (theta, found, follow)
-
-    solution, (theta, found, follow) = settle(refit, len(groups), SETTLED, "tolerances")
-    figures = (v.tolist() for v in (*np.exp([theta, *found.interval]), found.mean.determined))
-    scales = tuple(graph.ToleranceScale(*of) for of in zip(groups, members, *figures, strict=True))
-    added = follow @ found.added_covariance @ follow.T
-    return replace(solution, estimated_tolerances=graph.ToleranceScales(scales, added))
-
-
-class Corrections(Record):
-    """Information of the data on the corrections in prior sigmas.
-
-    Attributes:
-        information: G, shape (n, n).
-        preferred: g, shape (n,).
-        group: Number of the group of each, shape (n,).
-    """
-
-    information: Floats
-    preferred: Floats
-    group: Integers
-
-
-class ScalePosterior:
-    """The corrections at given scales, and the posterior of these.
-
-    Args:
-        corrections: Information of the data on the corrections.
-        theta: Logarithms of the scales, shape (n_groups,).
-
-    Attributes:
-        value: Logarithm of the posterior density.
-        estimate: Of the corrections, shape (n,).
-        covariance: Of the corrections, shape (n, n).
-        determined: How many corrections of each group the data determine, shape (n_groups,).
-        gradient: Of the logarithm of the posterior, shape (n_groups,).
-        hessian: Second derivative of it, shape (n_groups, n_groups).
-    """
-
-    def __init__(self, corrections: Corrections, theta: Floats) -> None:
-        self.theta, n = theta, len(theta)
-        member = np.equal.outer(np.arange(n), corrections.group).astype(np.float64)  # 1 for those of a group
-        prior = np.linalg.inv(COMMON_SIGMA**2 * np.ones((n, n)) + GROUP_SIGMA**2 * np.eye(n))
-        s = np.exp(theta) @ member
-        M = np.eye(len(s)) + s[:, None] * corrections.information * s
-        C = np.linalg.inv(M)
-        right = s * corrections.preferred
-        a = C @ right
-        self.value = float(0.5 * (right @ a - np.linalg.slogdet(M)[1] - theta @ prior @ theta))
-        self.estimate: Floats = s * a
-        self.covariance: Floats = s[:, None] * C * s
-        self.determined: Floats = member @ (1.0 - np.diag(C))
-        square = member @ (a**2 + np.diag(C))
-        self.gradient: Floats = square - member.sum(axis=1) - prior @ theta
-        both = member @ (4.0 * a[:, None] * C * a + 2.0 * C**2) @ member.T
-        self.hessian: Floats = both - np.diag(2.0 * square) - prior
-
-
-class EstimatedScales(Record):
-    """The posterior of the scales.
-
-    Attributes:
-        mean: The corrections at the mean of the logarithms.
-        sigma: 1 sigma of the logarithms, shape (n_groups,).
-        added_covariance: Added covariance of the corrections by unknown scales, shape (n, n).
-    """
-
-    mean: ScalePosterior
-    sigma: Floats
-    added_covariance: Floats
-
-    @property
-    def interval(self) -> tuple[Floats, Floats]:
-        """Lower and upper ends of the 95 % intervals of the logarithms, shape (n_groups,) each."""
-        half = QUANTILE * self.sigma
-        return self.mean.theta - half, self.mean.theta + half
-
-
-def fit_scales(corrections: Corrections) -> EstimatedScales:
-    """The posterior of the scales, about its highest mode.
-
-    Args:
-        corrections: Information of the data on the corrections.
-    """
-
-    def cost(theta: Floats) -> tuple[float, Floats]:
-        at = ScalePosterior(corrections, theta)
-        return -at.value, -at.gradient
-
-    n = int(corrections.group.max(initial=-1)) + 1
-    from scipy.optimize import minimize  # here, for it takes as long to import as a small calibration
-
-    modes = (minimize(cost, np.full(n, start), jac=True, method="BFGS", options={"gtol": GTOL}).x for start in STARTS)
-    mode = max((ScalePosterior(corrections, theta) for theta in modes), key=lambda at: at.value)
-    theta, variance, added = mode.theta, np.zeros(n), mode.covariance
-    curvature, V = np.linalg.eigh(-mode.hessian)
-    for axis in np.linalg.cholesky((V / np.maximum(curvature, LEAST_CURVATURE)) @ V.T).T:
-        points = [ScalePosterior(corrections, mode.theta + t * axis) for t in GRID]
-        density: Floats = np.exp([point.value - mode.value for point in points])
-        w = density / density.sum()
-        mean = float(GRID @ w)
-        theta, variance = theta + mean * axis, variance + axis**2 * ((GRID - mean) ** 2 @ w)
-        estimates, covariance = np.array([point.estimate for point in points]), np.array([p.covariance for p in points])
-        away = estimates - w @ estimates
-        added = added + np.tensordot(w, covariance, 1) - mode.covariance + (w * away.T) @ away
-    at_mean = ScalePosterior(corrections, theta)
-    return EstimatedScales(at_mean, np.sqrt(variance), added - at_mean.covariance)
-
-
-def _corrections(
-    solution: graph.Solution, specified: graph.Variables, scale: Floats, group: Integers
-) -> tuple[Corrections, Floats]:
-    """Information of the data on the corrections in specified prior sigmas, to first order at a solution.
-
-    At the optimum the data pull as hard one way as the priors do the other, so that `g = (G + 1 / scale^2) u`. Where
-    rows share errors but count as independent, g varies by H = G + (what they share) instead of by G: then the data
-    say `G H^-1 G` and `G H^-1 g`.
-
-    Args:
-        solution: The solution.
-        specified: The variables with the specified prior sigmas.
-        scale: Scale of each correction's prior sigma in the solution, shape (n,).
-        group: Number of each one's group, shape (n,).
-
-    Returns:
-        The corrections, and how the columns follow them, shape (n_columns, n).
-    """
-    problem, at = solution.problem, solution.parameters
-    by = specified.prior_scales
-    u, P = graph.prior_rows(specified, at)
-    U, s, Vt = np.linalg.svd(P * by)
-    back, rest = by[:, None] * (Vt[: len(s)].T / s) @ U.T, by[:, None] * Vt[len(s) :].T
-    J = problem.linearize(at).left.A
-    left = graph.eliminate(np.hstack([J @ back, J @ rest]), np.zeros(len(J)), len(u))
-    follow = back + rest @ left.follow
-    G = left.A.T @ left.A
-    g = G @ u + u / scale**2
-    added = graph.correlation(problem, at)
-    if added is not None:
-        values, V = np.linalg.eigh(G + follow.T @ added @ follow)
-        kept = values > graph.RANK_TOLERANCE * values.max(initial=0.0)
-        gain = G @ (V[:, kept] / values[kept]) @ V[:, kept].T
-        G, g = gain @ G, gain @ g
-    return Corrections(G, g, group), follow
-
 
 PRIOR_ALARM = 0.001
 """Probability of calling any single correction of a model that holds too large."""
@@ -379,23 +153,3 @@ def _prior_parameters(variables: graph.Variables) -> list[Parameter]:
     """The parameter of each row of `prior_rows`, in their order."""
     owned = [variables.robot.parameters[i] for v in variables.items if v.kind != "frame" for i in v.parameters]
     return [p for p in owned if p.tolerance is not None] if variables.priors else []
-
-
-def _group_of(robot: Robot, parameter: Parameter, by: SharedScale) -> str:
-    owner = ("base", *(joint.name for joint in robot.joints), "tool")[parameter.owner]
-    return owner if by == "joint" else tolerance_kind(parameter) or f"{owner} angles"
-
-
-def _with_scales(problem: graph.Problem, by: SharedScale, scales: Mapping[str, float]) -> graph.Problem:
-    """The problem from its start, with the tolerances of each group multiplied, those of fixed parameters too.
-
-    Args:
-        problem: The problem.
-        by: Grouping of parameters that share a scale.
-        scales: Factor on the tolerances of each group.
-    """
-    factors = [scales.get(_group_of(problem.robot, p, by), 1.0) for p in problem.robot.parameters]
-    each = zip(problem.robot.parameters, factors, strict=True)
-    parameters = tuple(p if p.tolerance is None else replace(p, tolerance=p.tolerance * f) for p, f in each)
-    robot = replace(problem.robot, parameters=parameters)
-    return graph.with_factors(problem, problem.start, robot=robot, variables=replace(problem.variables, robot=robot))

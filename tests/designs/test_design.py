@@ -7,7 +7,7 @@ import pytest
 from scenarios import INSTRUMENTS, SIGMA, TOLERANCE, WALL, scenario
 from simulated import small_arm
 
-from fg_calib import InputError, Job, Measurements, Options, Pairing, build_problem, calibrate_job, simulate, solve
+from fg_calib import InputError, Job, Options, Pairing, build_problem, calibrate_job, simulate, solve
 from fg_calib.designs.design import design
 from fg_calib.designs.from_job import solve_for_design
 from fg_calib.designs.information import Posterior
@@ -17,7 +17,6 @@ from fg_calib.measurements import Noise
 from fg_calib.prediction import errors_at
 from fg_calib.report.design import build_design_report
 from fg_calib.report.tables import plain_text
-from fg_calib.robot import pose
 from fg_calib.simulation import job_text
 from fg_calib.simulation.obstacles import enters
 from fg_calib.simulation.scenario import Box, Errors, GivenReadings, Instrument, Plane, RandomReadings, Spot
@@ -197,19 +196,6 @@ def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
     job = job_of(Instrument(model="distance", name="it", sockets=5), RandomReadings(12))
     plan = design(job, n=n, n_candidates=40)
     assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
-
-
-def test_tolerances_of_a_plan_are_those_that_its_job_found():
-    """The arm is ten times better than its tolerances say."""
-    rng, arm = np.random.default_rng(1), small_arm(tolerance=TOLERANCE)
-    q = rng.uniform(-1.5, 1.5, (60, 4))
-    off = [0.1 * p.tolerance * rng.normal() if p.estimated else 0.0 for p in arm.parameters]
-    position = pose(arm.with_values(arm.nominal + off), q).position + 1e-4 * rng.normal(size=(60, 3))
-    data = Measurements.from_arrays(q, position=position, sigma_position=1e-4)
-    job = Job(None, arm, data, Options("position", estimate_tolerance="kind"))
-    found, plan = calibrate_job(job), design(job, n=4, n_candidates=20)
-    said = errors_at(found.posterior, plan.task.readings)[plan.task.fitted].position
-    assert plan.before.position == pytest.approx(said, rel=0.02)
 
 
 LENGTHS = Instrument(model="anchor", name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})

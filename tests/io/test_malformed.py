@@ -105,7 +105,7 @@ JOBS = [
     (JOB+"noise: {joint: [0, 0, 0]}\n", "job.yaml: noise: joint: 3 values, expected one for all or 2, one a joint"),
     (JOB+"noise: 1\n", "job.yaml: noise: found 1, expected a mapping"),
     (JOB.replace("pose\n", "anchor\n")+"anchors: {a0: {x: 1, y: 2}}\n", "job.yaml: anchors: a0: missing key 'z' ..."),
-    (JOB+"tolerance: {anchor: 1}\n", "job.yaml: tolerance: unknown key 'anchor', expected one of estimate, targets, anchors ..."),
+    (JOB+"tolerance: {anchor: 1}\n", "job.yaml: tolerance: unknown key 'anchor', expected one of targets, anchors ..."),
     ("robot: robot.yaml\nmeasurements: []\n", "job.yaml: measurements: found [], expected a path, or a list of tables ..."),
     ("robot: robot.yaml\nmeasurements: [{table: poses.csv}]\n", "job.yaml: measurement 1: missing key 'model' ..."),
     ("robot: robot.yaml\nmeasurements: [{model: position}]\n", "job.yaml: measurement 1: missing key 'table' ..."),
