@@ -40,6 +40,9 @@ AMBIGUOUS_SHARE, MAX_AMBIGUOUS_SHARE = 0.05, 0.3
 LARGE_NOISE, MOST_READINGS = 0.2, 1000
 """Estimated noise over the tool's motion, beyond which it is no noise; and configurations of which that is taken."""
 
+GAIN_SCORE = 3.0
+"""Sigma by which squares of test rows must be larger than by the nominal arm: a right arm gains nothing."""
+
 LEAST_GAIN = 1.05
 """Error of test rows with a robust loss, over that of least squares, above which the loss does harm."""
 
@@ -319,14 +322,17 @@ def check_gain(case: Case) -> Iterator[Statement]:
     solution, problem = case.solution, case.problem
     if problem.evaluated or case.fit.goodness.test is None or not case.fit.goodness.test.n:
         return
-    before, after = (_test_misfit(problem, x) for x in (solution.before, solution.parameters))
+    (before, old), (after, new) = (_test_misfit(problem, x) for x in (solution.before, solution.parameters))
+    worse = new - old
+    certain = worse.mean() > GAIN_SCORE * worse.std() / np.sqrt(len(worse))
     text = f"test rows are predicted no better than by the nominal arm ({after:.3g} sigma RMS, {before:.3g} before)"
-    yield Statement("error", f"{text}: the calibration is no gain; keep the nominal arm", after > before)
+    text += ": the calibration is no gain; keep the nominal arm" if certain else ", as far as chance tells"
+    yield Statement("error" if certain else "warning", text, after > before)
     if problem.options.loss != "none":
         plain = replace(problem, options=replace(problem.options, loss="none"))
         plain = with_factors(plain, problem.start, replace(problem.state, weights=None))
         try:
-            least = _test_misfit(problem, solve(plain).parameters)
+            least, _ = _test_misfit(problem, solve(plain).parameters)
         except CalibrationError:  # says nothing of the loss
             return
         text = f"least squares predicts the test rows better ({least:.3g} sigma RMS, {after:.3g} with loss"
@@ -334,11 +340,11 @@ def check_gain(case: Case) -> Iterator[Statement]:
         yield Statement("error", text, after > LEAST_GAIN * least)
 
 
-def _test_misfit(problem: Problem, parameters: Floats) -> float:
-    """RMS of all test rows at a parameter vector, over their noise; 0 where none counts."""
+def _test_misfit(problem: Problem, parameters: Floats) -> tuple[float, Floats]:
+    """RMS of all test rows at a parameter vector, over their noise, and the sum of squares of each measurement's."""
     each = zip(problem.data.blocks, mahalanobis_distances(problem, parameters), strict=True)
     e, n = (np.concatenate(found) for found in zip(*((e[s.test], n[s.test]) for s, (e, n) in each), strict=True))
-    return float(np.sqrt(np.sum(e**2) / max(np.sum(n), 1)))
+    return float(np.sqrt(np.sum(e**2) / max(np.sum(n), 1))), e**2
 
 
 def check_priors(case: Case) -> Iterator[Statement]:
