@@ -94,6 +94,20 @@ def limits_of(*values: Any, with_zero: bool = False) -> tuple[float, float]:
     return (low if with_zero and low == 0.0 else low - room), high + room
 
 
+def without_outliers(values: Floats) -> Floats:
+    """Values, those further than 3 interquartile ranges from the quartiles moved there (Tukey's outer fences)."""
+    if not np.isfinite(values).any():
+        return values
+    low, high = np.nanquantile(values, [0.25, 0.75])
+    room = 3.0 * (high - low) or np.inf
+    return np.clip(values, low - room, high + room)
+
+
+def cut(n: int) -> str:
+    """The end of a caption, if values lie beyond the axis."""
+    return f"; {n} beyond the axis, at its edge" if n else ""
+
+
 Axis = tuple[float, float] | Sequence[str]
 """Range of an axis: values from a lowest to a highest, or names, whose values are 0, 1, 2 ..."""
 

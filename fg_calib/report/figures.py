@@ -14,6 +14,7 @@ from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.tables import figure, in_words, shown_in
 from fg_calib.report.text import ReportData
+from fg_calib.statistics import ParameterEstimate
 
 if TYPE_CHECKING:
     import polars as pl
@@ -35,6 +36,9 @@ MAX_STUDENTISED = 12.0
 
 MIN_TORQUE_RANGE = 1e-6
 """Range of torques that is more than rounding, [N m]."""
+
+MAX_PRIOR = 3.0
+"""Prior sigmas over the largest correction and its sigma, up to which they are drawn."""
 
 WORST = 5
 """Dots that are marked by name."""
@@ -82,15 +86,17 @@ def error_over_joints(data: ReportData) -> Iterator[Chart]:
     (kind, rms), test, ids = data.rms, data.held_out, data.configurations["id"]
     unit = shown_in(data.result.unit_of(kind)).unit
     worst = [k for k in np.argsort(-np.nan_to_num(rms))[:WORST].tolist() if np.isfinite(rms[k])]
+    shown = charts.without_outliers(rms)
+    beyond = charts.cut(int(np.sum(shown < rms)))
     for joint, readings in zip(data.robot.joints, data.readings.T, strict=True):
         q = readings * shown_in(joint.unit).factor
         names = f"{charts.short(joint.name, 40)} [{shown_in(joint.unit).unit}]", f"{kind} residual [{unit}]"
-        plot = Plot(limits_of(q), limits_of(rms, with_zero=True), names)
-        plot.dots(q[~test], rms[~test], "a")
-        plot.dots(q[test], rms[test], "b")
+        plot = Plot(limits_of(q), limits_of(shown, with_zero=True), names)
+        plot.dots(q[~test], shown[~test], "a")
+        plot.dots(q[test], shown[test], "b")
         for k in worst:
-            plot.ring(q[k], rms[k], f"{ids[k]}: {rms[k]:.3g} {unit}")
-        yield plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest")
+            plot.ring(q[k], shown[k], f"{ids[k]}: {rms[k]:.3g} {unit}")
+        yield plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest{beyond}")
 
 
 def _colours(test: Booleans) -> str:
@@ -98,15 +104,17 @@ def _colours(test: Booleans) -> str:
 
 
 def parameter_whiskers(data: ReportData) -> Iterator[Chart]:
-    """Corrections with their sigmas and prior sigmas, lengths and angles apart."""
-    for unit in robot.SCALES:
-        what = {"m": "Lengths", "rad": "Angles"}.get(unit, "Effects of joints")
-        shown = [p for p in data.result.estimated if p.unit == unit and robot.kind_of(p.name) != "curve"]
-        if not shown:
-            continue
+    """Corrections with their sigmas and prior sigmas; each unit, base, tool and effects on axes of their own."""
+    groups = dict[tuple[str, str], list[ParameterEstimate]]()
+    for p in (p for p in data.result.estimated if robot.kind_of(p.name) != "curve"):
+        what = {"base": "Base", "tool": "Tool"}.get(p.name.partition(".")[0], {"m": "Lengths"}.get(p.unit, "Angles"))
+        what = "Effects of joints" if robot.kind_of(p.name) in robot.EFFECT_KINDS else what
+        groups.setdefault((what, p.unit), []).append(p)
+    for (what, unit), shown in groups.items():
         columns = [[p.correction for p in shown], [p.sigma for p in shown], [p.prior_sigma for p in shown]]
         value, sigma, prior = np.array(columns, dtype=np.float64) * shown_in(unit).factor
         name, spread, row = f"[{shown_in(unit).unit}]", np.nan_to_num(sigma), np.arange(float(len(shown)))
+        prior = np.minimum(prior, MAX_PRIOR * (np.max(np.abs(value) + spread) or np.inf))
         limits = limits_of(value - spread, value + spread, [0.0], prior, -prior)
         plot = Plot(limits, [p.name for p in shown], (name, ""))
         for k in np.flatnonzero(np.isfinite(prior)).tolist():
@@ -152,14 +160,16 @@ def errors_over_torque(data: ReportData) -> Iterator[Chart]:
                 continue
             p, factor, ends = known[term.name], shown_in("rad/(N m)").factor, limits_of(tau)
             after, line = errors[:, term.owner - 1] * factor, p.estimate * np.array(ends) * factor
-            before = after + p.estimate * tau * factor
-            limits = limits_of(np.nanquantile([after, before], [0.005, 0.995]), line)
+            taken, kept = p.estimate * tau * factor, charts.without_outliers(after)
+            before, limits = after + taken, limits_of(kept, kept + taken, line)
+            outside = np.any([(e < limits[0]) | (e > limits[1]) for e in (after, before)], axis=0)
             names = f"torque on {charts.short(data.robot.joints[term.owner - 1].name, 30)} [N m]", "error [urad]"
             plot = Plot(ends, limits, names)
             plot.dots(tau, np.clip(before, *limits), "b")
             plot.dots(tau, np.clip(after, *limits), "a")
             plot.curve(np.array(ends), line)
-            yield plot.chart(f"{p.name}: {figure(p.estimate, p.unit, '.3g')} ± {in_words(p.sigma, p.unit, '.2g')}")
+            value = f"{figure(p.estimate, p.unit, '.3g')} ± {in_words(p.sigma, p.unit, '.2g')}"
+            yield plot.chart(f"{p.name}: {value}{charts.cut(int(outside.sum()))}")
 
 
 def joint_errors(data: ReportData) -> Floats | None:

@@ -19,12 +19,11 @@ MAX_ROWS = 40
 
 EXPLANATIONS = {
     text.PARAMETERS: "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the"
-    " prior sigma. Orange: the uncertainty is unknown.",
+    " prior sigma, cut at 3 times the largest of these. Orange: the uncertainty is unknown.",
     text.CURVES: "What joints turn beyond their readings, with a band of 2 sigma to both sides. Dots on the axis are"
     " readings of fitted rows: where there are none, the band is as wide as the prior.",
     "Compliance of joints": "What a joint would have to turn for the tool to be where it was measured, over the torque"
-    " of gravity: blue as calibrated, orange without the joint's compliance (the line). The largest are drawn at the"
-    " edge.",
+    " of gravity: blue as calibrated, orange without the joint's compliance (the line).",
     "Studentised residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1"
     " in 370 is beyond 3.",
     "Error over joint space": "Each dot is a configuration. A trend shows an unmodelled effect of that joint.",

@@ -14,8 +14,8 @@ from simulated import measure, plus, small_arm, true_robot
 from fg_calib import Calibration, calibrate
 from fg_calib.calibration import write_report
 from fg_calib.io.result import FIGURES
+from fg_calib.report import figures
 from fg_calib.report.charts import Scale
-from fg_calib.report.figures import error_curves, errors_over_torque, figures_of, joint_errors
 from fg_calib.report.html import build_page
 from fg_calib.robot import Compliance, ErrorCurve, Mass
 
@@ -117,7 +117,7 @@ def test_names_are_text_and_nothing_else():
 
 
 def test_figures_are_svg_files_of_their_own(folder, made):
-    assert set(figures_of(made.report_data)) <= set(FIGURES)
+    assert set(figures.figures_of(made.report_data)) <= set(FIGURES)
     names = {file.stem for file in folder.glob("*.svg")}
     assert names == {"joints", "parameters", "correlations", "residuals", "workspace"}
     for file in folder.glob("*.svg"):
@@ -154,8 +154,14 @@ def with_effects():
     return calibrate(robot, m, model="pose", frame="unknown")
 
 
+def test_a_gross_row_flattens_no_chart(made):
+    chart = next(figures.error_over_joints(made.report_data))
+    assert chart.caption.endswith("rings the 5 largest; 1 beyond the axis, at its edge")
+    assert list(drawn(chart, "dots a"))[1].max() < 0.5 * made.report_data.rms[1].max()
+
+
 def test_error_curves_are_drawn_with_two_sigma_and_the_readings(with_effects):
-    _, chart = error_curves(with_effects.report_data)
+    _, chart = figures.error_curves(with_effects.report_data)
     c = np.array([with_effects.parameters[f"theta2.curve[{k}]"].estimate for k in range(8)])
     x, y = drawn(chart, "curve")
     knots = np.degrees(np.arange(-4, 5) * np.pi / 4)
@@ -170,11 +176,20 @@ def test_error_curves_are_drawn_with_two_sigma_and_the_readings(with_effects):
 
 
 def test_errors_over_torque_show_the_line_that_the_compliance_takes_away(with_effects):
-    (chart,) = errors_over_torque(with_effects.report_data)
+    (chart,) = figures.errors_over_torque(with_effects.report_data)
     k = with_effects.parameters["theta2.compliance"].estimate * 1e6
     slopes = [np.polyfit(*drawn(chart, kind), 1)[0] for kind in ("curve", "dots b", "dots a")]
     assert k == pytest.approx(100.0, rel=0.1)
     assert slopes == pytest.approx([k, k, 0.0], abs=0.1 * k)
+
+
+def test_a_wide_prior_leaves_corrections_of_other_units_readable(with_effects):
+    wide = [replace(p, prior_sigma=1.0) for p in with_effects.result.parameters]
+    result = with_effects.result.model_copy(update={"parameters": tuple(wide)})
+    *_, chart = figures.parameter_whiskers(replace(with_effects.report_data, result=result))
+    labels = html.fromstring(chart.svg).xpath("//text[@class='tick middle']")
+    assert chart.caption == "Effects of joints: correction [urad/(N m)]"
+    assert 100.0 < float(labels[-1].text) <= 330.0  # three times the compliance of 100 urad/(N m) and its sigma
 
 
 def test_a_loaded_calibration_draws_its_effects_too(with_effects, tmp_path):
@@ -187,7 +202,7 @@ def test_a_loaded_calibration_draws_its_effects_too(with_effects, tmp_path):
 
 
 def test_errors_of_joints_are_measured_minus_predicted(with_effects):
-    assert joint_errors(with_effects.report_data)[40:, 3] == pytest.approx(
+    assert figures.joint_errors(with_effects.report_data)[40:, 3] == pytest.approx(
         1e-3, rel=0.25
     )  # noise and errors of the estimate
 
