@@ -54,6 +54,8 @@ def export(
 
 def show_export(made: Any, out: Path | None, as_json: bool) -> None:
     """Write an `Export` to a new file, or print it; its notes on stderr where they are not in what is printed."""
+    from fg_calib.exports.export import with_names
+
     if out is not None:
         made.write(out)
         say(f"wrote {out}")
@@ -64,4 +66,4 @@ def show_export(made: Any, out: Path | None, as_json: bool) -> None:
         show("\n".join(escaped(line.expandtabs()) if sys.stdout and sys.stdout.isatty() else line for line in lines))
     for note in made.notes:
         if as_json or out is not None or note not in made.text:
-            say(note)
+            say(note if out is None else with_names(note, out.stem))

@@ -1,6 +1,7 @@
 """The door to all formats: a calibration or a robot, and the text that others read."""
 
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, field, fields
 from hashlib import sha256
@@ -67,7 +68,8 @@ class Export(Record):
             InputError: A file is there already, or cannot be written.
         """
         path = Path(path)
-        texts = {path: self.text} | {path.with_name(path.stem + end): text for end, text in self.effects.items()}
+        texts = {path: with_names(self.text, path.stem)}
+        texts |= {path.with_name(path.stem + end): text for end, text in self.effects.items()}
         require_absent(path.parent, [one.name for one in texts])
         for one, text in texts.items():
             write_text(one, text)
@@ -91,6 +93,11 @@ class Export(Record):
 
     def __str__(self) -> str:
         return self.text
+
+
+def with_names(text: str, stem: str) -> str:
+    """Text with the real names of the files of effects next to a file."""
+    return re.sub(r"\*(?=_curves\.csv|_effects\.yaml)", lambda _: stem, text)
 
 
 @checked

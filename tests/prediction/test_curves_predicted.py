@@ -182,6 +182,7 @@ def test_exports_without_effects_write_them_next_to_the_file(calibrated, tmp_pat
     made.write(tmp_path / "arm.yaml")
     geometry = read_robot(tmp_path / "arm.yaml")
     assert not geometry.effects
+    assert "next to it: arm_curves.csv, arm_effects.yaml in rad" in (tmp_path / "arm.yaml").read_text()
     assert tool_points(geometry, q) == pytest.approx(without, abs=1e-9)
     rows = [line.split(",") for line in (tmp_path / "arm_curves.csv").read_text().splitlines()]
     assert rows[0] == ["joint", "angle", "correction"]
