@@ -112,7 +112,7 @@ def test_effects_that_the_arm_has_are_kept_and_others_are_left(tmp_path):
         lines = [line.strip() for line in str(one).splitlines()]
         assert any(line.startswith("compliance of joints 2, 3: p ") and line.endswith(" mm: kept") for line in lines)
         assert any(
-            line.startswith("gain of joints 1, 2, 3, 4: p ") and line.endswith(": left, no evidence") for line in lines
+            line.startswith("gain of joints 1 to 4: p ") and line.endswith(": left, no evidence") for line in lines
         )
     again = Job(None, choosing(arm_with(*LISTED)), measured(curved_and_compliant(1), 2), Options(model="position"))
     assert found.check(again).verdict == "pass"

@@ -84,7 +84,7 @@ def _jobs_table(jobs: "Sequence[fg_calib.batch.JobSummary]", seconds: float) -> 
         reason = "; ".join(job.reasons[:1])
         rows.append((job.name, job.verdict, job.rows, *values, job.reduced_chi2, job.seconds, reason))
     columns = [f"{kind} {shown_in(units[kind]).unit}|{units[kind]}| " for kind in kinds]
-    table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows, wrap=True)
+    table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())
     return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))
 

@@ -40,8 +40,8 @@ def build_comparison_report(comparison: Comparison) -> Group:
         *(line(f"DOUBTFUL: {finding}", "bold red") for finding in comparison.findings),
         line(""),
         table_of(("", "|unit", "nominal|>", *values), _quantities(comparison)),
-        *section("Corrections (± sigma)", table_of(columns, _corrections(comparison), wrap=True)),
-        *section("Estimators", table_of(("", ""), [nominal, *estimators], wrap=True)),
+        *section("Corrections (± sigma)", table_of(columns, _corrections(comparison))),
+        *section("Estimators", table_of(("", ""), [nominal, *estimators])),
         *section("Notes", *_comparison_notes(comparison)),
     )
 
@@ -228,8 +228,8 @@ KINDS = {
     "zero": "zero of a joint",
     "zeros": "zeros of two joints",
     "tool": "the tool",
-    "frame": "the measurement frame, or the base",
-    "row": "gross errors of one configuration",
+    "frame": "frame or base",
+    "row": "gross errors",
 }
 """Change that each kind of explanation is."""
 
@@ -281,12 +281,12 @@ def _rms_errors(found: monitoring.Check) -> Table:
 def _explanations(explanations: Sequence[monitoring.Explanation]) -> Table:
     rows = []
     for e in explanations:
-        word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "no: these rows rule it out"
+        word = "may be" if e.likely and e.not_told_apart_from else "is" if e.likely else "ruled out"
         several = list(zip(e.change, e.sigma, e.units, strict=True)) if len(e.change) < 3 else []
         change = ", ".join(f"{figure(c, unit, '+')} {tables.shown_in(unit).unit}" for c, _, unit in several)
         sigma = ", ".join(figure(s, unit) for _, s, unit in several)
         rows.append((named(e.parameters), KINDS.get(e.kind, ""), change, sigma, e.chi2_drop, e.p_value, word))
-    return table_of(("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", ""), rows, wrap=True)
+    return table_of(("", "", "change|>", "sigma|>", "chi-square falls by|.4g", "p-value|p", ""), rows)
 
 
 def _conclusions(found: monitoring.Check) -> Iterator[str]:

@@ -100,7 +100,7 @@ def _tables(found: Inspection) -> Table:
     columns["of"] = [", ".join(f"{n} {what}" for what, n in t.labels.items()) for t in found.tables]
     columns["residuals to fit"] = [", ".join(f"{n} {k}" for k, n in t.n_residuals.items()) for t in found.tables]
     filled = {heading: cells for heading, cells in columns.items() if any(cells)}
-    return table_of(filled, zip(*filled.values(), strict=True), wrap=True)
+    return table_of(filled, zip(*filled.values(), strict=True))
 
 
 def _joints(found: Inspection) -> Table:
@@ -128,7 +128,7 @@ def _class_table(o: Observability, relative: Sequence[str]) -> Table:
     """Classes of the parameters."""
     classes = {"Independent": o.named("independent"), "Relative": relative, "Ineffective": o.named("ineffective")}
     rows = [(name, ", ".join(members) or "None") for name, members in (classes | {"Kept": o.kept}).items()]
-    return table_of(("Identifiability", "Kinematic parameters"), rows, wrap=True)
+    return table_of(("Identifiability", "Kinematic parameters"), rows)
 
 
 def inspection_document(found: Inspection, job: Job) -> dict[str, Any]:

@@ -163,7 +163,7 @@ def size_table(found: PredictedErrors) -> Table:
         rows += [
             (name, unit, *size.values()) for name, unit, size in zip((frame, ""), ("m", "rad"), sizes, strict=False)
         ]
-    return table_of(("", "|unit", "RMS|q", "median|q", "95 % below|q", "largest|q"), rows, wrap=True)
+    return table_of(("", "|unit", "RMS|q", "median|q", "95 % below|q", "largest|q"), rows)
 
 
 def percentages(found: PredictedErrors) -> Iterator[str]:
@@ -212,7 +212,7 @@ def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
     near = np.where(found.far, "no", "yes").tolist()
     rows = [(names[k], *found.errors.readings[k], *found.expected[k], near[k]) for k in np.argsort(-error).tolist()]
     columns = ("", *tables.joint_columns(robot, ":.2f"), "mm|m", "deg|rad", "near|>")
-    return table_of(columns, rows, wrap=True, most=MAX_LISTED)
+    return table_of(columns, rows, most=MAX_LISTED)
 
 
 def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
@@ -283,7 +283,7 @@ def _target_errors(correction: Correction) -> Table:
             sizes = (np.sqrt(np.mean(known**2)), known.max()) if len(known) else (None, None)
             rows.append((ERRORS[of] if kind == "position" else "", *sizes, POSE_KINDS[kind]))
     rows.append(("the same after the best rigid fit of all targets", correction.expected_fitted, "", "m"))
-    return table_of(("error at the targets", "RMS|q|-", "largest|q|-", "|unit"), rows, wrap=True)
+    return table_of(("error at the targets", "RMS|q|-", "largest|q|-", "|unit"), rows)
 
 
 def _commands(ids: Sequence[str], correction: Correction, robot: Robot) -> Table:
@@ -291,7 +291,7 @@ def _commands(ids: Sequence[str], correction: Correction, robot: Robot) -> Table
     before, after = correction.uncorrected[:, 0], np.hypot(correction.missed[:, 0], correction.expected[:, 0])
     rows = [(*of, b, a) for *of, b, a in zip(ids, *correction.readings.T, before, after, strict=True)]
     columns = ("target", *tables.joint_columns(robot), "before mm|m|-", "after mm|m|-")
-    return table_of(columns, rows, wrap=True, most=MAX_LISTED)
+    return table_of(columns, rows, most=MAX_LISTED)
 
 
 def _assumed(robot: Robot) -> Iterator[str]:

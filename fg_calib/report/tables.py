@@ -3,12 +3,15 @@
 import io
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pydantic_core import to_json
-from rich.console import Console, Group, RenderableType
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -21,6 +24,9 @@ from fg_calib.robot import SCALES, Robot, Scale, unit_of
 WEAK = "sigma above a tenth of the prior sigma, or of 1 mrad at the reach"
 WEAKLY = f"Weakly determined ({WEAK})"
 """The definition of a weak direction, for headings."""
+
+BETWEEN = 2
+"""Blanks between the columns of a table."""
 
 WIDTH = 100
 """Columns of a report that is not printed to a terminal."""
@@ -88,6 +94,21 @@ class Section(inputs.Record):
         return [str(part.caption or "") if isinstance(part, Table) else str(part) for part in self.content]
 
 
+class NarrowTable(Table):
+    """A table that cuts no word: where room is scarce the widest columns wrap, each to its `min_width` at most."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table, its columns as wide as the room allows."""
+        shown, room = copy(self), options.max_width - BETWEEN * (len(self.columns) - 1)
+        sizes = [(c.min_width or 0, max(cell_len(str(cell)) for cell in (c.header, *c.cells))) for c in self.columns]
+        most = max((full for _, full in sizes), default=0)
+        while most and sum(min(full, max(least, most)) for least, full in sizes) > room:
+            most -= 1
+        widths = (min(full, max(least, most)) for least, full in sizes)
+        shown.columns = [replace(c, width=width) for c, width in zip(self.columns, widths, strict=True)]
+        return Table.__rich_console__(shown, console, options)
+
+
 def _part(content: Content) -> RenderableType:
     return Padding(line(content), (0, 0, 0, 2)) if isinstance(content, str) else content
 
@@ -103,10 +124,8 @@ def report(*parts: Section | Content) -> Group:
     return Group(*(part if isinstance(part, Section) else _part(part) for part in parts))
 
 
-def table_of(
-    columns: Iterable[str], rows: Iterable[Sequence[Any]], *, wrap: bool = False, most: int | None = None
-) -> Table:
-    """A table without a frame, for the terminal and the page.
+def table_of(columns: Iterable[str], rows: Iterable[Sequence[Any]], *, most: int | None = None) -> Table:
+    """A table without a frame, for the terminal and the page; text in it wraps where the terminal is narrow.
 
     Args:
         columns: Of each column `heading|form|unknown`: how its values are shown, and what stands for one that is not
@@ -120,21 +139,23 @@ def table_of(
 
             Without any heading there is no heading row.
         rows: Values; text stands for itself in every column.
-        wrap: Whether cells wrap at spaces where the terminal is narrow.
         most: Rows that are shown; a line below says how many more there are.
     """
     parts = [tuple(f"{column}||".split("|")[:3]) for column in columns]
-    show_header = any(heading for heading, _, _ in parts)
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="italic", show_header=show_header)
+    table = NarrowTable(box=None, pad_edge=False, padding=(0, BETWEEN, 0, 0), header_style="italic")
+    table.show_header = any(heading for heading, _, _ in parts)
     for heading, form, _ in parts:
         justify: Literal["left", "right"] = "left" if form in ("", "unit") else "right"
-        table.add_column(line(heading), justify=justify, no_wrap=not wrap, overflow="fold")
+        table.add_column(line(heading), justify=justify, overflow="fold")
     at, rows = next((k for k, (_, form, _) in enumerate(parts) if form == "unit"), 0), list(rows)
     if most is not None and len(rows) > most:
         table.caption, table.caption_justify = line(f"and {len(rows) - most} more"), "left"
     for row in rows[:most]:
         cells = zip(row, parts, strict=True)
         table.add_row(*(_cell(value, form, unknown, str(row[at])) for value, (_, form, unknown) in cells))
+    for column, (_, form, _) in zip(table.columns, parts, strict=True):
+        words = " ".join(map(str, column.cells)).split() if form in ("", ">") else map(str, column.cells)
+        column.min_width = max(map(cell_len, (*str(column.header).split(), *words)), default=0)
     return table
 
 
@@ -189,7 +210,7 @@ def lost_directions(lost: Sequence[LostDirection]) -> Table:
     for direction in lost:
         by_reason.setdefault(direction.reason, []).append(format_relation(direction.relation))
     rows = [(", ".join(relations), reason) for reason, relations in by_reason.items()]
-    return table_of(("", "because"), rows, wrap=True)
+    return table_of(("", "because"), rows)
 
 
 def format_sum(factors: Mapping[str, float]) -> str:
@@ -215,7 +236,7 @@ def weak_directions(observability: Observability, most: int = 5) -> Table:
     for weak in observability.weak:
         members = ", ".join(f"{name} {share:+.2f}" for name, share in list(weak.members.items())[:6])
         rows.append((1.0 / weak.signal_to_noise if weak.signal_to_noise > 0.0 else None, members))
-    return table_of(("sigma / prior|.3g|unknown", "largest members"), rows, wrap=True, most=most)
+    return table_of(("sigma / prior|.3g|unknown", "largest members"), rows, most=most)
 
 
 def joint_columns(robot: Robot, form: str = "") -> list[str]:

@@ -204,7 +204,7 @@ def _goodness(result: Result, robot: Robot) -> list[Content]:
     columns = ("", "|unit", "specified|q|-", f"{estimated}|q|-", "ratio|.3f", "p-value|p", "")
     level = f"no row (|studentised residual| above {result.suspect_level:.2f}) and no configuration is suspicious"
     none = not result.suspect_configurations and not any(fit.n_beyond for fit in fits)
-    return [table_of(columns, rows, wrap=True), *([level] if none and np.isfinite(result.suspect_level) else [])]
+    return [table_of(columns, rows), *([level] if none and np.isfinite(result.suspect_level) else [])]
 
 
 def _estimated_noise(result: Result, key: str) -> str:
@@ -220,7 +220,7 @@ def _prediction(result: Result) -> Iterator[Content]:
     ratios = [(k.n, k.observed_over_specified / k.factor, k.p_value) for k in fit.kinds]
     words = [statistics.PREDICTION_VERDICTS[k.verdict] for k in fit.kinds]
     rows = [(_named(result, k), *of, word) for k, of, word in zip(fit.kinds, ratios, words, strict=True)]
-    yield table_of(("", "rows|d", "ratio|.3f", "p-value|p", ""), rows, wrap=True)
+    yield table_of(("", "rows|d", "ratio|.3f", "p-value|p", ""), rows)
     if fit.n_outliers:
         yield f"{fit.n_outliers} of {fit.n_measurements} measurements do not count: outliers by the loss"
     if fit.n_unknown:
@@ -251,10 +251,14 @@ def _cross_validation(result: Result) -> list[Section]:
 def _effects(result: Result) -> Iterator[str]:
     """What was found of each effect that was tried."""
     for one in result.effects:
-        where = f" of joint{'s' * (len(one.joints) > 1)} {', '.join(map(str, one.joints))}" * bool(one.joints)
+        joints, n = ", ".join(map(str, one.joints)), len(one.joints)
+        if n > 2 and one.joints[-1] - one.joints[0] == n - 1:
+            joints = f"{one.joints[0]} to {one.joints[-1]}"
+        where = f" of joint{'s' * (n > 1)} {joints}" * bool(joints)
         rms = f"{figure(one.folds_before, one.unit, '.3g')} -> {in_words(one.folds_after, one.unit)}"
+        p = f"p {one.p_value:.0e}" if one.p_value > 1e-300 else "p < 1e-300"
         outcome = "kept" if one.kept else f"left, {one.reason}"
-        yield f"{one.effect.replace('_', ' ')}{where}: p {max(one.p_value, 1e-300):.0e}, folds {rms}: {outcome}"
+        yield f"{one.effect.replace('_', ' ')}{where}: {p}, folds {rms}: {outcome}"
 
 
 def expected_tool_error(expected: prediction.ExpectedError | None) -> list[Section]:
@@ -321,7 +325,7 @@ def _error_curves(result: Result) -> Table:
 def _combinations(result: Result) -> Table:
     sums = [(p, tables.format_sum(p.stands_for)) for p in result.parameters if p.stands_for]
     rows = [(p.name, p.sigma_of_combination, p.unit, words) for p, words in sums]
-    return table_of(("", "sigma|q", "|unit", "of the sum"), rows, wrap=True)
+    return table_of(("", "sigma|q", "|unit", "of the sum"), rows)
 
 
 def _suspicious_rows(residuals: "pl.DataFrame | None", split: str, most: int) -> list[Table]:

@@ -8,6 +8,7 @@ from reported import format_report
 from simulated import measure, planar_robot, plus, small_arm, true_robot
 
 from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
+from fg_calib.report.tables import plain_text, table_of
 
 
 def planar_arm(tolerance=None) -> Robot:
@@ -137,6 +138,15 @@ def test_doubt_stands_first():
     assert "axes 1 and 2 are parallel" in text.partition("Notes")[2]
     assert "noise specified too small" in text
     assert "GOOD" not in text
+
+
+def test_where_the_terminal_is_narrow_no_word_and_no_value_is_cut():
+    row, heads = ("theta2.compliance", "errors of a configuration", -0.123, "ruled out"), ("", "", "change|rad", "a b")
+    for width in range(20, 110, 10):
+        text = plain_text(table_of(heads, [row]), width)
+        words = f"change a b {row[0]} {row[1]} -7.04738 {row[3]}".split()
+        assert sorted(text.split()) == sorted(words)
+        assert max(map(len, text.splitlines())) <= max(width, 17 + 13 + 8 + 5 + 3 * 2)  # of the longest words
 
 
 def test_names_in_brackets_are_text():
