@@ -237,8 +237,7 @@ class Calibration(Record, repr=False, eq=False):
     @property
     def measured(self) -> Floats | None:
         """Readings of the measured configurations, shape (n, n_joints), [rad] (prismatic: [m]); None if not saved."""
-        table = self.configurations
-        return None if table is None else table.select(f"q{i + 1}" for i in range(self.robot.n_joints)).to_numpy()
+        return None if self.configurations is None else self.report_data.readings
 
     @property
     def report_data(self) -> ReportData:

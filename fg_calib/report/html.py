@@ -94,8 +94,13 @@ def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:
     rows = "of an evaluation" if result.evaluated_only else "held out" if data.split == "test" else "fitted"
     for kind, rms in result.residual_rms[data.split].items():
         if rms is not None and ", table" not in kind:
-            unit = result.unit_of(kind)
-            yield in_words(rms.after, unit), f"{kind}, rows {rows}; before: {in_words(rms.before, unit)}"
+            unit, found = result.unit_of(kind), data.quantiles(kind)
+            after, before = in_words(rms.after, unit), in_words(rms.before, unit)
+            if found is None:
+                yield after, f"{kind}, rows {rows} (RMS); before: {before}"
+            else:
+                most = f"95 % below {in_words(found[1], unit)}, RMS {after}"
+                yield in_words(found[0], unit), f"{kind}, median of rows {rows}; {most}; before: RMS {before}"
     if result.expected_error is not None:
         frame = "fitted" if result.free_of_frame else "base"
         for kind, unit in POSE_KINDS.items():
