@@ -37,7 +37,7 @@ MAX_STUDENTISED = 12.0
 MIN_TORQUE_RANGE = 1e-6
 """Range of torques that is more than rounding, [N m]."""
 
-MAX_PRIOR = 3.0
+MAX_PRIOR = 1.5
 """Prior sigmas over the largest correction and its sigma, up to which they are drawn."""
 
 WORST = 5
@@ -317,7 +317,7 @@ def arm_scene(data: ReportData) -> Mapping[str, Any] | None:
     kind, rms = data.rms
     evenly = np.linspace(0, len(rms) - 1, min(300, len(rms))).astype(np.int64)
     chosen = np.unique(np.concatenate([evenly, np.argsort(-np.nan_to_num(rms))[:20]]))
-    low, high = np.nanquantile(rms[chosen], [0.0, 0.98]).tolist()
+    low, high = np.nanquantile(charts.without_outliers(rms), [0.0, 1.0]).tolist()
     items = [
         {
             "id": data.configurations["id"][k],

@@ -19,7 +19,7 @@ MAX_ROWS = 40
 
 EXPLANATIONS = {
     text.PARAMETERS: "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the"
-    " prior sigma, cut at 3 times the largest of these. Orange: the uncertainty is unknown.",
+    " prior sigma, cut at 1.5 times the largest of these. Orange: the uncertainty is unknown.",
     text.CURVES: "What joints turn beyond their readings, with a band of 2 sigma to both sides. Dots on the axis are"
     " readings of fitted rows: where there are none, the band is as wide as the prior.",
     "Compliance of joints": "What a joint would have to turn for the tool to be where it was measured, over the torque"
