@@ -85,6 +85,8 @@ def eliminate(A: Floats, b: Floats, n_core: int) -> Eliminated:
     of the landmark columns that nothing determines stay where they are.
     """
     core, landmarks = A[:, :n_core], A[:, n_core:]
+    if not landmarks.size:
+        return Eliminated(np.zeros(0), core, b, np.zeros((0, n_core)), lambda y: y, np.zeros(0, dtype=np.bool_))
     Q, inverse, unknown = _basis_of(landmarks)
     explained = Q.T @ core
     left = core - Q @ explained

@@ -459,15 +459,16 @@ def prior_rows(variables: Variables, parameters: Floats, only: Variable | None =
         parameters: The parameter vector.
         only: The variable whose priors are wanted; all if None.
     """
-    nominal, r, J = variables.nominal(), [np.zeros(0)], [np.zeros((0, variables.n_columns))]
-    for v in variables.items if only is None else (only,):
+    items, nominal = variables.items if only is None else (only,), variables.nominal()
+    n = sum(len(variables.prior_weights[v.key][0]) for v in items)
+    r, J, after = np.zeros(n), np.zeros((n, variables.n_columns)), 0
+    for v in items:
         with_prior, weight = variables.prior_weights[v.key]
+        rows = slice(after, after := after + len(with_prior))
         x, of = parameters[v.places], nominal[v.places]
         off, D = _off_nominal(x, of) if v.is_pose else (x - of, np.eye(len(x)))
-        r.append(weight * off[with_prior])
-        J.append(np.zeros((len(with_prior), variables.n_columns)))
-        J[-1][:, v.columns] = weight[:, None] * D[with_prior]
-    return np.concatenate(r), np.vstack(J)
+        r[rows], J[rows, v.columns] = weight * off[with_prior], weight[:, None] * D[with_prior]
+    return r, J
 
 
 def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
