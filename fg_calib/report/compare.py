@@ -103,6 +103,8 @@ def _comparison_notes(comparison: Comparison) -> Iterator[str]:
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """The document `comparison.json`: SI, full precision, None for what is unknown or infinite.
 
+    ::
+
         { "schema": "fg-calib/comparison/1", "version", "robot", "model", "frame", "pairing",
           "judged_on": "test" | "train", "n_judged", "truth_known", "trustworthy", "findings",
           "nominal": {"residual_rms": {split: {kind: RMS | null}}, "errors": errors | null},
