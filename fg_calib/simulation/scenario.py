@@ -32,7 +32,6 @@ configurations:                       # where the calibration measures; one of
   table: configurations.csv           #   the joint readings of a table
   keep_out: [{lower: [-1, -1, -1], upper: [1, 1, 0]}]   # with any of them: boxes in the base frame that nothing of
                                       #   the arm may be inside: its joints, the lines between them, the tool point
-  apart: 5                            #   and by how much some joint must differ between two; default: nothing
 noise: {position: 0.001, orientation: 0.01, joint: 0.005}   # 1 sigma; joint noise moves the arm, not the table
 temperature: [15, 30]                 # drawn evenly for each configuration where an effect of the robot has a column
                                       #   of temperatures; so are sides of approach, -1 or 1, where it has such columns
@@ -49,9 +48,8 @@ instruments:                          # what measures, a table each; default: po
   - {model: distance, name: sockets, sockets: 4}
   - {model: distance, name: caliper, pairs: {random: 30}}
 ```
-Where `tracker`, `keep_out`, `apart` or `board_size` stand, configurations are drawn until all are found; else the
-reasons are reported. In `apart` a prismatic joint counts as its share of the arm's reach, in rad. With `instruments`
-the `job` has no model or pairing of its own. A design needs no `errors`.
+Where `tracker`, `keep_out` or `board_size` stand, configurations are drawn until all are found; else the reasons are
+reported. With `instruments` the `job` has no model or pairing of its own. A design needs no `errors`.
 
 | key of an instrument | for | meaning |
 |---|---|---|
@@ -284,12 +282,9 @@ class Conditions:
 
     Attributes:
         keep_out: Boxes that nothing of the arm may be inside, see `obstacles.enters`.
-        apart: Least distance of two configurations, [rad]: the largest difference of a joint; a prismatic joint counts
-            as its share of the arm's reach. None: any.
     """
 
     keep_out: tuple[InBox, ...] = Field(default=(), kw_only=True)
-    apart: PositiveAngle | None = Field(default=None, kw_only=True)
 
 
 @schema
@@ -398,7 +393,7 @@ def _configurations(given: Any, context: FileContext) -> Configurations:
     key, found = _the_one_of({key: getattr(file, key) for key in ("board", "tracker", "random", "table")})
     if key == "table":
         found = GivenReadings(io.read_measurements(context.folder / found, context.robot, units=context.units).readings)
-    return cast("Configurations", replace(found, keep_out=file.keep_out, apart=file.apart))
+    return cast("Configurations", replace(found, keep_out=file.keep_out))
 
 
 def _the_one_of(given: Mapping[str, Any]) -> tuple[str, Any]:

@@ -1,7 +1,7 @@
 """Configurations: poses that a camera or a tracker could see, or random ones, with the reasons why others are rejected.
 
-Poses are drawn and brought within reach by inverse kinematics. A pose that the arm does not reach, a configuration that
-is in a box, and one that is near another are rejected, and counted by reason.
+Poses are drawn and brought within reach by inverse kinematics. A pose that the arm does not reach, and a configuration
+that is in a box, are rejected, and counted by reason.
 """
 
 from collections import Counter
@@ -23,10 +23,7 @@ Words = NDArray[np.str_]
 Draw = Callable[[int, int], tuple[Floats, Words]]
 """Draws n configurations after m others, shape (n, n_joints), with why each is rejected, "" where it is not."""
 
-REASONS = (
-    *("outside the joint limits", "not seen", "out of range", "outside the region", "out of reach", "in keep_out"),
-    "near another",
-)
+REASONS = ("outside the joint limits", "not seen", "out of range", "outside the region", "out of reach", "in keep_out")
 """Why a configuration, or a pose, is rejected; of several reasons the first."""
 
 WORD = f"<U{max(map(len, REASONS))}"
@@ -94,7 +91,6 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
     most, hopeless = MAX_DRAWN_EACH * patience * n, MAX_DRAWN_IN_VAIN * patience
     if isinstance(of, GivenReadings):
         most = hopeless = len(of.readings)
-    unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
     taken, asked = np.empty((0, robot.n_joints)), 0
     counts: Counter[str] = Counter()
     while len(taken) < n and asked < most and (len(taken) or asked < hopeless):
@@ -103,8 +99,6 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
         readings, reason = draw(min(k, MAX_DRAWN_AT_ONCE, most - asked), asked)
         good = np.flatnonzero(reason == "")
         reason[good[enters(robot, readings[good], of.keep_out)]] = "in keep_out"
-        good = np.flatnonzero(reason == "")
-        reason[good[_near(taken / unit, readings[good] / unit, of.apart)]] = "near another"
         good = np.flatnonzero(reason == "")[: n - len(taken)]
         k = int(good[-1]) + 1 if len(taken) + len(good) == n else len(reason)  # none after the last that is wanted
         taken, asked = np.concatenate([taken, readings[good]]), asked + k
@@ -164,21 +158,6 @@ def _target(robot: Robot, views: TargetViews, generator: np.random.Generator, k:
         inside = (target >= views.region.lower) & (target <= views.region.upper)
         reason[~inside.all(axis=1)] = "outside the region"
     return readings, reason
-
-
-def _near(taken: Floats, readings: Floats, apart: float | None) -> Booleans:
-    """Which configurations are near one taken before, or before them, shape (n,).
-
-    Args:
-        taken: Configurations taken before, shape (m, n_joints), [rad] (prismatic: share of the reach).
-        readings: Further ones, shape (n, n_joints).
-        apart: Least distance of two, as `Conditions` has it; None: any.
-    """
-    near = np.zeros(len(readings), dtype=np.bool_)
-    for k, q in enumerate(readings if apart is not None else ()):
-        near[k] = bool(np.any(np.abs(taken - q).max(axis=1) < apart))
-        taken = taken if near[k] else np.vstack([taken, q])
-    return near
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
@@ -261,7 +240,7 @@ def find_readings(robot: Robot, of: Configurations, generator: np.random.Generat
     Raises:
         InputError: There are not so many that meet their conditions.
     """
-    conditions = bool(of.keep_out) or of.apart is not None or isinstance(of, TargetViews)
+    conditions = bool(of.keep_out) or isinstance(of, TargetViews)
     if isinstance(of, BoardViews) and not conditions and of.board_size is None:
         return _reach_views(robot, of, generator, f"{place}: board")
     if isinstance(of, GivenReadings) and not conditions:

@@ -84,23 +84,6 @@ def test_what_no_joint_moves_and_what_touches_is_not_in_the_way():
     assert enters(flat, on_the_floor, [Box([-9, -9, -1], [9, 9, 1e-6])]).all()
 
 
-# --- apart ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("robot", [ARM, small_arm()], ids=lambda robot: robot.name)
-def test_all_are_apart_and_none_was_rejected_for_nothing(robot):
-    """As one by one: each that is not near one taken before is taken. More than 1024 make several parts."""
-    unit = np.array([robot.reach if joint.prismatic else 1.0 for joint in robot.joints])
-    q = random_readings(robot, 1100, np.random.default_rng(2))
-    found = draw(robot, GivenReadings(q), apart=1.2)
-    taken = q[:1]
-    for row in q[1:]:
-        if np.abs((taken - row) / unit).max(axis=1).min() >= 1.2:
-            taken = np.concatenate([taken, [row]])
-    assert found.readings.tolist() == taken.tolist()
-    assert found.rejected == {"near another": 1100 - len(taken)}
-
-
 # --- what a camera sees -----------------------------------------------------------------------------------------------
 
 

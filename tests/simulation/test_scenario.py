@@ -102,7 +102,6 @@ def test_a_tracker_has_every_value_in_the_units_of_the_file(folder):
   tracker: {station: {x: 3000, z: 1500}, target: {y: 50}, axis: [0, 1, 0], acceptance: 40, distance: [1000, 8000],
             region: {lower: [0, -500, 0], upper: [1000, 500, 2000]}, count: 7}
   keep_out: [{lower: [-1000, -1000, -1000], upper: [1000, 1000, 0]}, {below: -500}, {box: [[0, 0, 0], [1, 1, 1]]}]
-  apart: 5
 """
     s = read(folder, "units: {length: mm, angle: deg}\n" + SHORT.replace(RANDOM, text))
     t = s.configurations
@@ -111,7 +110,6 @@ def test_a_tracker_has_every_value_in_the_units_of_the_file(folder):
     assert (t.region.lower.tolist(), t.region.upper.tolist()) == ([0, -0.5, 0], [1, 0.5, 2])
     boxes = [(box.lower.tolist(), box.upper.tolist()) for box in t.keep_out]
     assert boxes == [([-1, -1, -1], [1, 1, 0]), ([-1e6] * 3, [1e6, 1e6, -0.5]), ([0, 0, 0], [1e-3] * 3)]
-    assert t.apart == pytest.approx(math.radians(5))
 
 
 def test_values_are_converted_and_instruments_named(folder):
