@@ -258,30 +258,37 @@ class Compliance(Effect, Record):
             terms.append(Term(name, 1e-4, i + 1, _moving(robot, i)[0] - 1, axis))
         if self.gravity == "estimate":
             names = ("base.tilt_x", "base.tilt_y", "")
-            terms += [_own(robot, i, "", 2e-2, -1)._replace(name=name, owner=0) for name in names for i in joints]
+            terms += [t._replace(name=name, sigma=2e-2, owner=0) for t in terms for name in names]
         return terms
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         joints = _joints(robot, self.joints, "compliance")
-        gravity, n, tilts = np.array(GRAVITY if self.gravity == "estimate" else self.gravity), len(joints), np.zeros(2)
+        gravity, tilts = np.array(GRAVITY if self.gravity == "estimate" else self.gravity), np.zeros(2)
         if self.gravity == "estimate":
-            tilts = at[[-3 * n, -2 * n]]
+            tilts = at[-3:-1]
         along = gravity + np.cross([*tilts, 0.0], gravity)
         own = self._torques(robot, readings, context, joints, along)
         if np.any(at[: own.shape[1]]):  # as the joints have turned
             counts = [len(self._loads(robot, i)) or 1 for i in joints]
             readings = readings.copy()
             readings[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
-            own = self._torques(robot, readings, context, joints, along)
-        parts = [own]
-        if self.lateral and self.masses is not None:
-            moments = _Moments(robot, readings, context, along, self.masses)
-            parts += [moments.of_masses(_moving(robot, i)[0])[:, :2] for i in joints]
-        if self.gravity == "estimate":  # tau is linear in gravity, so k tau is in either of both
-            turned = [np.cross(e, gravity) for e in np.eye(3)[:2]]
-            moved = [at[:n] * self._torques(robot, readings, context, joints, g) for g in turned]
-            parts += [*moved, -(tilts[0] * moved[0] + tilts[1] * moved[1])]
+        parts = [self._moments(robot, readings, context, joints, along)]
+        if self.gravity == "estimate":  # moments are linear in gravity, so k M is in either of both
+            turned = (np.cross(e, gravity) for e in np.eye(3)[:2])
+            each = [self._moments(robot, readings, context, joints, g) for g in turned]
+            x, y = (at[: m.shape[1]] * m for m in each)
+            parts.append(np.stack([x, y, -tilts[0] * x - tilts[1] * y], axis=2).reshape(len(x), -1))
         return _with_slopes(np.hstack(parts))
+
+    def _moments(
+        self, robot: Robot, readings: Floats, context: Context, joints: Sequence[int], gravity: Floats
+    ) -> Floats:
+        """Torques, and where joints tilt too the moments across their axes, shape (n, n_own + n_lateral)."""
+        parts = [self._torques(robot, readings, context, joints, gravity)]
+        if self.lateral and self.masses is not None:
+            moments = _Moments(robot, readings, context, gravity, self.masses)
+            parts += [moments.of_masses(_moving(robot, i)[0])[:, :2] for i in joints]
+        return np.hstack(parts)
 
     def _torques(
         self, robot: Robot, readings: Floats, context: Context, joints: Sequence[int], gravity: Floats

@@ -92,11 +92,12 @@ def test_joints_give_way_to_equilibrium(arm):
     assert np.abs(found - turned).max() < 0.02 * largest  # third order in k
 
 
-def test_a_tilt_of_gravity_is_that_of_the_base(arm):
-    k, tilts = np.array([1e-5, 2e-5, 3e-5, 4e-5]), [0.02, -0.03]
+@pytest.mark.parametrize("lateral", [False, True])
+def test_a_tilt_of_gravity_is_that_of_the_base(arm, lateral):
+    k, tilts = np.linspace(1e-5, 4e-5, 12 if lateral else 4), [0.02, -0.03]
     gravity = np.array([0.0, 0.0, -9.81])
-    tilted = Compliance(MASSES, gravity=gravity + np.cross([*tilts, 0.0], gravity))
-    estimated = arm.with_effects(Compliance(MASSES, gravity="estimate"))
+    tilted = Compliance(MASSES, lateral=lateral, gravity=gravity + np.cross([*tilts, 0.0], gravity))
+    estimated = arm.with_effects(Compliance(MASSES, lateral=lateral, gravity="estimate"))
     estimated = estimated.with_values([*arm.nominal, *k, *tilts])
     expected = arm.with_effects(tilted).with_values([*arm.nominal, *k])
     found = tool_points(estimated, Q)
