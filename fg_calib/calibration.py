@@ -616,6 +616,7 @@ def correct(
     calibration: Calibration,
     position: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
+    context: Context | None = None,
     *,
     near: ArrayLike | None = None,
     world: bool = False,
@@ -628,6 +629,7 @@ def correct(
         position: Where the tool point is to be, shape (n, 3), or (3,) of one target, [m]. If None the targets are the
             poses of the nominal arm at `near`: what a program of joint values was meant to reach.
         rotation: Orientations wanted, shape (n, 3, 3), or (3, 3); any if None.
+        context: What effects depend on besides at the targets, such as temperatures, a row each: see `Robot.trig`.
         near: Joint values to stay near, shape (n, n_joints) or (n_joints,), [rad] (prismatic: [m]): of an arm that
             reaches a target in several ways they choose one. If None that is the first that is found, searched for from
             the middle of the limits and, where that leads nowhere, from anywhere.
@@ -642,7 +644,7 @@ def correct(
         raise InputError("world", "joint values reach poses in the base frame", "targets with positions")
     number = calibration.table_in_world(table, world=world)
     posterior, nominal = calibration.posterior, calibration.nominal
-    return correct_targets(posterior, calibration.robot, nominal, position, rotation, near=near, table=number)
+    return correct_targets(posterior, calibration.robot, nominal, position, rotation, context, near=near, table=number)
 
 
 @checked

@@ -53,7 +53,8 @@ def correct(
         io.require_absent(out.parent, [out.name])
     found, units = calibration.Calibration.load(result), io.Units(length, angle)
     wanted = io.read_targets(targets, found.robot, units)
-    commands = correct_targets(found, wanted.position, wanted.rotation, near=wanted.readings, world=world, table=table)
+    where, near = (wanted.position, wanted.rotation, wanted.context), wanted.readings
+    commands = correct_targets(found, *where, near=near, world=world, table=table)
     if out is not None:
         report.write_commands(out, wanted.ids, commands, found.robot, units)
     document = partial(report.correction_document, found.robot.name, wanted.ids, commands)

@@ -585,9 +585,13 @@ def read_joint_table(
     """
     table = read_table(path, robot)
     readings = read_readings(table, find_joint_columns(table, robot), robot, units or Units())
+    return tuple(read_ids(table, repeated=True).tolist()), readings, _read_context(table, robot, readings)
+
+
+def _read_context(table: Table, robot: Robot, readings: Floats | None) -> Context:
+    """What effects depend on besides readings, where a table has it."""
     context = [effect.context(robot, readings, partial(_numbers_if_any, table)) for effect in robot.effects]
-    given = {name: values for one in context for name, values in one.items() if not np.isnan(values).all()}
-    return tuple(read_ids(table, repeated=True).tolist()), readings, given
+    return {name: values for one in context for name, values in one.items() if not np.isnan(values).all()}
 
 
 def _numbers_if_any(table: Table, columns: Sequence[str]) -> Floats:
@@ -604,12 +608,14 @@ class Targets(FrozenArrays):
         position: Of the tool point, shape (n, 3), [m]; None where the table holds joint values alone.
         rotation: Of the tool, shape (n, 3, 3); None where the table states none.
         readings: Joint values to stay near, shape (n, n_joints), [rad] (prismatic: [m]); None where there are none.
+        context: What effects depend on besides, such as temperatures, where the table has it.
     """
 
     ids: tuple[str, ...]
     position: Floats | None
     rotation: Floats | None
     readings: Floats | None
+    context: Context
 
 
 @checked
@@ -635,7 +641,8 @@ def read_targets(path: Path | str | Any, robot: Robot, units: Units | None = Non
         found = "neither x y z nor joint columns" if rotation is None else "orientations without x y z"
         raise InputError(table.name, found, "x y z, or joint values alone", f"it has {', '.join(table.columns)}")
     readings = read_readings(table, find_joint_columns(table, robot), robot, units) if named else None
-    return Targets(tuple(read_ids(table, repeated=False).tolist()), position, rotation, readings)
+    ids = tuple(read_ids(table, repeated=False).tolist())
+    return Targets(ids, position, rotation, readings, _read_context(table, robot, readings))
 
 
 # --- columns of configurations ----------------------------------------------------------------------------------------

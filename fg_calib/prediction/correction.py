@@ -20,7 +20,18 @@ from numpy.typing import ArrayLike
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations
 from fg_calib.measurements import check_readings
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
-from fg_calib.robot import N_STARTS, REACHED, Inverse, Robot, build_chain, forward, rotation_vector, solve_inverse
+from fg_calib.robot import (
+    N_STARTS,
+    REACHED,
+    Context,
+    Inverse,
+    Robot,
+    build_chain,
+    context_at,
+    forward,
+    rotation_vector,
+    solve_inverse,
+)
 from fg_calib.statistics import TangentCovariance
 
 LARGE_CHANGE = 0.1
@@ -50,6 +61,7 @@ class Correction(FrozenArrays, eq=False):
         expected_fitted: RMS position error after the best rigid fit of all targets, which needs no base, [m];
             nan where it is not determined.
         turns: Whether the targets have an orientation.
+        context: Whether it is known what effects depend on besides.
     """
 
     readings: Floats
@@ -61,6 +73,7 @@ class Correction(FrozenArrays, eq=False):
     expected: Floats
     expected_fitted: float
     turns: bool
+    context: bool
 
     @cached_property
     def reached(self) -> Booleans:
@@ -79,6 +92,7 @@ def correct_targets(
     nominal: Robot,
     position: ArrayLike | None = None,
     rotation: ArrayLike | None = None,
+    context: Context | None = None,
     *,
     near: ArrayLike | None = None,
     table: int | None = None,
@@ -92,6 +106,7 @@ def correct_targets(
         position: Tool points wanted, shape (n, 3), or (3,) of one target, [m]. If None the targets are the poses of the
             nominal arm at `near`.
         rotation: Orientations wanted, shape (n, 3, 3), or (3, 3); any if None.
+        context: What effects depend on besides at the targets, a row each: see `Robot.trig`.
         near: Joint values to stay near, shape (n, n_joints) or (n_joints,), [rad] (prismatic: [m]). If None the first
             solution is taken, searched for from the middle of the limits, then from anywhere.
         table: Number of the table in whose measurement frame the targets are; the base frame if None.
@@ -109,15 +124,16 @@ def correct_targets(
         uncorrected = first.readings
         off[first.miss_position >= REACHED] = np.nan
         off[first.miss_rotation >= REACHED, 1] = np.nan
-    off += np.column_stack(misses(robot, uncorrected, target, turned))
-    found = reach(robot, target, turned, uncorrected)
+    off += np.column_stack(misses(robot, uncorrected, target, turned, context))
+    found = reach(robot, target, turned, uncorrected, context)
     commanded = forward(build_chain(nominal), nominal.trig(found.readings))
-    covariance = predict_poses(posterior, found.readings, table)[2]
+    covariance = predict_poses(posterior, found.readings, table, context)[2]
     variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(-1, 2, 3).sum(axis=2)
-    fitted = errors_at(posterior, found.readings)[1].position
+    fitted = errors_at(posterior, found.readings, context)[1].position
     missed, expected = np.column_stack([found.miss_position, found.miss_rotation]), np.sqrt(variance)
     at, whole = (commanded.position, commanded.rotation), np.nan if fitted is None else fitted
-    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, turned is not None)
+    more = (turned is not None, bool(context))
+    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, *more)
 
 
 def _check_targets(
@@ -159,7 +175,15 @@ def _in_base(
     return (position - (world[0][0] - R @ base[0][0])) @ R, None if rotation is None else R.T @ rotation
 
 
-def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats, *, anywhere: bool = False) -> Inverse:
+def reach(
+    robot: Robot,
+    position: Floats,
+    rotation: Floats | None,
+    near: Floats,
+    context: Context | None = None,
+    *,
+    anywhere: bool = False,
+) -> Inverse:
     """Configurations at poses, near given ones; the nearest orientation where only the point is in reach.
 
     Args:
@@ -167,6 +191,7 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats,
         position: base_p_tool, shape (n, 3), [m].
         rotation: base_R_tool, shape (n, 3, 3); any if None.
         near: Configurations to stay near, shape (n, n_joints), [rad] (prismatic: [m]).
+        context: What effects depend on besides: see `Robot.trig`.
         anywhere: Whether these are starts alone, and any configuration will do.
 
     Returns:
@@ -174,14 +199,14 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats,
     """
     if robot.effects:
         first = reach(robot.geometry, position, rotation, near, anywhere=anywhere).readings
-        found = solve_inverse(robot, position, rotation, near=first, n_starts=1)
+        found = solve_inverse(robot, position, rotation, context, near=first, n_starts=1)
         q, rows = found.readings.copy(), np.flatnonzero(~found.reached)
-        points = solve_inverse(robot, position[rows], near=first[rows], n_starts=1)
+        points = solve_inverse(robot, position[rows], None, context_at(context, rows), near=first[rows], n_starts=1)
         q[rows] = points.readings
         if rotation is not None:
             for k in rows[points.reached]:
-                q[k] = _rotate(robot, q[k], position[k], rotation[k])
-        return Inverse(q, *misses(robot, q, position, rotation))
+                q[k] = _rotate(robot, q[k], position[k], rotation[k], context_at(context, slice(k, k + 1)))
+        return Inverse(q, *misses(robot, q, position, rotation, context))
 
     def solve(rows: Integers, near: Floats | None, n_starts: int) -> Inverse:
         turned = None if rotation is None else rotation[rows]
@@ -202,7 +227,9 @@ def reach(robot: Robot, position: Floats, rotation: Floats | None, near: Floats,
     return Inverse(q, *misses(robot, q, position, rotation))
 
 
-def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | None) -> tuple[Floats, Floats]:
+def misses(
+    robot: Robot, readings: Floats, position: Floats, rotation: Floats | None, context: Context | None = None
+) -> tuple[Floats, Floats]:
     """Distances of the tool from points and angles from orientations, shapes (n,), [m] and [rad].
 
     Args:
@@ -210,25 +237,26 @@ def misses(robot: Robot, readings: Floats, position: Floats, rotation: Floats | 
         readings: Shape (n, n_joints), [rad] (prismatic: [m]).
         position: Shape (n, 3), [m].
         rotation: Shape (n, 3, 3); if None any will do, and the angle is 0.
+        context: What effects depend on besides: see `Robot.trig`.
     """
-    at = forward(build_chain(robot), robot.trig(readings))
+    at = forward(build_chain(robot), robot.trig(readings, context))
     distance = np.linalg.norm(position - at.position, axis=1)
     if rotation is None:
         return distance, np.zeros(len(distance))
     return distance, np.linalg.norm(rotation_vector(rotation @ np.swapaxes(at.rotation, 1, 2)), axis=1)
 
 
-def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats) -> Floats:
+def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context: Context | None = None) -> Floats:
     """The configuration nearest in orientation with the tool point in place, from one whose point is there."""
     from scipy.optimize import least_squares  # here, for it takes as long to import as a small calibration
 
     chain = build_chain(robot)
 
     def misses(q: Floats) -> Floats:
-        at = forward(chain, robot.trig(q[None]))
+        at = forward(chain, robot.trig(q[None], context))
         turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
         return np.concatenate([(at.position - position)[0] * _WEIGHT, turn[0]])
 
     best = least_squares(misses, q, jac="3-point", bounds=tuple(robot.limits.T), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
-    found = solve_inverse(robot, position, near=best, n_starts=1)
+    found = solve_inverse(robot, position, None, context, near=best, n_starts=1)
     return found.readings[0] if found.reached[0] else q

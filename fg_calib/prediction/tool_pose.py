@@ -21,7 +21,7 @@ from fg_calib.graph import Problem, build_variables
 from fg_calib.inputs import Floats, FrozenArrays, Integers, Record
 from fg_calib.measurements import Dataset
 from fg_calib.observability import ObservedQuantities
-from fg_calib.robot import Chain, Context, forward, without_rigid_motion
+from fg_calib.robot import Chain, Context, context_at, forward, without_rigid_motion
 from fg_calib.statistics import TangentCovariance
 
 MAX_CONFIGURATIONS = 1000
@@ -80,7 +80,7 @@ def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedE
     """
     judged, at = judged_configurations(problem.data)
     chosen = _evenly(judged)
-    context = {name: values[chosen] for name, values in problem.data.context.items()}
+    context = context_at(problem.data.context, chosen)
     base, fitted = errors_at(covariance, problem.data.readings[chosen], context)
     return ExpectedError(base, fitted, at, len(chosen), len(judged), ObservedQuantities.of(problem).blind_to_base)
 
@@ -109,7 +109,7 @@ def errors_at(
     """
     every = np.arange(len(readings))
     few = _evenly(every) if len(covariance.curves) else every
-    there = {name: values[few] for name, values in (context or {}).items()}
+    there = context_at(context, few)
     points, motion, _ = tool_derivatives(covariance, base_chain(covariance), readings[few], there)
     return pose_rms(points, motion, covariance.variance)
 
@@ -271,7 +271,7 @@ class ToolPoseUncertainty(FrozenArrays):
         n, context = len(readings), context or {}
         position, base, fitted, noise = np.empty((n, 3)), np.empty((n, 2)), np.empty((n, 2)), np.zeros((n, 2))
         for rows in _chunks(n):
-            there = readings[rows], {name: values[rows] for name, values in context.items()}
+            there = readings[rows], context_at(context, rows)
             position[rows], motion, of_joints = tool_derivatives(self.covariance, self.chain, *there)
             base[rows] = self._rms(motion)
             fitted[rows] = self._rms(self._without_fit(position[rows], motion))

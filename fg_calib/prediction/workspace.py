@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, Record
 from fg_calib.prediction.tool_pose import ToolErrors, ToolPoseUncertainty
-from fg_calib.robot import Context, Robot, pose, random_readings, unit_of
+from fg_calib.robot import Context, Robot, context_at, pose, random_readings, unit_of
 from fg_calib.statistics import TangentCovariance
 
 QUANTILES: Mapping[str, float] = {"median": 0.5, "p95": 0.95, "largest": 1.0}
@@ -187,7 +187,7 @@ def predict_errors(
 
 def _worst(found: PredictedErrors, row: int) -> WorstConfiguration:
     """The error ellipsoid and the responsible parameters at one configuration."""
-    model, there = found.model, {name: values[row : row + 1] for name, values in found.context.items()}
+    model, there = found.model, context_at(found.context, slice(row, row + 1))
     errors = model.at(found.errors.readings[row : row + 1], there)
     v = model.motions(errors.readings, there, fitted=found.fitted)[0, 3:]
     size, axes = np.linalg.eigh(model.covariance.covariance(v))

@@ -300,7 +300,7 @@ def _assumed(robot: Robot) -> Iterator[str]:
 
 
 def _correction_notes(ids: Sequence[str], correction: Correction, robot: Robot) -> Iterator[str]:
-    yield from _assumed(robot)
+    yield from () if correction.context else _assumed(robot)
     yield "Give the controller the joint positions; or the poses that --out writes, with its nominal model unchanged."
     point = correction.missed[:, 0] < 1e-9
     doubts = {

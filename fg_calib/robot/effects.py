@@ -358,13 +358,17 @@ class Backlash(Effect, Record):
             return _with_slopes(np.sign(of._torques(robot, readings, context, joints, gravity)))
         return _with_slopes(context.get(self.side, np.zeros(readings.shape))[:, joints])
 
-    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+    def context(self, robot: Robot, readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
         if self.side == "load":
             return super().context(robot, readings, read)
         if self.side != "moves":
-            joints, sides = _joints(robot, self.joints, "backlash"), np.full(readings.shape, np.nan)
-            sides[:, joints] = read([f"{self.side}{i + 1}" for i in joints])
+            joints = _joints(robot, self.joints, "backlash")
+            given = read([f"{self.side}{i + 1}" for i in joints])
+            sides = np.full((len(given), robot.n_joints), np.nan)
+            sides[:, joints] = given
             return {self.side: sides}
+        if readings is None:
+            return {}
         sides, moves = np.zeros(readings.shape), np.diff(readings, axis=0)
         for k, move in enumerate(moves):
             sides[k + 1] = np.where(np.abs(move) < LEAST_MOVE, sides[k], np.sign(move))
@@ -438,7 +442,7 @@ class Thermal(Effect, Record):
         lengths = [p.nominal for *_, p in self._lengths(robot)]
         return _with_slopes(warmer[:, None] * np.array(lengths + [1.0] * len(self._drifting(robot))))
 
-    def context(self, robot: Robot, readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+    def context(self, robot: Robot, readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
         return {self.column: read([self.column])[:, 0]}
 
 

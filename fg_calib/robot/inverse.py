@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from fg_calib.inputs import Booleans, Brief, Floats, Integers, as_floats, as_rotations, check_number, checked
 from fg_calib.robot.kinematics import build_chain, forward
-from fg_calib.robot.model import Robot
+from fg_calib.robot.model import Context, Robot, context_at
 from fg_calib.robot.rotations import rotation_vector
 
 REACHED = 1e-9
@@ -70,6 +70,7 @@ def solve_inverse(
     robot: Robot,
     position: ArrayLike,
     rotation: ArrayLike | None = None,
+    context: Context | None = None,
     *,
     near: ArrayLike | None = None,
     generator: np.random.Generator | None = None,
@@ -82,6 +83,7 @@ def solve_inverse(
         robot: The robot, at its nominal values.
         position: base_p_tool, shape (n_poses, 3), or (3,) of one pose, [m].
         rotation: base_R_tool, shape (n_poses, 3, 3), or (3, 3) of one pose; any if None.
+        context: What effects depend on besides, a row a pose: see `Robot.trig`.
         near: Configuration to start from, shape (n_joints,) or (n_poses, n_joints), [rad] (prismatic: [m]), for
             solutions that stay near it; further starts are drawn ever wider about it. Random starts if None.
         generator: Draws the starts; one seeded with 0 if None.
@@ -103,7 +105,7 @@ def solve_inverse(
     check_number("n_steps", n_steps, least=1, whole=True)
     n_poses = len(position)
     starts = _starts(robot, near, (n_poses, n_starts, robot.n_joints), generator)
-    search = _Search(robot, rotation, position)
+    search = _Search(robot, rotation, position, context)
     pending = np.arange(n_poses)  # rows still to be solved, and where each of them stands
     tried, steps = np.zeros(n_poses, dtype=np.int64), np.zeros(n_poses, dtype=np.int64)
     q = starts[:, 0].copy()  # (n_poses, n_joints)
@@ -140,9 +142,9 @@ def _starts(robot: Robot, near: ArrayLike | None, shape: tuple[int, ...], genera
 class _Search:
     """Misses and steps towards poses, lengths over the arm's length so that they weigh like angles."""
 
-    def __init__(self, robot: Robot, rotation: Floats | None, position: Floats) -> None:
+    def __init__(self, robot: Robot, rotation: Floats | None, position: Floats, context: Context | None) -> None:
         self._chain = build_chain(robot).with_joint_columns()
-        self._robot = robot
+        self._robot, self._context = robot, context
         self._rotation, self._position = rotation, position
         self._lower, self._upper = robot.limits.T
         self._low, self._high = _range_of_starts(robot)
@@ -159,7 +161,7 @@ class _Search:
             Pose minus tool, shape (n, 6), rotation vector first, about and along the base's axes; and the
             derivative, each joint in its own unit of step, shape (n, 6, n_joints).
         """
-        at = forward(self._chain, self._robot.trig(q))
+        at = forward(self._chain, self._robot.trig(q, context_at(self._context, rows)))
         shift = (self._position[rows] - at.position) / self.length
         jacobian = at.jacobian * self._unit
         jacobian[:, 3:] /= self.length

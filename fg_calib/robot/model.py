@@ -19,7 +19,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib import inputs
-from fg_calib.inputs import NEAR, Floats, InputError, as_floats, check_names, checked, escaped, listed, shape_of, shown
+from fg_calib.inputs import (
+    NEAR,
+    Floats,
+    InputError,
+    Integers,
+    as_floats,
+    check_names,
+    checked,
+    escaped,
+    listed,
+    shape_of,
+    shown,
+)
 from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
 
 MOST_JOINTS = 200
@@ -216,6 +228,11 @@ class Term(NamedTuple):
     joint: int = -1
 
 
+def context_at(context: Context | None, rows: Integers | slice) -> Context:
+    """What else was measured at some of the configurations."""
+    return {name: values[rows] for name, values in (context or {}).items()}
+
+
 class Effect(ABC):
     """What an arm does beyond its geometry: a sum of terms, each a coefficient times a function of the readings."""
 
@@ -257,12 +274,13 @@ class Effect(ABC):
             at: Values of the terms' coefficients, shape (n_terms,).
         """
 
-    def context(self, robot: "Robot", readings: Floats, read: Callable[[Sequence[str]], Floats]) -> Context:
+    def context(self, robot: "Robot", readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
         """What else the values depend on, for the rows of a table: of loads the masses that the rows have.
 
         Args:
             robot: The robot.
-            readings: Joint readings in the rows' order, shape (n, n_joints), [rad] (prismatic: [m]).
+            readings: Joint readings in the rows' order, shape (n, n_joints), [rad] (prismatic: [m]); None if the table
+                has none.
             read: Columns of the table, shape (n, k), by their names.
         """
         return {m.column: read([m.column])[:, 0] for m in getattr(self, "masses", None) or () if m.column}
@@ -438,6 +456,9 @@ class Robot(inputs.Record):
         shape = shape_of("readings", readings, expected)
         if len(shape) != 2 or shape[1] != self.n_joints:
             raise InputError("readings", f"shape {shape}", expected)
+        for name, given in (context or {}).items():
+            if len(given) != shape[0]:
+                raise InputError(f"context {name}", f"{len(given)} rows", f"{shape[0]}, one a configuration")
         prismatic = np.array([j.prismatic for j in self.joints])
         trig = np.empty((*shape, 2))
         np.cos(readings, out=trig[:, :, 0])

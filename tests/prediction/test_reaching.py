@@ -1,6 +1,7 @@
 """Reaching: held to 4x4 products and, where a pose is out of reach, to scipy's own optimum."""
 
 import numpy as np
+import polars as pl
 import pytest
 from exported import UR10, scara, seven
 from oracle import tool_pose
@@ -9,9 +10,10 @@ from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import Robot
+from fg_calib.io import read_targets
 from fg_calib.prediction import correction
 from fg_calib.prediction.correction import reach
-from fg_calib.robot import REACHED, pose, random_readings
+from fg_calib.robot import REACHED, Thermal, pose, random_readings
 
 NEAR = np.array([0.3, -0.4, 0.1, 0.5])
 
@@ -50,3 +52,19 @@ def test_no_target_that_can_be_reached_is_missed_although_nobody_says_from_where
     middle = np.tile(robot.limits.mean(axis=1), (2000, 1))
     assert reach(robot, at.position, at.rotation, middle, anywhere=True).reached.all()
     assert reach(robot, at.position, None, middle, anywhere=True).reached.all()
+
+
+def test_targets_are_reached_at_the_temperature_of_their_rows():
+    """By the arm whose lengths are those of that temperature, one part of a table warm, the other cold."""
+    warm = UR.with_effects(Thermal())
+    values = warm.nominal.copy()
+    values[[p.kind.startswith("expansion") for p in warm.parameters]] = 2e-5
+    q = 0.4 * random_readings(UR, 4, np.random.default_rng(3))
+    at, temperature = pose(UR, q), np.array([10.0, 45.0, 45.0, 10.0])
+    columns = {**dict(zip("xyz", at.position.T, strict=True)), "temperature": temperature}
+    found = read_targets(pl.DataFrame(columns), warm).context
+    reached = reach(warm.with_values(values), at.position, at.rotation, q, found)
+    for row, T, point in zip(reached.readings, temperature, at.position, strict=True):
+        grown = [[a * (1 + 2e-5 * (T - 20)), alpha, d * (1 + 2e-5 * (T - 20)), z] for a, alpha, d, z, *_ in UR10]
+        assert tool_pose(Robot.from_dh(grown, "dh"), row)[:3, 3] == pytest.approx(point, abs=1e-9)
+        assert np.linalg.norm(tool_pose(UR, row)[:3, 3] - point) > 1e-5

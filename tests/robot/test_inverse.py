@@ -104,7 +104,7 @@ def test_what_a_joint_at_its_limit_cannot_do_the_others_do():
     robot, q = Robot.from_dh([[1.0, 0, 0, 0]] * 3, "dh", limits=[[-1.0, 1.0], None, None]), np.array([[1.0, 0.5, 0.5]])
     for way in (1.0, -1.0):
         target = pose(robot, q + way * np.array([[1e-4, 1e-4, 1e-4]])).position
-        search = _Search(robot, None, target)
+        search = _Search(robot, None, target, None)
         moved = search.step(q, *search.look(q, np.array([0])))
         assert np.linalg.norm(pose(robot, moved).position - target) < 1e-6
         assert (moved[0, 0] == 1.0) == (way > 0.0)
