@@ -182,3 +182,6 @@ def rms(values: ArrayLike) -> float:
 def clean(axes: Axes) -> None:
     """Remove the frame above and on the right."""
     axes.spines[["top", "right"]].set_visible(False)
+    for axis in (axes.xaxis, axes.yaxis):
+        if axis.get_scale() in ("log", "symlog"):
+            axis.set_major_formatter("{x:g}")

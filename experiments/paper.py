@@ -311,10 +311,13 @@ def draw_residuals(found: Row, path: Path) -> None:
         for (who, marker, colour), shift in zip(styles, (-0.22, 0.0, 0.22), strict=True):
             axes.plot(x + shift, row[who] / largest, marker, color=colour, label=who, fillstyle="none", ms=5)
         axes.set_yscale("symlog", linthresh=0.3)
-        axes.set_ylabel("residual over\n10 mm or 0.05 deg")
-        axes.set_title(MODELS[model], loc="left", fontsize=10)
+        axes.set_ylabel("error left\nover its bound")
+        axes.set_title(f"calibrated by {MODELS[model]}", loc="left", fontsize=10)
         clean(axes)
-    panels[0].legend(ncols=3, frameon=False, fontsize=9)
+    figure.suptitle("Error of each parameter that is left, over its bound before (10 mm or 0.05 deg): Tables 7 to 9")
+    panels[0].legend(
+        *panels[0].get_legend_handles_labels(), loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False
+    )
     panels[2].set_xticks(x, row["names"], rotation=60)
     figure.savefig(path, dpi=100)
 
@@ -371,12 +374,13 @@ def draw_validation(found: Row, path: Path) -> None:
             e = np.array(errors) / MM
             line.semilogy(e, color=colour, lw=0.8, label=f"{label}: mean {e.mean():.2g} mm")
             bars.hist(e, bins=np.geomspace(0.02, 60, 50), color=colour, histtype="step")
-        line.set_title(who, loc="left", fontsize=10)
-        line.set(xlabel="validation configuration", ylabel="position error [mm]")
-        line.legend(ncols=4, frameon=False, fontsize=8)
-        bars.set(xscale="log", xlabel="position error [mm]", ylabel="configurations")
+        line.set_title(f"by {'the factor graph' if who == 'graph' else who}", loc="left", fontsize=10)
+        line.set(xlabel="validation configuration", ylabel="tool error [mm]")
+        line.legend(ncols=2, frameon=False, loc="upper right", bbox_to_anchor=(1.0, 1.22), fontsize=9)
+        bars.set(xscale="log", xlabel="tool error [mm]", ylabel="configurations")
         clean(line)
         clean(bars)
+    figure.suptitle("Tool error of the paper's arm at 500 configurations, by what was measured: Figures 9 and 10")
     figure.savefig(path, dpi=100)
 
 

@@ -192,18 +192,28 @@ def answer(found: Row) -> str:
     return f"{text}. Fastest accurate package takes {ratios or '-'}"
 
 
+TITLES = {
+    "poses": "60 simulated poses",
+    "compliance": "60 simulated poses, joints that give way",
+    "distances": "300 simulated distances",
+    "many": "5000 simulated poses",
+    "real": "real poses by a laser tracker",
+}
+
+
 def draw(found: Row, path: Path) -> None:
     """Draw time and error of every peer."""
     shown = {peer: row for peer, row in found["peers"].items() if "over optimum" in row}
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     times, errors = figure.subplots(1, 2, sharey=True)
     for k, row in enumerate(shown.values()):
-        times.plot(row["seconds"], k, "o", color=COLOURS[0])
+        times.plot(1e3 * row["seconds"], k, "o", color=COLOURS[0])
         errors.plot(row["over optimum"], k, "o", color=COLOURS[1])
     times.set_yticks(range(len(shown)), list(shown))
     times.invert_yaxis()
-    times.set(xscale="log", xlabel="processor time of the solve [s]")
-    errors.set(xlabel="error over that of whitened least squares")
+    times.set(xscale="log", xlabel="processor time [ms]")
+    errors.set(xlabel="tool error over that of whitened least squares")
+    figure.suptitle(f"A UR10, {TITLES[path.stem.removeprefix('peers_')]}: left is better")
     for axes in (times, errors):
         axes.grid(axis="x", alpha=0.3)
         clean(axes)

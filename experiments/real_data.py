@@ -171,6 +171,7 @@ def draw_ur10(found: Row, path: Path) -> None:
         axes.set(xlabel=f"{kind} error of test poses [{name}]", ylabel="test poses")
         axes.legend(frameon=False)
         clean(axes)
+    figure.suptitle("A real UR10 by a laser tracker, poses that were not fitted: geometry before and after calibration")
     figure.savefig(path, dpi=120)
 
 

@@ -39,7 +39,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from common import MM, Question, Row, Task, by_cell, rms, run
+from common import COLOURS, MM, Question, Row, Task, by_cell, clean, rms, run
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
@@ -394,6 +395,23 @@ def instruments_answer(found: Row) -> str:
     return f"RMS tool error, mm, at {' / '.join(map(str, POSES))} poses: {', '.join(cells)}"
 
 
+def draw_instruments(found: Row, path: Path) -> None:
+    """Draw the tool error of every instrument over the number of poses."""
+    figure = Figure(figsize=(8, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for way, marker, colour in zip(INSTRUMENTS, "osD^vP*", (*COLOURS, "0.3"), strict=True):
+        axes.loglog(
+            POSES, [found[f"{way}, {n} poses"]["tool mm"] for n in POSES], marker + "-", color=colour, label=way
+        )
+    axes.set(xlabel="poses measured", ylabel="tool error after calibration, RMS [mm]")
+    axes.set_xticks(POSES, map(str, POSES), minor=False)
+    axes.minorticks_off()
+    axes.set_title("A simulated UR10: accuracy by instrument and number of poses", loc="left", fontsize=11)
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    clean(axes)
+    figure.savefig(path, dpi=110)
+
+
 def anchor_cells() -> dict[str, Cell]:
     """Forty lengths to each of three unknown anchors, without priors on the arm and with them."""
     return {
@@ -584,7 +602,7 @@ QUESTIONS = (
     Question("landmarks", "And with every instrument's unknown places?", draws("landmarks"), draw, summarise,
              warned_answer, (50, 1)),
     Question("instruments", "Which instrument for how many poses?", draws("instruments"), draw, summarise,
-             instruments_answer, (10, 1)),
+             instruments_answer, (10, 1), draw_instruments),
     Question("anchors", "Is a calibration by lengths to unknown anchors as good as it can be?", draws("anchors"), draw,
              summarise, anchors_answer, (100, 1)),
     Question("outliers", "Does gnc survive gross errors?", cells_and_seeds("outliers"), outlier_draw, outlier_summary,

@@ -4,7 +4,7 @@
 
 Every record holds the rows of a few tasks. They are worked out again, and each number is compared: to 1e-6 relative,
 or 1e-3 for counts and times of steps that rounding may change (iterations, p-values, gaps of singular values). Exit
-status 1 if any differs. `--ledger` writes README.md from the records instead.
+status 1 if any differs. `--ledger` writes README.md from the records instead, and draws their figures.
 """
 
 from __future__ import annotations
@@ -71,6 +71,16 @@ def verify(script: str) -> bool:
     return good
 
 
+def draw_figures() -> None:
+    """Draw every figure from its record."""
+    for script in SCRIPTS:
+        file = RESULTS / f"{script}.json"
+        record: Row = json.loads(file.read_text()) if file.is_file() else {}
+        for question in importlib.import_module(script).QUESTIONS:
+            if question.figure is not None and question.name in record:
+                question.figure(record[question.name]["found"], RESULTS / f"{script}_{question.name}.png")
+
+
 def ledger() -> str:
     """README.md from the records: the question, its answer, the command and what made it."""
     lines = [HEAD]
@@ -81,7 +91,8 @@ def ledger() -> str:
         for of in record.values():
             made = f"{of['commit']}, {of['date']}"
             lines.append(f"| {of['question']} | {of['answer']} | `{of['command']}` | {made} |\n")
-        lines += [f"\n![{png.stem}](results/{png.name})\n" for png in sorted(RESULTS.glob(f"{script}*.png"))]
+        names = ((png, png.stem.removeprefix(f"{script}_")) for png in sorted(RESULTS.glob(f"{script}_*.png")))
+        lines += [f"\n![{record[name]['question']}](results/{png.name})\n" for png, name in names if name in record]
         lines.append("\n")
     notes = HERE / "notes.md"
     return "".join(lines) + (notes.read_text() if notes.is_file() else "")
@@ -94,6 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--ledger", action="store_true", help="write README.md from the records")
     given = parser.parse_args(arguments)
     if given.ledger:
+        draw_figures()
         (HERE / "README.md").write_text(ledger())
         return 0
     present = [script for script in given.only if (RESULTS / f"{script}.json").is_file()]
