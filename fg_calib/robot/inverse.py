@@ -88,14 +88,13 @@ def solve_inverse(
             solutions that stay near it; further starts are drawn ever wider about it. Random starts if None.
         generator: Draws the starts; one seeded with 0 if None.
         n_starts: How many starts are tried for each pose.
-        n_steps: How many steps are made from each.
+        n_steps: How many steps from each.
 
     Raises:
         InputError: A target, or where to start, is not of such a shape, not finite, or no rotation.
 
     Note:
-        That no start ends at a pose does not prove that none could. The result of one pose does not depend on the
-        others but for the starts: these are drawn pose by pose, so the first ones agree.
+        That no start ends at a pose does not prove that none could. Starts are drawn pose by pose.
     """
     position = as_floats("position", np.atleast_2d(position), "(n, 3)")
     if rotation is not None:
