@@ -55,9 +55,6 @@ MOST_ESTIMATED = 2.0
 MAX_NOISE_FACTOR = 5.0
 """Estimated over specified noise above which one asks why."""
 
-MAX_PRIOR_SCALE = 10.0
-"""Estimated over specified prior sigma above which one asks why."""
-
 NAMED = 3
 """Configurations, rows or parameters that a statement names."""
 
