@@ -90,7 +90,6 @@ class Check(Record):
         deploy: Whether to go on: with the calibration as it is, or with the change that explains the rows.
         detectable: Joint offset changes that these rows would show in 9 of 10 cases, [rad] (prismatic: [m]);
             None where they show none at all.
-        advice: Measurements to distinguish the two likeliest changes; None where there is nothing to.
     """
 
     verdict: Verdict
@@ -107,7 +106,6 @@ class Check(Record):
     gross_rows: tuple[str, ...]
     deploy: bool
     detectable: dict[str, float | None]
-    advice: hypotheses.Advice | None = None
 
 
 def check_rows(calibrated: Calibrated, rows: Rows, limits: Limits) -> Check:
@@ -175,8 +173,8 @@ def _judge(
     tested = (verdict, tuple(reasons), tuple(cautions), n, at.chi2, at.dof, p_value)
     sizes = ({kind: one.after for kind, one in rms.items()}, noise, limit)
     deploy = verdict == "pass" or (verdict == "fail" and alone and explained)
-    detectable, advice = _detectable(calibrated, found), hypotheses.advise_configurations(at, likely)
-    made = Check(*tested, *sizes, _explanations(found, likely), tuple(gross), deploy, detectable, advice)
+    explanations, detectable = _explanations(found, likely), _detectable(calibrated, found)
+    made = Check(*tested, *sizes, explanations, tuple(gross), deploy, detectable)
     return made if explained or verdict != "fail" else _unless_misread(made, at)
 
 
@@ -188,7 +186,7 @@ def _unless_misread(found: Check, at: Linear) -> Check:
     named = tuple(str(one) for one in reporting(checks) if one.explanations)
     if not named:
         return found
-    nothing = replace(found, cautions=(), explanations=(), gross_rows=(), advice=None)
+    nothing = replace(found, cautions=(), explanations=(), gross_rows=())
     return replace(nothing, verdict="not_evaluated", reasons=named, deploy=False)
 
 

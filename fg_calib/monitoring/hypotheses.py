@@ -16,8 +16,6 @@ hypothesis, where that is above 1, and an F test judges what a hypothesis explai
 
 Hypotheses that move the tool alike everywhere, but for less than the noise of one row, are one: nothing distinguishes
 them, nor needs to.
-
-What to measure next are the random configurations where the two likeliest changes move the tool most differently.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,7 +26,7 @@ import numpy as np
 from scipy import special
 
 from fg_calib import graph, statistics
-from fg_calib.inputs import POSE_MODELS, CalibrationError, Floats, FrozenArrays, Record
+from fg_calib.inputs import CalibrationError, Floats, Record
 from fg_calib.monitoring.new_data import Linear, Rows, ends_of_rows, linearise_new_data, place_new_data
 from fg_calib.monitoring.prior_information import Calibrated
 from fg_calib.robot import Robot, forward, names_of, random_readings
@@ -55,8 +53,8 @@ MOST_REFINED = 6
 MOST_ROWS = 2400
 """Rows up to which gross errors are tested, 400 poses: their columns grow with the square of the rows."""
 
-N_RANDOM, N_ADVISED = 200, 10
-"""Random configurations at which changes are compared, and those of them that are advised."""
+N_RANDOM = 200
+"""Random configurations at which changes are compared."""
 
 POSES = {"tool": "tool", "base": "frame"}
 """Variables that are a pose, and the hypothesis that it made any turn and shift."""
@@ -290,11 +288,6 @@ def all_variables(robot: Robot) -> graph.Variables:
     return graph.build_variables(robot.with_estimated(names_of(robot.parameters)), [False], False)
 
 
-def random_configurations(robot: Robot) -> Floats:
-    """Configurations at which changes are compared, shape (n, n_joints), [rad] (prismatic: [m])."""
-    return random_readings(robot, N_RANDOM, np.random.default_rng(0))
-
-
 def motion(rows: Linear, found: HypothesisTest) -> Floats:
     """How a change moves the tool at random configurations, shape (n, 2, 3), rotation first, [rad] and [m].
 
@@ -302,8 +295,8 @@ def motion(rows: Linear, found: HypothesisTest) -> Floats:
         rows: The rows at the calibrated arm.
         found: The change; no gross errors.
     """
-    v = all_variables(rows.robot)
-    J = forward(v.chains[0].at(v.nominal()), v.robot.trig(random_configurations(rows.robot))).jacobian
+    v, q = all_variables(rows.robot), random_readings(rows.robot, N_RANDOM, np.random.default_rng(0))
+    J = forward(v.chains[0].at(v.nominal()), v.robot.trig(q)).jacobian
     return (J @ (found.hypothesis.directions @ found.change)).reshape(-1, 2, 3)
 
 
@@ -327,34 +320,3 @@ def merge_alike(rows: Linear, likely: Sequence[HypothesisTest], noise: Mapping[s
         else:
             kept.append(f)
     return kept
-
-
-class Advice(FrozenArrays):
-    """Configurations at which the two likeliest changes differ most, among random ones.
-
-    Attributes:
-        readings: The configurations, the largest difference first, shape (n, n_joints), [rad] (prismatic: [m]).
-        between: The two changes.
-        apart: Distance of the tool's positions there by these two, shape (n,), [m].
-    """
-
-    readings: Floats
-    between: tuple[tuple[str, ...], tuple[str, ...]]
-    apart: Floats
-
-
-def advise_configurations(rows: Linear, likely: Sequence[HypothesisTest]) -> Advice | None:
-    """Configurations to measure next; None of a single change, or where none of the tables is of poses.
-
-    Args:
-        rows: The rows at the calibrated arm.
-        likely: Changes that these leave open, the likeliest first.
-    """
-    changes = [f for f in likely if f.hypothesis.kind != "row"][:2]
-    if len(changes) < 2 or all(table.model not in POSE_MODELS for table in rows.placed.problem.data.tables):
-        return None
-    one, other = changes
-    q, moved = random_configurations(rows.robot), motion(rows, one) - motion(rows, other)
-    in_scale = moved / np.array([[rows.robot.scale_of("rad")], [rows.robot.scale_of("m")]])
-    best = np.argsort(-np.linalg.norm(in_scale, axis=(1, 2)), kind="stable")[:N_ADVISED]
-    return Advice(q[best], (one.hypothesis.names, other.hypothesis.names), np.linalg.norm(moved[best, 1], axis=1))

@@ -248,8 +248,6 @@ def check_document(found: monitoring.Check) -> dict[str, Any]:
     document = tables.document_of("check", **vars(found))
     for e in document["explanations"]:
         e |= {key: [*map(named, e[key])] for key in ("told_apart_from", "not_told_apart_from")}
-    if document["advice"] is not None:
-        document["advice"]["between"] = [*map(named, document["advice"]["between"])]
     return document
 
 
@@ -270,7 +268,6 @@ def build_check_report(found: monitoring.Check, joint_units: Sequence[str]) -> G
         *section("Errors of the calibrated arm (RMS)", _rms_errors(found)),
         *(section(SHOWN_CHANGES, ", ".join(sizes)) if found.verdict != "not_evaluated" else []),
         *section("What changed", _explanations(found.explanations), *_conclusions(found)),
-        *section("What to measure", *_advice(found, joint_units)),
     )
 
 
@@ -303,16 +300,3 @@ def _conclusions(found: monitoring.Check) -> Iterator[str]:
         yield f"no other single change explains the rows: update with --changed {likely[0].parameters[0]}, check others"
     elif likely and found.verdict == "fail":
         yield "do not deploy: residuals above noise remain after the most likely change"
-
-
-def _advice(found: monitoring.Check, joint_units: Sequence[str]) -> list[Content]:
-    advice = found.advice
-    if advice is None:
-        return []
-    rows = [(*q, apart) for q, apart in zip(advice.readings, advice.apart, strict=True)]
-    joints = [f"q{i} [{tables.shown_in(unit).unit}]|{unit}:.2f" for i, unit in enumerate(joint_units, start=1)]
-    between = " and ".join(map(named, advice.between))
-    said = (
-        f"Here {between} differ most, by so much in the tool's position; measure them like the rest, in the same table."
-    )
-    return [table_of((*joints, "apart [mm]|m:.3f"), rows), said]

@@ -110,20 +110,6 @@ def test_what_merely_correlates_is_said_not_to_be_told_apart():
     assert all(e.not_told_apart_from for e in found.explanations if e.likely)
 
 
-@pytest.mark.slow
-def test_the_configurations_advised_tell_the_changes_apart():
-    """Followed to the letter: the same rows, and the advised ones in the same frame."""
-    calibration, new, frame, q, rng = few_rows_of_a_slip()
-    rows = measured(new, len(q), rng, frame=frame, q=q)
-    advice = calibration.check(rows).advice
-    assert advice is not None
-    assert len(advice.readings) == 10
-    q = np.vstack([q, advice.readings])
-    found = calibration.check(measured(new, len(q), np.random.default_rng(0), frame=frame, q=q))
-    assert likely(found) == [("theta3",)]
-    assert found.deploy
-
-
 def test_a_gross_row_does_not_count_against_a_limit(known):
     """The frame is fitted without it: the errors are those that the other rows have by themselves."""
     calibration, true, rng = known

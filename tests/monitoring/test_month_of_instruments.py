@@ -1,4 +1,4 @@
-"""`check` and `update` of rows of every instrument: p-values, slips, updates, and what to measure next."""
+"""`check` and `update` of rows of every instrument: p-values, slips and updates."""
 
 import pytest
 from month import OF_INSTRUMENTS, months_of
