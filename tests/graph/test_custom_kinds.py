@@ -171,8 +171,6 @@ def described(**attributes):
      "a finite number; at the start of the unknowns"),
     (lambda r: r._replace(residual="far"), "lengths: kind Mine: residual: found 'far', expected numbers of shape "
      "(12, 1)"),
-    (lambda r: r._replace(residual=[[1.0], [1.0, 2.0]]), "lengths: kind Mine: residual: found [[1.0], [1.0, 2.0]], "
-     "expected numbers of shape (12, 1)"),
     (lambda r: r._replace(residual=r.residual + 1j), "lengths: kind Mine: residual: found ndarray of shape (12, 1)"
      ", complex128, expected numbers of shape (12, 1)"),
     (lambda r: r._replace(nuisances=None), "lengths: kind Mine: nuisances: found None, expected "
@@ -209,22 +207,16 @@ def test_a_kind_of_ours_cannot_be_changed_under_its_compiled_twin():
 
 
 @pytest.mark.parametrize(("change", "said"), [
-    ({"data": "far"}, "data: found 'far', expected finite numbers"),
     ({"data": ["1.0"] * 60}, "data: found ['1.0', '1.0', '1.0', '1.0', '1.0', '1.0', ...], expected finite numbers"),
     ({"data": np.full(60, np.nan)}, "data: row 0: found nan, expected a finite number"),
-    ({"data": np.zeros((60, 2))}, "data: shape (60, 2), expected (n, 1)"),
-    ({"data": np.ma.masked_array(np.ones(60))}, "data: found a masked array, expected finite numbers; nan "),
     ({"data": (x for x in range(60))}, "data: found a generator, expected finite numbers; list(...) makes a list"),
     ({"sigma": -1.0}, "sigma: found -1, expected a number above 0"),
-    ({"sigma": "1e-3"}, "sigma: found '1e-3', expected finite numbers"),
     ({"sigma": 1e-200}, "sigma: found 1e-200, expected a number no larger than 1e+15; sigmas and tolerances no "),
     ({"which": np.full((60, 1), 3)}, "which: row 0: found 3, expected 0 to 2"),
     ({"ends": np.full((60, 1), -1)}, "ends: row 0: found -1, expected 0 and above"),
     ({"names": ("A", "A", "B")}, "names: found ('A', 'A', 'B'), expected 3 different words"),
     ({"names": (1, 2, 3)}, "names: found (1, 2, 3), expected 3 different words"),
-    ({"names": 3}, "names: found 3, expected a list of names"),
     ({"unknowns": np.zeros((0, 0))}, "unknowns: shape (0, 0), expected a start for each unknown; "),
-    ({"unknowns": np.zeros((3, 1, 3))}, "unknowns: shape (3, 1, 3), expected (n, k)"),
     ({"test": [True]}, "test: shape (1,), expected (60,), one a row"),
     ({"kind": AnchorDistance}, "kind: found <class 'custom_kinds.AnchorDistance'>, expected an object of a class"),
 ])  # fmt: skip

@@ -258,7 +258,6 @@ def test_what_an_instruments_model_lacks_is_named():
         ("plane", "no column plane, expected the name of a plane for model plane"),
         ("board", "no columns qx, qy, qz, qw or roll, pitch, yaw, expected measured"),
         ("pixels", "no columns u, v, corner_x, corner_y, expected images of a board's points for model pixels"),
-        ("position", "no columns x, y, z, expected measured positions for model position"),
     ):
         assert refused(robot, Table(m, model)).startswith(f"measurements: {lacks}")
     names = np.array(m.labels["anchor"].names)[m.labels["anchor"].index]

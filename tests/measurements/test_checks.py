@@ -131,7 +131,6 @@ def test_sigmas_are_spread_over_the_rows():
     ({"sigma_orientation": [1, -1, 1]}, "sigma_orientation: row 1: found -1, expected a number above 0"),
     ({"sigma_joint": -1.0}, "noise: joint: found -1.0, expected a finite number not below 0"),
     ({"sigma_joint": [1.0, 1.0, 1.0]}, "noise: joint: 3 sigmas, expected one value, or 2"),
-    ({"ids": ["a"] * N}, "measurements: row 1: id: found 'a', expected different ids"),
     ({"test": np.arange(N)}, "test: found .*, expected True or False for each of 7 rows"),
     ({"pairs": {"a": [0], "distance": [1]}}, "pairs: no b, expected a and b"),
     ({"pairs": {"a": [0], "b": [1]}}, "pairs: neither distance nor angle"),
