@@ -18,7 +18,7 @@ from typing import Any
 
 from common import HERE, RESULTS, Question, Row, one, rounded
 
-SCRIPTS = ("paper", "real_data", "validation", "effects", "real_effects", "design", "peers", "speed")
+SCRIPTS = ("paper", "real_data", "validation", "effects", "real_effects", "ur10", "design", "peers", "speed")
 TOLERANCE = 1e-6
 LOOSE = {"gap", "seconds", "iterations", "p", "angle to the null space", "update"}
 """Keys whose values rounding may change by more: they are compared by order of magnitude."""
