@@ -83,7 +83,7 @@ def of(*effects):
 
 
 def choosing(robot):
-    return replace(robot, select_effects=True)
+    return robot.geometry.with_effects(*robot.effects, select=True)
 
 
 def curved_and_compliant(seed):

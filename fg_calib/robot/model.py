@@ -474,8 +474,12 @@ class Robot(inputs.Record):
                 parts.append(effect.values(loaded if effect.by_loads else arm, readings, context or {}, at))
         return np.concatenate(parts, axis=1) if len(parts) > 1 else trig
 
-    def with_effects(self, *effects: Effect) -> "Robot":
+    def with_effects(self, *effects: Effect, select: bool = False) -> "Robot":
         """Copy that does more than its geometry; each effect brings its parameters, of nominal value zero.
+
+        Args:
+            effects: The effects.
+            select: Whether a calibration keeps only those for which there is evidence.
 
         Raises:
             InputError: A joint that there is not, or two effects with the same parameters.
@@ -503,10 +507,9 @@ class Robot(inputs.Record):
                     element = Element(t.axis, constant, places.get(t.name), None, t.sign, Basis(number, t.joint))
                     more.setdefault(t.after, []).append(element)
                     number += 1
-        elements = list(more.get(-1, []))
-        for i, element in enumerate(self.elements):
-            elements += [element, *more.get(i, [])]
-        return replace(self, parameters=tuple(parameters), elements=tuple(elements), effects=effects)
+        follow = (one for i, element in enumerate(self.elements) for one in (element, *more.get(i, [])))
+        found = tuple(parameters), (*more.get(-1, []), *follow)
+        return replace(self, parameters=found[0], elements=found[1], effects=effects, select_effects=select)
 
     @property
     def nominal(self) -> Floats:
