@@ -177,7 +177,7 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
     choice, found, order = _Choice(job, solution), dict[int, EffectTest](), list(EFFECTS.values())
     for _ in range(N_PASSES):
         before = kept
-        for i in sorted(range(len(effects)), key=lambda i: order.index(type(effects[i]))):
+        for i in sorted({i for i, _ in choice.groups}, key=lambda i: order.index(type(effects[i]))):
             others = frozenset(group for group in kept if group[0] != i)
             found[i], of = choice.test(others, frozenset(group for group in choice.groups if group[0] == i))
             kept = others | of

@@ -467,7 +467,7 @@ def _lacking(robot: Robot, readings: Floats) -> tuple[list[str], Integers, Float
     loads = ([Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, n)]) if len(slides) < n else ()
     compliant = [(e.terms(arm), e.gravity) for e in robot.effects if isinstance(e, Compliance)]
     loaded = [{t.owner for terms, g in compliant for t in terms if g == "estimate" or g[k]} for k in range(3)]
-    candidates: list[tuple[str, Effect, set[int]]] = [("2 position", Gain(slides), set())]
+    candidates: list[tuple[str, Effect, set[int]]] = [("2 position", Gain(slides), set())] * bool(slides)
     candidates += [("2 position", Harmonics(), set())] * bool(loads)
     for name, g, owners in zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), loaded, strict=True):
         candidates += [(name, Compliance(masses, gravity=g), owners) for masses in loads]

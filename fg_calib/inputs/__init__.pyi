@@ -44,7 +44,7 @@ from .arrays import (
     require,
     shape_of,
 )
-from .errors import CalibrationError, InputError, ProblemError, SolverError, escaped, printable, shown
+from .errors import CalibrationError, InputError, ProblemError, SolverError, escaped, printable, shown, within
 from .options import (
     LIMITED,
     MODELS,
@@ -130,4 +130,5 @@ __all__ = [
     "require",
     "shape_of",
     "shown",
+    "within",
 ]

@@ -1,5 +1,7 @@
 """The exceptions of the package: each message is one line that a user can act on."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from reprlib import Repr
 
 
@@ -49,6 +51,16 @@ class InputError(CalibrationError):
     def __reduce__(self) -> "tuple[type[InputError], tuple[str, str, str, str]]":
         """How it is pickled: it is made of more than its message, and comes back from a worker process."""
         return type(self), (self.place, self.found, self.expected, self.hint)
+
+
+@contextmanager
+def within(place: str) -> Iterator[None]:
+    """The place of what is refused in the block is within another place, unless it is already."""
+    try:
+        yield
+    except InputError as error:
+        of = "" if error.place.startswith(place) else f"{place}: "
+        raise InputError(f"{of}{error.place}", error.found, error.expected, error.hint) from None
 
 
 class ProblemError(InputError):

@@ -12,17 +12,20 @@ effects:
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import BeforeValidator, TypeAdapter, ValidationError
+from pydantic import model_validator
 
-from fg_calib.inputs import InputError, shown
-from fg_calib.io.yaml import Number, Positive, Schema, first_misfit, refuse_unknown_keys, validate, within
+from fg_calib.inputs import InputError, as_floats, check_names, check_type, did_you_mean, shown, within
+from fg_calib.io.yaml import Number, Positive, Schema, validate
 from fg_calib.robot import EFFECT_KINDS, EFFECTS, Effect, Mass, Robot
 
 STANDARD = ("error_curve", "compliance", "harmonics", "gain")
 """What `select` tries where nothing is listed."""
+
+MOST_METRES = 20.0
+"""Farthest place of a mass in the frame of its link, [m], whatever the file's unit."""
 
 NO_MASSES = "`masses: free`, or the mass and com of each link"
 
@@ -36,6 +39,12 @@ def select_standard(links: Mapping[Any, Any]) -> dict[str, Any]:
 class _Mass(Schema):
     mass: Positive
     com: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _in_metres(self) -> "_Mass":
+        if max(map(abs, self.com)) > MOST_METRES:
+            raise InputError("com", f"found {shown(self.com)}", f"m, at most {MOST_METRES:g}", "is it in mm?")
+        return self
 
 
 class _Payload(_Mass):
@@ -55,7 +64,9 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
     Raises:
         InputError: An effect or option that there is not, or no masses.
     """
-    _checked(dict[str, Any], (*EFFECTS, "values", "select"), given, place)
+    check_names(place, given, (*EFFECTS, "values", "select"), "key")
+    check_type(f"{place}: select", given.get("select", False), bool)
+    check_type(f"{place}: values", given.get("values", {}), Mapping[str, Any])
     effects, masses = list[Effect](), None
     loaded = {key: one for key, one in given.items() if isinstance(one, Mapping) and {"masses", "payload"} & one.keys()}
     for key, one in loaded.items():
@@ -69,7 +80,9 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
         of, options, here = EFFECTS[key], given[key], f"{place}: {key}"
         names = [f.name for f in fields(of)]  # type: ignore[arg-type]
         options = {} if options is True else options if isinstance(options, Mapping) else {names[0]: options}
-        options = {name: value for name, value in options.items() if name not in ("masses", "payload")}
+        check_names(here, options, [*names, *["payload"] * ("masses" in names)], "key")
+        not_given = (("sigma", "estimate"), ("payload", options.get("payload")))
+        options = dict(one for one in options.items() if one not in not_given)
         if "masses" in names:
             free = key == "compliance" and isinstance(given[key], Mapping) and given[key].get("masses") == "free"
             if not masses and not free and (key != "backlash" or options.get("side") == "load"):
@@ -82,20 +95,8 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
         if "gravity" in names and gravity is not None:
             options.setdefault("gravity", gravity)
         with within(here):
-            effects.append(_checked(of, names, options, here))
+            effects.append(of(**options))
     return effects
-
-
-def _checked(of: Any, keys: Sequence[str], value: object, place: str) -> Any:
-    """A value as of a type, a mapping with none but known keys.
-
-    Raises:
-        InputError: It does not fit.
-    """
-    try:
-        return TypeAdapter(Annotated[of, BeforeValidator(refuse_unknown_keys(*keys))]).validate_python(value)
-    except ValidationError as error:
-        raise first_misfit(error, place) from None
 
 
 def _masses(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any], n_joints: int) -> tuple[Mass, ...]:
@@ -113,7 +114,8 @@ def _masses(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any]
             mass = validate(_Mass, value, here)
             found.append(links[str(link)](mass.mass, mass.com))
     elif wanted not in (None, "free"):
-        raise InputError(f"{place}: masses", f"found {shown(wanted)}", "urdf, free, or masses by link")
+        hint = did_you_mean(wanted, ("urdf", "free"))
+        raise InputError(f"{place}: masses", f"found {shown(wanted)}", "urdf, free, or masses by link", hint)
     if "payload" in given:
         payload = validate(_Payload, given["payload"], f"{place}: payload")
         found.append(Mass(n_joints, payload.mass, payload.com, payload.column))
@@ -129,10 +131,10 @@ def with_coefficients(robot: Robot, given: Mapping[str, Any], place: str) -> Rob
     values = robot.nominal
     for name, value in given.items():
         each = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
-        names = [f"{name}[{k}]" for k in range(len(each))] if name.endswith(".curve") else [name]
-        figures = _checked(list[float], (), each, f"{place}: {name}")
+        names = [p.name for p in robot.parameters if p.name.startswith(f"{name}[")] or [name]
+        figures = as_floats(f"{place}: {name}", each, "(n)")
         if len(figures) != len(names):
-            raise InputError(f"{place}: {name}", f"{len(figures)} figures", "one")
+            raise InputError(f"{place}: {name}", f"{len(figures)} figures", str(len(names)) if names[1:] else "one")
         with within(place):
             values[[robot.index(one) for one in names]] = figures
     return robot.with_values(values)

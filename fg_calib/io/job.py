@@ -162,7 +162,7 @@ def _read_job(path: Path) -> Job:
             raise InputError(f"{path.name}: tolerance: {key}", f"of no use without the key {key}", "no such key")
     tables = [_table(entry, place, file, robot, folder) for place, entry in entries]
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
-    with yaml.within(path.name):
+    with inputs.within(path.name):
         options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)
     alone = tables[0].measurements if isinstance(file.measurements, str) and tables[0].is_plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
@@ -361,7 +361,7 @@ def check_choices(choices: Mapping[str, Any], robot: Robot, place: str) -> None:
     file = yaml.validate(_Job, {"robot": ".", "measurements": ".", **choices}, place)
     if file.model is None:
         raise InputError(place, "missing key 'model'")
-    with yaml.within(place):
+    with inputs.within(place):
         file.options(robot, file.model)
 
 

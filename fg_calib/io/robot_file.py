@@ -32,10 +32,11 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
+from fg_calib import inputs
 from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
-from fg_calib.io.yaml import FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate, within
+from fg_calib.io.yaml import FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
 from fg_calib.robot import Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
 
 if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
@@ -159,10 +160,9 @@ def _links_of(root: Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], 
     return links | {"urdf": masses}
 
 
-def _with_effects(
-    builder: RobotBuilder, given: Mapping[str, Any] | str, links: Mapping[Any, Any], place: str, **choices: Any
-) -> Robot:
+def _with_effects(builder: RobotBuilder, given: Any, links: Mapping[Any, Any], place: str, **choices: Any) -> Robot:
     """The robot of a builder with the effects of a robot file."""
+    inputs.check_type(f"{place}: effects", given, Mapping[str, Any] | Literal["select"])
     given = select_standard(links) if isinstance(given, str) else given
     where, coefficients = f"{place}: effects", given.get("values", {})
     robot = builder.build(effects=read_effects(given, where, links, builder.n_joints), place=place, **choices)
@@ -491,7 +491,7 @@ class _Robot(Schema):
     fixed: tuple[str, ...] = ()
     estimate: Names = ()
     tolerance: dict[str, Positive] = Field(default_factory=dict)
-    effects: dict[str, Any] | Literal["select"] = Field(default_factory=dict)
+    effects: Any = Field(default_factory=dict)
 
     def choices(self, place: str, estimate: Sequence[str]) -> dict[str, Any]:
         """Arguments of `RobotBuilder.build`, [m] and [rad]; `estimate` is estimated too.
@@ -647,7 +647,7 @@ def _add_screw(builder: RobotBuilder, joint: Joint, row: _ScrewRow, units: Units
     if joint.prismatic and (row.x or row.y):
         raise InputError(place, "x or y of a slide", "pitch and roll: it has a direction alone")
     values = {kind: _si(kind, getattr(row, kind), units, place) for kind in model.SCREW_KINDS}
-    with within(place):
+    with inputs.within(place):
         builder.add_screw_joint(joint, row.axis, point, values)
 
 

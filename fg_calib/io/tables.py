@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fg_calib import inputs, measurements, parallel
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked, within
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import ANGLES, LENGTHS, Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
@@ -440,7 +440,8 @@ def read_measurements(
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
     found = measurements_of(table, readings, between, units, noise, model)
-    context = [effect.context(robot, readings, table.numbers) for effect in robot.effects]
+    with within(table.name):
+        context = [effect.context(robot, readings, table.numbers) for effect in robot.effects]
     return replace(found, context={name: values for one in context for name, values in one.items()})
 
 
@@ -514,7 +515,7 @@ def read_table(
 
     def note(names: Sequence[str]) -> Floats:
         known.update(names)
-        return np.zeros((1, len(names)))
+        return np.full((1, len(names)), np.nan)
 
     for effect in robot.effects:
         effect.context(robot, np.zeros((1, robot.n_joints)), note)

@@ -2,8 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
@@ -12,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from fg_calib import inputs
-from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, AngleUnit, InputError, LengthUnit, check_fields, did_you_mean
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, AngleUnit, InputError, LengthUnit, check_fields, did_you_mean, within
 from fg_calib.io.atomic import read_text
 from fg_calib.robot import SCALES
 
@@ -77,15 +76,6 @@ def validate(schema: type[AnySchema], value: object, place: str) -> AnySchema:
             return schema.model_validate(value)
     except ValidationError as error:
         raise first_misfit(error, place) from None
-
-
-@contextmanager
-def within(place: str) -> Iterator[None]:
-    """The place of what is refused in the block is within another place."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{place}: {error.place}", error.found, error.expected, error.hint) from None
 
 
 def first_misfit(error: ValidationError, place: str) -> InputError:

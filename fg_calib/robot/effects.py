@@ -25,14 +25,17 @@ References:
     calibration of robots with flexible joints and links. J. Intelligent and Robotic Systems 34.
 """
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from fg_calib.inputs import Floats, InputError, Record, check_number, shown
-from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Parameter, Robot, Term
+from fg_calib.inputs import MOST_SIZE, Floats, InputError, Record, as_floats, check_names, check_number, shown
+from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Parameter, Robot, Term, names_of
+
+_log = logging.getLogger(__name__)
 
 Joints = Literal["all"] | Sequence[int]
 """Numbers of joints from 1; all that turn, for gains all."""
@@ -46,6 +49,15 @@ LEAST_LENGTH = 0.02
 GRAVITY = (0.0, 0.0, -9.81)
 """Of a base that stands upright, [m/s^2]."""
 
+MOST_GRAVITY = 100.0
+"""Size of no gravity that an arm works under, [m/s^2]: it is in mm/s^2."""
+
+MOST_TERMS = 1000
+"""Highest order of a harmonic, and most knots a turn."""
+
+MOST_KELVIN = 40.0
+"""Distance of all temperatures from their reference beyond which it is asked for their unit."""
+
 
 def _joints(robot: Robot, joints: Joints, what: str, *, sliding: bool = False) -> list[int]:
     """Indices of the joints: those that turn, or all of them.
@@ -54,13 +66,15 @@ def _joints(robot: Robot, joints: Joints, what: str, *, sliding: bool = False) -
         InputError: One is none of these.
     """
     able = [i for i, joint in enumerate(robot.joints) if sliding or not joint.prismatic]
-    if isinstance(joints, str):
+    if joints == "all":
         return able
+    numbers, expected = [i + 1 for i in able], f"joints{' that turn' * (not sliding)}, of"
     for number in joints:
-        if number - 1 not in able:
-            expected = f"joints{' that turn' * (not sliding)}, of {', '.join(str(i + 1) for i in able)}"
-            raise InputError(f"{what}: joints", f"found {shown(number)}", expected)
-    return [number - 1 for number in joints]
+        if isinstance(number, bool) or number not in numbers:
+            raise InputError(f"{what}: joints", f"found {shown(number)}", f"{expected} {', '.join(map(str, numbers))}")
+    if not joints or len({*joints}) < len(joints):
+        raise InputError(f"{what}: joints", f"found {shown(joints)}", "different joints")
+    return [int(number) - 1 for number in joints]
 
 
 def _prefix(robot: Robot, joint: int) -> str:
@@ -111,7 +125,9 @@ class Harmonics(Effect, Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         for order in self.orders:
-            check_number("orders", order, above=True)
+            check_number("orders", order, above=True, most=MOST_TERMS)
+        if len({f"{order:.9g}" for order in self.orders}) != (len(self.orders) or 1):
+            raise InputError("orders", f"found {shown(self.orders)}", "different numbers, such as [1, 2]")
 
     def terms(self, robot: Robot) -> list[Term]:
         names = [(f"{m:.9g}".replace(".", "_"), f) for m in self.orders for f in ("sin", "cos")]
@@ -140,7 +156,8 @@ class ErrorCurve(Effect, Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_number("knots", self.knots, least=4.0, whole=True)
+        check_number("knots", self.knots, least=4.0, whole=True, most=MOST_TERMS)
+        check_number("sigma", 1.0 if self.sigma is None else self.sigma, above=True)
 
     def terms(self, robot: Robot) -> list[Term]:
         joints, sigma = _joints(robot, self.joints, "error_curve"), self.sigma or 5e-4
@@ -214,7 +231,24 @@ def _frames(robot: Robot, readings: Floats, wanted: Collection[int]) -> dict[int
     return found
 
 
-class Compliance(Effect, Record):
+class _Loaded(Effect):
+    """An effect of gravity on masses."""
+
+    masses: Sequence[Mass] | None
+    gravity: Sequence[float] | Literal["estimate"]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.by_loads and self.masses is not None:
+            figures = [(m.link, m.mass, *m.com) for m in self.masses]
+            if not figures or np.any(as_floats("masses", figures, "(n, 5)")[:, :2] < 0.0):
+                raise InputError("masses", f"found {shown(self.masses)}", "a Mass for each link, 0 kg or more")
+        gravity = as_floats("gravity", GRAVITY if self.gravity == "estimate" else self.gravity, "(3)")
+        if not 0.0 < np.linalg.norm(gravity) < MOST_GRAVITY:
+            raise InputError("gravity", f"found {shown(self.gravity)}", "m/s^2, such as [0, 0, -9.81]")
+
+
+class Compliance(_Loaded, Record):
     """Joints that give way to gravity: q + k tau(q), k in [rad/(N m)], positive.
 
     Attributes:
@@ -303,7 +337,7 @@ class Compliance(Effect, Record):
         return np.stack(columns, axis=1)
 
 
-class Bending(Effect, Record):
+class Bending(_Loaded, Record):
     """Bending of a base or column: it turns by the moment of all masses about its origin.
 
     Attributes:
@@ -324,7 +358,7 @@ class Bending(Effect, Record):
         return _with_slopes(moments.of_masses(robot.end_of(0))[:, :2])
 
 
-class Backlash(Effect, Record):
+class Backlash(_Loaded, Record):
     """Half the dead zone of a gear, times the side that it lies on.
 
     Attributes:
@@ -364,6 +398,9 @@ class Backlash(Effect, Record):
         if self.side != "moves":
             joints = _joints(robot, self.joints, "backlash")
             given = read([f"{self.side}{i + 1}" for i in joints])
+            for j, side in np.argwhere(~np.isin(given, (-1.0, 0.0, 1.0)) & np.isfinite(given))[:, ::-1][:1]:
+                found = f"found {given[side, j]:g}"
+                raise InputError(f"{self.side}{joints[j] + 1}", found, "sides of approach, -1, 0 or 1")
             sides = np.full((len(given), robot.n_joints), np.nan)
             sides[:, joints] = given
             return {self.side: sides}
@@ -382,7 +419,13 @@ class Coupling(Effect, Record):
         pairs: Driving joint and joint that turns with it, numbers from 1: [(4, 5)] for theta5.coupling4.
     """
 
-    pairs: Sequence[tuple[int, int]]
+    pairs: Sequence[tuple[int, int]] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        sizes = [len(pair) if isinstance(pair, tuple) else 1 for pair in {*self.pairs}]
+        if sizes != [2] * (len(self.pairs) or 1):
+            raise InputError("pairs", f"found {shown(self.pairs)}", "different pairs of joints, such as [[4, 5]]")
 
     def _places(self, robot: Robot) -> list[list[int]]:
         return [_joints(robot, pair, "coupling", sliding=True) for pair in self.pairs]
@@ -409,11 +452,18 @@ class Thermal(Effect, Record):
     zeros: bool = False
     column: str = "temperature"
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_number("reference", self.reference, least=-MOST_SIZE)
+        if not self.lengths and not self.zeros:
+            raise InputError("lengths", "neither lengths nor zeros", "one of them")
+
     def bound(self, robot: Robot) -> "Thermal":
         """Of the nominal arm: a calibration finds no further lengths, and loses none."""
+        of_links = [p for p in robot.parameters if p.unit == "m" and 1 <= p.owner <= robot.n_joints]
         if self.lengths is not True:
+            check_names("thermal: lengths", self.lengths or (), names_of(of_links), "length")
             return self
-        of_links = (p for p in robot.parameters if p.unit == "m" and 1 <= p.owner <= robot.n_joints)
         return replace(self, lengths=tuple(p.name for p in of_links if abs(p.nominal) >= LEAST_LENGTH))
 
     def _lengths(self, robot: Robot) -> list[tuple[int, Element, Parameter]]:
@@ -427,7 +477,7 @@ class Thermal(Effect, Record):
         return f"{self.column} {self.reference:g}"
 
     def _drifting(self, robot: Robot) -> list[int]:
-        return _joints(robot, "all" if self.zeros else (), "thermal")
+        return _joints(robot, "all", "thermal") if self.zeros else []
 
     def terms(self, robot: Robot) -> list[Term]:
         terms = []
@@ -443,7 +493,11 @@ class Thermal(Effect, Record):
         return _with_slopes(warmer[:, None] * np.array(lengths + [1.0] * len(self._drifting(robot))))
 
     def context(self, robot: Robot, readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
-        return {self.column: read([self.column])[:, 0]}
+        found = read([self.column])[:, 0]
+        if np.all(np.abs(found - self.reference) > MOST_KELVIN):
+            of = self.column, found[0], self.reference
+            _log.warning("column %s, %g in the first row, is far from its reference, %g; are they in one unit?", *of)
+        return {self.column: found}
 
 
 EFFECTS: Mapping[str, type[Effect]] = {

@@ -19,19 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib import inputs
-from fg_calib.inputs import (
-    NEAR,
-    Floats,
-    InputError,
-    Integers,
-    as_floats,
-    check_names,
-    checked,
-    escaped,
-    listed,
-    shape_of,
-    shown,
-)
+from fg_calib.inputs import NEAR, Floats, InputError, as_floats, check_names, checked, escaped, listed, shape_of, shown
 from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
 
 MOST_JOINTS = 200
@@ -228,7 +216,7 @@ class Term(NamedTuple):
     joint: int = -1
 
 
-def context_at(context: Context | None, rows: Integers | slice) -> Context:
+def context_at(context: Context | None, rows: inputs.Integers | slice) -> Context:
     """What else was measured at some of the configurations."""
     return {name: values[rows] for name, values in (context or {}).items()}
 
@@ -240,6 +228,7 @@ class Effect(ABC):
         """Take lists for tuples: robots are keys of caches."""
         for name, value in list(vars(self).items()):
             object.__setattr__(self, name, _as_tuple(value))
+        inputs.check_fields(self)
 
     @property
     def by_loads(self) -> bool:
@@ -282,8 +271,15 @@ class Effect(ABC):
             readings: Joint readings in the rows' order, shape (n, n_joints), [rad] (prismatic: [m]); None if the table
                 has none.
             read: Columns of the table, shape (n, k), by their names.
+
+        Raises:
+            InputError: A row has what cannot be.
         """
-        return {m.column: read([m.column])[:, 0] for m in getattr(self, "masses", None) or () if m.column}
+        found = {m.column: read([m.column])[:, 0] for m in getattr(self, "masses", None) or () if m.column}
+        for name, masses in found.items():
+            if np.any(masses < 0.0):
+                raise InputError(name, f"found {np.nanmin(masses):g}", "masses, 0 or above")
+        return found
 
 
 class Element(inputs.Record):
@@ -770,7 +766,8 @@ class RobotBuilder:
             self.add_frame("tool", {}, behind, False)
         parts = tuple(self._joints), tuple(self._parameters), tuple(self._elements)
         robot = Robot(self._name, self._convention, *parts, urdf)
-        robot = robot.with_effects(*effects) if effects else robot
+        with inputs.within(f"{place}: effects"):
+            robot = robot.with_effects(*effects) if effects else robot
         fixed, estimate = (robot.own_names(listed(*one)) for one in (("fixed", fixed), ("estimate", estimate)))
         if ZEROS in estimate:
             if not {*robot.zero_names} <= {*names_of(robot.parameters)}:

@@ -90,6 +90,22 @@ def test_select_stands_for_the_standard_effects(read):
     assert [type(e).__name__ for e in robot.effects] == ["ErrorCurve", "Compliance", "Harmonics", "Gain"]
 
 
+@pytest.mark.parametrize(
+    ("effects", "said"),
+    [("backlash: {side: q}", "t.csv: q1: found 0.5, expected sides of approach, -1, 0 or 1"),
+     ("compliance: {payload: {mass: 1, column: load}}", "t.csv: load: found -2, expected masses, 0 or above")],
+)  # fmt: skip
+def test_columns_of_what_cannot_be_are_refused(read, tmp_path, effects, said):
+    (tmp_path / "t.csv").write_text("q1,q2,q3,x,y,z,load\n0.5,0,0,1,2,3,-2\n")
+    assert said in refusal(read_measurements, tmp_path / "t.csv", read(HEAD + f"effects: {{{effects}}}\n"))
+
+
+def test_a_temperature_far_from_its_reference_is_asked_for_its_unit(read, tmp_path, caplog):
+    (tmp_path / "t.csv").write_text("q1,q2,q3,x,y,z,temperature\n0.5,0,0,1,2,3,294\n")
+    read_measurements(tmp_path / "t.csv", read(HEAD + "effects: {thermal: true}\n"))
+    assert [r.getMessage().split(";")[1] for r in caplog.records] == [" are they in one unit?"]
+
+
 @pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base")])
 def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
     """A mass behind a fixed joint, and axes that are not z: torques by the potential of all links."""
@@ -137,6 +153,26 @@ def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
         ("{error_curve: {knots: 2}}", "effects: error_curve: knots: found 2"),
         ("{gain: true, values: {theta9.gain: 1}}", "effects: values: arm: no parameter 'theta9.gain'"),
         ("{gain: true, values: {theta1.gain: [1, 2]}}", "effects: values: theta1.gain: 2 figures, expected one"),
+        ("gain", "robot.yaml: effects: found 'gain', expected a mapping or one of select"),
+        ("Select", "one of select; did you mean select?"),
+        ("{gain: {joints: elbow}}", "robot.yaml: effects: gain: joints: found 'elbow', expected one of all or a list"),
+        ("{gain: {joints: [2, 2]}}", "robot.yaml: effects: gain: joints: found (2, 2), expected different joints"),
+        ("{gain: {joints: []}}", "gain: joints: found (), expected different joints"),
+        ("{gain: {masses: free}}", "effects: gain: unknown key 'masses', expected one of joints"),
+        ("{compliance: {masses: free, payloads: 1}}", "gravity, payload; did you mean payload?"),
+        ("{harmonics: {orders: [1, 1]}}", "harmonics: orders: found (1, 1), expected different numbers"),
+        ("{error_curve: {knots: 1000000}}", "error_curve: knots: found 1000000, expected at most 1000"),
+        ("{error_curve: {sigma: -1e-3}}", "error_curve: sigma: found -0.001, expected a finite number above 0"),
+        ("{compliance: {masses: {2: {mass: 1}}, gravity: [0, 9]}}", "compliance: gravity: shape (2,), expected (3)"),
+        ("{compliance: {masses: {2: {mass: 1}}, gravity: [0, 0, 0]}}", "gravity: found (0, 0, 0), expected m/s^2"),
+        ("{compliance: {masses: {2: {mass: 1, com: [300, 0, 0]}}}}", "masses: 2: com: found (300.0, 0.0, 0.0), "),
+        ("{coupling: [[2, 2]]}", "effects: coupling: joints: found (2, 2), expected different joints"),
+        ("{coupling: [2, 3]}", "effects: coupling: pairs: found (2, 3), expected different pairs of joints"),
+        ("{thermal: {reference: .nan}}", "effects: thermal: reference: found nan, expected a finite number"),
+        ("{thermal: {lengths: [a7]}}", "thermal: lengths: unknown length 'a7', expected one of d1, a1"),
+        ("{gain: true, select: 'no'}", "robot.yaml: effects: select: found 'no', expected True or False"),
+        ("{gain: true, values: [1]}", "robot.yaml: effects: values: found [1], expected a mapping"),
+        ("{gain: true, values: {theta1.gain: big}}", "robot.yaml: effects: values: theta1.gain: "),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_effects_is_said_in_one_line(read, effects, said):

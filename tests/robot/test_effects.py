@@ -239,6 +239,10 @@ def test_effects_that_cannot_be_are_one_line(arm, effects, said):
     assert refusal(arm.with_effects, *effects) == said
 
 
+def test_sides_by_loads_need_masses():
+    assert refusal(Backlash, side="load") == "masses: found (), expected a Mass for each link, 0 kg or more"
+
+
 @pytest.mark.parametrize(("name", "kind"), [("q1.spring", "spring"), ("q1.shift", "yaw")])
 def test_an_unknown_kind_and_a_name_that_hides_it_are_one_line(name, kind):
     with pytest.raises(InputError, match=rf"parameter '{name}': kind '{kind}', expected a name that ends in its kind"):
