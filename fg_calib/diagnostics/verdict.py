@@ -226,8 +226,9 @@ def check_fit(case: Case) -> Iterator[Statement]:
     """Check chi-square, but where only the corrections make it too large."""
     chi2, problem = case.fit.chi_square, case.problem
     if case.fit.priors is None or case.too_large or not chi2.too_large:
-        updated, effect = problem.knowledge is not None, case.effect
-        yield from check_chi_square(chi2, case.gross, evaluated=problem.evaluated, updated=updated, effect=effect)
+        noise = any(kind.verdict == "too large" for kind in case.fit.goodness.kinds)
+        updated, evaluated, effect = problem.knowledge is not None, problem.evaluated, case.effect
+        yield from check_chi_square(chi2, case.gross, noise, evaluated=evaluated, updated=updated, effect=effect)
         text = "outliers were not searched for: there are too many rows; let a robust loss do so (loss: gnc)"
         yield Statement("warning", text, chi2.too_large and not case.effect and not case.fit.goodness.searched)
 
@@ -235,6 +236,7 @@ def check_fit(case: Case) -> Iterator[Statement]:
 def check_chi_square(
     chi2: statistics.ChiSquare,
     gross: GrossErrors | None = None,
+    noise: bool = True,
     *,
     evaluated: bool = False,
     updated: bool = False,
@@ -245,6 +247,7 @@ def check_chi_square(
     Args:
         chi2: Chi-square.
         gross: The gross errors that are all that is wrong; None if there are none, or more than these is.
+        noise: Whether residuals of some kind are smaller than specified; else priors are, or what was known before.
         evaluated: Whether the arm was evaluated as it is.
         updated: Whether the rows were added to an earlier calibration.
         effect: What systematic residuals follow.
@@ -267,7 +270,7 @@ def check_chi_square(
     cause = cause or "noise specified too small, unmodelled effects, or outliers"
     yield Statement("error", f"{outside}: {cause}", reduced > high)
     text = f"{outside}: noise specified too large; sigmas are larger than they need be"
-    yield Statement("note", text, reduced < low)
+    yield Statement("note", text, reduced < low and noise)
     significant = low <= reduced <= high and chi2.p_value is not None and chi2.p_value < SIGNIFICANT
     text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
     text += f" ({ratio:.2f} times), and sigmas are shown larger by as much"

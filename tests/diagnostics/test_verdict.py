@@ -79,6 +79,7 @@ def chi_square(reduced, p_value=0.5, dof=40):
     (chi_square(1.3, 1e-4), {}, "note", "(1.14 times), and sigmas are shown larger by as much"),
     (chi_square(1.2, 1e-4), {}, None, ""),
     (chi_square(0.4), {}, "note", "noise specified too large"),
+    (chi_square(0.4), {"noise": False}, None, ""),
     (chi_square(2.1), {}, "error", "[0.50, 2.00]: noise specified too small, unmodelled effects, or outliers"),
     (chi_square(2.1), {"updated": True}, "error", "new rows contradict the earlier calibration"),
     (chi_square(2.1), {"evaluated": True}, "error", "the arm does not predict these test rows"),
