@@ -1,4 +1,4 @@
-"""The documentation site: `sphinx-build -W --keep-going -n docs docs/_build`. It needs no network."""
+"""The documentation site: `sphinx-build -W --keep-going -n docs docs/_build/html`. It needs no network."""
 
 import sys
 from pathlib import Path
@@ -11,7 +11,7 @@ project = "fg_calib"
 author = "the authors of fg_calib"
 release = version = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "repository", "reference", "mathml"]
-exclude_patterns = ["_build", "_ext", "**.ipynb_checkpoints"]
+exclude_patterns = ["_build", "_ext", "jupyter_execute", "**.ipynb_checkpoints"]
 
 html_theme = "furo"
 html_title = f"fg_calib {version}"

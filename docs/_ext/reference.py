@@ -3,13 +3,13 @@
 import ast
 import inspect
 import re
-from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import typer
 from docutils import nodes
+from paper import paper
 from pygments.lexers.special import TextLexer
 from sphinx import addnodes
 from sphinx.pycode import ModuleAnalyzer
@@ -70,8 +70,7 @@ def api(stub: Path) -> tuple[str, str]:
 def write(*_: Any) -> None:
     """Write the pages that changed."""
     HERE.mkdir(exist_ok=True)
-    pages: Iterator[tuple[str, str]] = (("cli", commands()), *map(api, STUBS))
-    for name, text in pages:
+    for name, text in (("cli", commands()), ("paper", paper()), *map(api, STUBS)):
         file = HERE / f"{name}.rst"
         if not file.exists() or file.read_text() != text:
             file.write_text(text)
