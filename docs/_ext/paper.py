@@ -62,7 +62,7 @@ def rows(found: dict[str, Any]) -> Iterator[tuple[str, ...]]:
         value = (
             f"median of 200 draws {draws['median']:.2g} mm, 5 % below {draws['p5']:.2g}, 5 % above {draws['p95']:.2g}"
         )
-        off = "a lucky draw" if stated < draws["median"] / 2 else "typical"
+        off = "in the lower tail" if stated < draws["median"] / 2 else "typical"
         yield "Table 10", f"{model}, by our draws", value, off if inside else "not reached", "claims"
 
 

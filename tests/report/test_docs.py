@@ -161,8 +161,6 @@ def run_python(text, folder, fg_calib):
         m = measure(true_robot(names.get("robot", three), rng), 40, rng, sigma=(1e-4, 1e-4))
         np.save(folder / "q.npy", m.readings)
         np.save(folder / "p.npy", m.position)
-        np.save(folder / "lengths.npy", np.linalg.norm(pose(three, m.readings).position - [1.1, 0.4, -0.2], axis=1)
-                if m.readings.shape[1] == 3 else m.position)  # fmt: skip
     if "calibration.check" in text:
         calibration, true, more = month.calibrated(1)
         names |= {"calibration": calibration, "rows": month.measured(month.slipped(true, theta3=2e-3), 10, more)}
