@@ -19,7 +19,6 @@ from fg_calib.cli import EXAMPLES
 from fg_calib.cli.entry import build_app
 from fg_calib.importers.board import read_calibration_board
 from fg_calib.io import Units, read_measurements
-from fg_calib.robot.kinematics import pose
 from fg_calib.simulation import read_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
