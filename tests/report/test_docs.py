@@ -138,9 +138,9 @@ def parse_commands(text, folder, fg_calib):
             assert words[:1] in ([], ["python3"], ["."], ["pip"], ["pytest"])
 
 
-def run_console(text, folder, fg_calib):
-    """A command next to the bundled example, and what it prints."""
-    assert fg_calib("example", "space-robot", "--out", "demo").code == 0
+def run_console(text, folder, fg_calib, example="space-robot"):
+    """A command next to a bundled example, and what it prints."""
+    assert fg_calib("example", example, "--out", "demo").code == 0
     Path("robot.yaml").write_bytes(Path("demo/robot_nominal.yaml").read_bytes())
     command, shown = text.split("\n", 1)
     ended = fg_calib(*shlex.split(command.removeprefix("$ fg-calib ")))
@@ -180,7 +180,9 @@ RUN = {"yaml": read_yaml, "csv": read_csv, "bash": parse_commands, "sh": parse_c
 RUN |= {
     "python": run_python,
     "diff": lambda *_: None,  # see `measurements/test_extensions.py`
-    "text": lambda text, *others: run_console(f"$ fg-calib calibrate demo/calibration.yaml\n{text}", *others),
+    "text": lambda text, *others: run_console(
+        f"$ fg-calib calibrate demo/calibration.yaml\n{text}", *others, "ur10-tracker"
+    ),
 }
 FAST = ("bash", "sh", "csv", "yaml", "diff")
 EVERY_SNIPPET = [
@@ -242,9 +244,11 @@ def test_links_lead_somewhere(page):
 
 
 def test_the_commands_that_are_checked_are_the_readmes():
-    """`.ci/run` takes the first lines that start so."""
+    """`.ci/run` takes the lines from the first that starts so, and the one of the tests."""
     lines = PAGES["README"].read_text().splitlines()
-    (install,) = (line for line in lines if line.startswith("python3 -m venv"))
+    start = next(n for n, line in enumerate(lines) if line.startswith("python3 -m venv"))
     (tests,) = (line for line in lines if re.match("pip install .*test", line))
-    assert install.endswith("--out demo/result")
+    words = [line.split()[:2] for line in lines[start + 1 : start + 3]]
+    assert words == [["fg-calib", "example"], ["fg-calib", "calibrate"]]
+    assert lines[start + 2].endswith("--out demo/result")
     assert tests == "pip install '.[test]' && pytest -n auto"
