@@ -63,20 +63,15 @@ def observe(
 
 
 def compare(
-    job: Annotated[Path, argument("JOB|OLD", "The job, such as calibration.yaml; or an older result.")],
-    new: Annotated[Path | None, argument("[NEW]", "A newer result, to compare with the older.")] = None,
+    job: Annotated[Path, argument("JOB", "The job, such as calibration.yaml.")],
     out: Annotated[Path | None, option("--out", "DIR", "Write comparison.json there.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare the factor graph with plain least squares on the same job, or a new result with an old one."""
+    """Compare the factor graph with plain least squares on the same job."""
     from fg_calib import baseline, io
     from fg_calib.report import compare as report
     from fg_calib.report import write_document
 
-    if new is not None:
-        of = io.read_result(job), io.read_result(new), (job, new)
-        show_result(as_json, lambda: report.changes_document(*of), lambda: report.build_changes_report(*of))
-        return
     found = baseline.comparison.compare(io.read_job(job))
     if out is not None:
         write_document(out, "comparison.json", report.comparison_document(found))

@@ -1,9 +1,8 @@
-"""Comparisons: estimators on one job, two calibrations, the runs of a calibration, a calibration with new rows."""
+"""Comparisons: estimators on one job, the runs of a calibration, a calibration with new rows."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import reduce
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,20 +10,17 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from fg_calib import inputs, monitoring
+from fg_calib import monitoring
 from fg_calib.baseline import ESTIMATORS, Comparison, Estimate
 from fg_calib.diagnostics import probability
-from fg_calib.io import NOISE_UNITS, Result, Run
+from fg_calib.io import NOISE_UNITS, Run
 from fg_calib.report import tables
-from fg_calib.report.tables import Content, figure, in_words, line, section, table_of
-from fg_calib.report.text import summary
+from fg_calib.report.tables import figure, in_words, line, section, table_of
 
 ERRORS = {"max": "m", "mean": "m", "rms": "m", "orientation_rms": "rad"}
 PREDICTED = {"predicted_position_rms": "m", "predicted_position_rms_fitted": "m"}
 EFFORT = {"n_estimated": "", "iterations": "", "seconds": "s"}
 """Units of quantities of an estimate in the document."""
-
-INDEPENDENT = "The sigma of a change assumes independent calibrations; with common priors or rows it is too small."
 
 
 def build_comparison_report(comparison: Comparison) -> Group:
@@ -157,49 +153,14 @@ def _estimate(comparison: Comparison, e: Estimate) -> dict[str, Any]:
     return {key: value for key, value in vars(e).items() if key not in ("robot", "sigma")} | more
 
 
-def changes(old: Result, new: Result) -> Iterator[dict[str, Any]]:
-    """The parameters that one of two calibrations estimated: old, new, change, its sigma, and both over each other.
-
-    Raises:
-        InputError: The calibrations are of different robots.
-    """
-    if [p.name for p in old.parameters] != [p.name for p in new.parameters]:
-        raise inputs.InputError(new.robot, "other parameters", f"those of {old.robot}")
-    for a, b in zip(old.parameters, new.parameters, strict=True):
-        if a.identifiability == b.identifiability == "fixed":
-            continue
-        change = b.estimate - a.estimate
-        if b.unit == "rad":
-            change -= 2.0 * np.pi * round(change / (2.0 * np.pi))
-        sigma = None if a.sigma is None or b.sigma is None else float(np.hypot(a.sigma, b.sigma))
-        values = {"old": a.estimate, "new": b.estimate, "change": change, "sigma": sigma}
-        yield {"name": b.name, "unit": b.unit, **values, "in_sigma": change / sigma if sigma else None}
-
-
-def changes_document(old: Result, new: Result, folders: tuple[Path, Path]) -> dict[str, Any]:
-    """Two calibrations for programs, in [m] and [rad].
-
-    { "schema": "fg-calib/changes/1", "old": folder, "new": folder,
-      "parameters": [{"name", "unit", "old", "new", "change", "sigma", "in_sigma"}] }
-    """
-    return tables.document_of("changes", old=str(folders[0]), new=str(folders[1]), parameters=list(changes(old, new)))
-
-
-def build_changes_report(old: Result, new: Result, folders: tuple[Path, Path]) -> Group:
-    """Two calibrations for the terminal."""
-    rows = [tuple(one.values()) for one in changes(old, new)]
-    head: list[Content] = [line(f"OLD  {folders[0]}", "bold"), *summary(old), line("")]
-    head += [line(f"NEW  {folders[1]}", "bold"), *summary(new)]
-    columns = ("", "|unit", "old|q", "new|q", "change|q:+", "sigma of it|q", "in sigma|+z.1f")
-    return tables.report(*head, *section("Parameters", table_of(columns, rows), INDEPENDENT))
-
-
 def _largest_change(before: Run, run: Run) -> dict[str, Any] | None:
     """The parameter that changed most from one run to the next, in the sigma that it had before."""
     found: list[dict[str, Any]] = []
     for name in (name for name in run.parameters if name in before.parameters):
         then, sigma, unit = before.parameters[name]
         change = run.parameters[name][0] - then
+        if unit == "rad":
+            change -= 2.0 * np.pi * round(change / (2.0 * np.pi))
         found.append({"name": name, "unit": unit, "change": change, "in_sigma": abs(change) / sigma if sigma else None})
     return max(found, key=lambda one: one["in_sigma"] or -1.0, default=None)
 
