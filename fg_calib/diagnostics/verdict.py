@@ -60,7 +60,10 @@ NAMED = 3
 
 
 class Statement(Record):
-    """A statement about a result: one line, how severe it is, and whether it applies."""
+    """A statement about a result: one line, how severe it is, and whether it applies.
+
+    Keys and commands stand in backticks within parentheses: the first page of a report leaves them out.
+    """
 
     severity: Severity
     text: str
@@ -229,7 +232,7 @@ def check_fit(case: Case) -> Iterator[Statement]:
         noise = any(kind.verdict == "too large" for kind in case.fit.goodness.kinds)
         updated, evaluated, effect = problem.knowledge is not None, problem.evaluated, case.effect
         yield from check_chi_square(chi2, case.gross, noise, evaluated=evaluated, updated=updated, effect=effect)
-        text = "outliers were not searched for: there are too many rows; let a robust loss do so (loss: gnc)"
+        text = "outliers were not searched for: there are too many rows; let a robust loss do so (`loss: gnc`)"
         yield Statement("warning", text, chi2.too_large and not case.effect and not case.fit.goodness.searched)
 
 
@@ -262,9 +265,9 @@ def check_chi_square(
         cause = "the arm does not predict these test rows, noise specified too small, or outliers"
     elif gross is not None:
         cause = f"outliers: {gross.n} ({listed(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
-        cause += " loss do so (loss: gnc)"
+        cause += " loss do so (`loss: gnc`)"
     elif updated:
-        cause = "new rows contradict the earlier calibration: has the arm changed? See `fg-calib check`"
+        cause = "new rows contradict the earlier calibration: has the arm changed (see `fg-calib check`)?"
     elif effect:
         cause = "residuals are systematic"
     cause = cause or "noise specified too small, unmodelled effects, or outliers"
@@ -336,7 +339,7 @@ def check_gain(case: Case) -> Iterator[Statement]:
         except CalibrationError:  # says nothing of the loss
             return
         text = f"least squares predicts the test rows better ({least:.3g} sigma RMS, {after:.3g} with loss"
-        text += f" {problem.options.loss}): it takes effects for outliers; use loss: none"
+        text += f" {problem.options.loss}): it takes effects for outliers (use `loss: none`)"
         yield Statement("error", text, after > LEAST_GAIN * least)
 
 
@@ -352,7 +355,7 @@ def check_priors(case: Case) -> Iterator[Statement]:
     fit = case.fit.priors
     if fit is None:
         return
-    causes = "prior sigmas (key tolerance) specified too small, or the measurements are not what the job says"
+    causes = "prior sigmas (key `tolerance`) specified too small, or the measurements are not what the job says"
     for one in fit.beyond:
         text = f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}"
         yield Statement("error", text, one.is_place)
@@ -409,7 +412,7 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
         return
     if gross is not None:
         text = f"outliers: {gross.n} ({listed(gross.names)}) make the estimated noise {gross.ratio**-0.5:.3g} times as"
-        text += " large: look at them, or let a robust loss do so (loss: gnc)"
+        text += " large: look at them, or let a robust loss do so (`loss: gnc`)"
         yield Statement("error" if case.effect else "warning", text)
     readings = case.problem.data.readings[:MOST_READINGS]
     at = pose(case.problem.robot, readings).jacobian[:, :, -readings.shape[1] :] * readings.std(axis=0)
@@ -450,8 +453,9 @@ def check_offsets(case: Case) -> Iterator[Statement]:
         of = f" of {labels[found.table]}" if len(labels) > 1 else ""
         adds = f"{1e3 * found.size:+.3g} mm"
         adds = f"some {adds} to each" if high else f"{adds} to each (sigma {1e3 * found.sigma:.2g} mm)"
-        text = f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated: use offset:"
-        yield Statement("error" if high else "warning", f"{text} estimate, or calibrate the instrument")
+        text = f"the lengths{of} fit better if the instrument adds {adds}, which was not estimated:"
+        text += " estimate it (`offset: estimate`), or calibrate the instrument"
+        yield Statement("error" if high else "warning", text)
 
 
 def check_missing(case: Case) -> Iterator[Statement]:

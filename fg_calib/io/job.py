@@ -71,6 +71,15 @@ class _Tolerances(Schema):
     anchors: Positive | None = None
 
 
+_FreeText = Annotated[str | None, BeforeValidator(lambda text: str(text) if type(text) is int else text)]
+
+
+_ABOUT: dict[str, Any] = dict.fromkeys(
+    ("customer", "robot_serial", "instrument", "operator", "note"), (_FreeText, None)
+)
+_About = create_model("_About", __base__=Schema, **_ABOUT)
+
+
 class _TableKeys(Schema):
     """Keys of a table; at the top of a job they are the defaults of all its tables."""
 
@@ -122,7 +131,7 @@ class _JobKeys(_TableKeys):
 
 
 _CHECKED_LATER: dict[str, Any] = dict.fromkeys(_CHOICES, (Any, None))
-_Job = create_model("_Job", __base__=_JobKeys, **_CHECKED_LATER)
+_Job = create_model("_Job", __base__=_JobKeys, about=(_About, _About()), **_CHECKED_LATER)
 
 
 @checked

@@ -227,7 +227,8 @@ class Result(Section):
     """All that `result.json` holds.
 
     `date` is when the rows were measured, or when they were calibrated if that is unknown. `history` are the runs
-    before this one. `files` holds SHA-256 of the tables written with it, `links` the ends of a URDF's chain.
+    before this one, `about` whose arm it is and who measured it, as the job says. `files` holds SHA-256 of the tables
+    written with it, `links` the ends of a URDF's chain.
     """
 
     schema_: Literal["fg-calib/result/2"] = Field(alias="schema", default="fg-calib/result/2")
@@ -291,6 +292,7 @@ class Result(Section):
     files: dict[str, str] = {}
     inputs: dict[str, str]
     date: str = ""
+    about: dict[str, str] = {}
     history: tuple[Run, ...] = ()
     carried: Carried = Carried()
 
@@ -340,6 +342,7 @@ class Result(Section):
             versions=versions(),
             inputs=dict(inputs or {}),
             date=date or datetime.now(UTC).isoformat(timespec="seconds"),
+            about={key: str(text) for key, text in ((job or {}).get("about") or {}).items() if text is not None},
             history=history,
             notes=notes,
             effects=effects,

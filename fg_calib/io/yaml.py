@@ -94,8 +94,8 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
             hint = did_you_mean(context["key"], context["known"])
         case "literal_error":
             hint = did_you_mean(first["input"], _options(first))
-        case "string_type" if isinstance(first["input"], bool):
-            hint = "text such as no, on or true stands in quotes"
+        case "string_type" if isinstance(first["input"], bool | float):
+            hint = "text such as no, on, true or 0012 stands in quotes"
         case "float_type":
             hint = number_hint(first["input"])
     more = f" (and {len(misfits) - n} more)" * (len(misfits) > n)

@@ -138,7 +138,7 @@ def confounding_in_words(letters: Sequence[str]) -> str:
     described = {letter: of.description or f"the unknown {of.name}s" for letter, of in LANDMARKS.items()} | OTHERS
     names = [described[letter] for letter in letters]
     kind = LANDMARKS.get(letters[0]) if len(letters) == 1 else None
-    remedy = f": to see it, give places of {kind.name}s (key {kind.key})" if kind is not None and kind.key else ""
+    remedy = f": to see it, give places of {kind.name}s (key `{kind.key}`)" if kind is not None and kind.key else ""
     together = " together" if len(letters) > 1 else ""
     return f"confounded with {' and '.join(names)}{together}{remedy}"
 

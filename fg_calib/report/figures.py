@@ -80,22 +80,35 @@ def draw(data: ReportData, name: str) -> Drawing:
 
 
 def error_over_joints(data: ReportData) -> Iterator[Chart]:
-    """Residuals of configurations over the reading of each joint."""
-    if data.rms is None or data.configurations is None:
+    """Signed residuals over the reading of each joint, where an error of the joint once a turn is a sine.
+
+    Of positions it is the component along the joint's own motion, else each component of the kind that is nearest to
+    the tool's position; a pair stands at the reading of its second configuration.
+    """
+    if data.rms is None or data.configurations is None or data.residuals is None:
         return
-    (kind, rms), test, ids = data.rms, data.held_out, data.configurations["id"]
-    unit = shown_in(data.result.unit_of(kind)).unit
-    worst = [k for k in np.argsort(-np.nan_to_num(rms))[:WORST].tolist() if np.isfinite(rms[k])]
-    shown = charts.without_outliers(rms)
-    beyond = charts.cut(int(np.sum(shown < rms)))
-    for joint, readings in zip(data.robot.joints, data.readings.T, strict=True):
-        q = readings * shown_in(joint.unit).factor
-        names = f"{charts.short(joint.name, 40)} [{shown_in(joint.unit).unit}]", f"{kind} residual [{unit}]"
+    kind, ids = data.rms[0], data.configurations["id"].to_list()
+    if (errors := tool_errors(data)) is not None:
+        size = np.linalg.norm(errors[1], axis=1, keepdims=True)  # on its axis a joint moves nothing
+        at, signed = np.arange(len(ids)), -np.einsum("ni,nij->nj", errors[0], errors[1] / np.where(size, size, np.nan))
+    else:
+        rows = data.residuals.filter(data.residuals["excluded"].is_null())
+        rows = rows.filter([name.partition(".")[0] == kind for name in rows["kind"]])
+        place = {name: k for k, name in enumerate(ids)}
+        at = np.array([place[b if b in place else a] for a, b in rows.select("a", "b").rows()])
+        signed = np.repeat(rows["residual"].to_numpy()[:, None], data.robot.n_joints, axis=1)
+    scale, test = shown_in(data.result.unit_of(kind)), data.held_out[at]
+    for joint, readings, r in zip(data.robot.joints, data.readings[at].T, signed.T * scale.factor, strict=True):
+        q, shown = readings * shown_in(joint.unit).factor, charts.without_outliers(r)
+        names = f"{charts.short(joint.name, 40)} [{shown_in(joint.unit).unit}]", f"{kind} residual [{scale.unit}]"
         plot = Plot(limits_of(q), limits_of(shown, with_zero=True), names)
+        plot.line((plot.x.low, plot.x.high), 0.0, "level")
         plot.dots(q[~test], shown[~test], "a")
         plot.dots(q[test], shown[test], "b")
+        worst = [k for k in np.argsort(-np.abs(np.nan_to_num(r)))[:WORST].tolist() if np.isfinite(r[k])]
         for k in worst:
-            plot.ring(q[k], shown[k], f"{ids[k]}: {rms[k]:.3g} {unit}")
+            plot.ring(q[k], shown[k], f"{ids[at[k]]}: {r[k]:+.3g} {scale.unit}")
+        beyond = charts.cut(int(np.sum(np.abs(shown - r) > 0.0)))
         yield plot.chart(f"{joint.name}: {_colours(test)}, rings the {len(worst)} largest{beyond}")
 
 
@@ -172,13 +185,14 @@ def errors_over_torque(data: ReportData) -> Iterator[Chart]:
             yield plot.chart(f"{p.name}: {value}{charts.cut(int(outside.sum()))}")
 
 
-def joint_errors(data: ReportData) -> Floats | None:
-    """Errors of joints, measured minus predicted, each as if it alone made those of the tool's position.
+def tool_errors(data: ReportData) -> tuple[Floats, Floats] | None:
+    """Errors of the tool's position, measured minus predicted, and what joints move it by, in the base frame.
 
-    Shape (n, n_joints), [rad] (prismatic: [m]), nan where there are none; None where no positions were measured.
+    Shapes (n, 3), [m], nan where there are none, and (n, 3, n_joints); None where no positions of the tool were
+    measured: those of boards are along the camera's axes.
     """
     rows, table = data.residuals, data.configurations
-    if rows is None or table is None or "rms_position" not in table.columns:
+    if rows is None or table is None or "rms_position" not in table.columns or "board" in data.result.model:
         return None
     place, error = {name: k for k, name in enumerate(table["id"])}, np.zeros((len(table), 3))
     for t, (label, _) in enumerate(data.result.tables):
@@ -190,9 +204,18 @@ def joint_errors(data: ReportData) -> Floats | None:
             error[[place[name] for name in some["a"]]] -= np.outer(some["residual"], along)
     error[table["rms_position"].is_null()] = np.nan
     arm = data.robot.geometry
-    J = robot.forward(robot.build_chain(arm).with_joint_columns(), arm.trig(data.readings)).jacobian[:, 3:]
-    lever = np.sum(J**2, axis=1)
-    return np.einsum("ni,nij->nj", error, J) / np.where(lever > 0.0, lever, np.nan)  # on its axis a joint moves nothing
+    return error, robot.forward(robot.build_chain(arm).with_joint_columns(), arm.trig(data.readings)).jacobian[:, 3:]
+
+
+def joint_errors(data: ReportData) -> Floats | None:
+    """Errors of joints, measured minus predicted, each as if it alone made those of the tool's position.
+
+    Shape (n, n_joints), [rad] (prismatic: [m]), nan where there are none; None where no positions were measured.
+    """
+    if (errors := tool_errors(data)) is None:
+        return None
+    lever = np.sum(errors[1] ** 2, axis=1)
+    return np.einsum("ni,nij->nj", *errors) / np.where(lever > 0.0, lever, np.nan)  # on its axis a joint moves nothing
 
 
 def correlation_matrix(data: ReportData) -> list[Chart]:

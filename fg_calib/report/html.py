@@ -1,21 +1,25 @@
 """`report.html`: the page of a calibration, one file that needs no other, from the template `page.html`."""
 
+import re
 import shlex
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 from fg_calib import inputs, io
-from fg_calib.report import text
+from fg_calib.report import tables, text
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import arm_scene, figures_of
 from fg_calib.report.predict import FRAMES, percentages, size_table
-from fg_calib.report.tables import POSE_KINDS, Section, in_words, section, shortened
+from fg_calib.report.tables import Section, in_words, section, shortened
 
 WORKSPACE = "Expected error over the workspace"
 
-MAX_ROWS = 40
+MAX_ROWS = 12
 """Suspicious rows that the page lists; the table of residuals has all."""
+
+CODE = re.compile(r" \([^()]*`[^()]*\)")
+"""Keys and commands in a statement, which the first page leaves out."""
 
 EXPLANATIONS = {
     text.PARAMETERS: "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the"
@@ -26,7 +30,8 @@ EXPLANATIONS = {
     " of gravity: blue as calibrated, orange without the joint's compliance (the line).",
     "Studentised residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1"
     " in 370 is beyond 3.",
-    "Error over joint space": "Each dot is a configuration. A trend shows an unmodelled effect of that joint.",
+    "Error over joint space": "Predicted minus measured; of positions the component along the joint's own motion: a"
+    " sine is an error of that joint once a turn. A trend shows an unmodelled effect of it.",
     "Correlations": "Strong colours: errors of the two parameters go together.",
     WORKSPACE: "RMS error of the tool's position expected from the covariance. Unmodelled effects are not included.",
 }
@@ -47,6 +52,12 @@ def _environment() -> Any:
         finalize=lambda value: inputs.escaped(value) if type(value) is str else value,
     )
     environment.filters |= {"figure": lambda chart: Markup(chart.svg), "resource": lambda name: Markup(resource(name))}
+    environment.filters |= {
+        "without_code": lambda text: CODE.sub("", text),
+        "digits": tables.figure,
+        "in_words": in_words,
+    }
+    environment.filters["shown_in"] = tables.shown_in
     return environment
 
 
@@ -69,9 +80,10 @@ def build_page(data: text.ReportData) -> str:
         ramp=RAMP,
         verdict=text.verdict_word(result),
         limits=[] if result.acceptance is None else list(text.judged(result.acceptance.judgements)),
-        tiles=list(_tiles(data)),
+        lost=list(_not_determined(result)),
+        frames=FRAMES,
         command=_command(result),
-        options=list(_options(result)),
+        options=vars(result.options),
     )
 
 
@@ -88,36 +100,16 @@ def pages_of(data: text.ReportData, *, report: bool, figures: bool) -> dict[str,
     return {"report.html": build_page(data)} | files if report else files
 
 
-def _tiles(data: text.ReportData) -> Iterator[tuple[str, str]]:
-    """The most important values, and their meaning."""
-    result = data.result
-    rows = "of an evaluation" if result.evaluated_only else "held out" if data.split == "test" else "fitted"
-    for kind, rms in result.residual_rms[data.split].items():
-        if rms is not None and ", table" not in kind:
-            unit, found = result.unit_of(kind), data.quantiles(kind)
-            after, before = in_words(rms.after, unit), in_words(rms.before, unit)
-            if found is None:
-                yield after, f"{kind}, rows {rows} (RMS); before: {before}"
-            else:
-                most = f"95 % below {in_words(found[1], unit)}, RMS {after}"
-                yield in_words(found[0], unit), f"{kind}, median of rows {rows}; {most}; before: RMS {before}"
-    if result.expected_error is not None:
-        frame = "fitted" if result.free_of_frame else "base"
-        for kind, unit in POSE_KINDS.items():
-            size = in_words(getattr(getattr(result.expected_error, frame), kind), unit)
-            yield size, f"tool {kind} error expected from the covariance, {FRAMES[frame]} (RMS)"
-    known = sum(p.sigma is not None for p in result.estimated)
-    yield f"{result.n_configurations}", "configurations" if result.evaluated_only else "configurations fitted"
-    yield f"{known} of {len(result.estimated)}", "parameters estimated with a known uncertainty"
+def _not_determined(result: io.Result) -> Iterator[str]:
+    """A line a reason why combinations of parameters are not determined, with three of these."""
+    found: dict[str, list[str]] = {}
+    for one in result.observability.lost:
+        members = [name for name, factor in one.relation.items() if abs(factor) >= 0.01]  # the largest is 1
+        found.setdefault(one.reason, []).append(" with ".join(members[:3]) + " ..." * (len(members) > 3))
+    yield from (f"{shortened(combinations, 3)}: {reason}" for reason, combinations in found.items())
 
 
 def _command(result: io.Result) -> str:
     """The command that repeats the calibration in the folder of its job; empty without a job."""
     job, folds = [*result.inputs][:1], [] if result.folds is None else ["--folds", f"{result.folds.n}"]
     return shlex.join(["fg-calib", "calibrate", *job, "--out", "result", *folds]) if job else ""
-
-
-def _options(result: io.Result) -> Iterator[tuple[str, str]]:
-    for key, value in vars(result.options).items():
-        if value not in (None, (), "") and key != "accept":
-            yield key, shortened(list(value), 20) if isinstance(value, tuple) else str(value)

@@ -60,16 +60,6 @@ class ReportData(inputs.Record):
         assert self.configurations is not None
         return (self.configurations["split"] == "test").to_numpy()
 
-    def quantiles(self, kind: str) -> tuple[float, float] | None:
-        """Median and 95 % of a kind's residuals by configuration, of the rows of `split`; None if they were not saved.
-
-        One gross row is neither, though it may be nearly all of the RMS.
-        """
-        if self.configurations is None or f"rms_{kind}" not in self.configurations.columns:
-            return None
-        values = self.configurations.filter(split=self.split)[f"rms_{kind}"].drop_nulls().to_numpy()
-        return None if not len(values) else tuple(np.quantile(values, [0.5, 0.95]).tolist())
-
     @cached_property
     def workspace(self) -> prediction.PredictedErrors | None:
         """Expected errors over the workspace; None where nothing says what was measured."""

@@ -235,7 +235,7 @@ def lengths(rng, offset, n=60):
 def test_a_large_forgotten_offset_is_named_and_not_what_it_looks_like():
     robot, table = lengths(np.random.default_rng(1), 0.3)
     verdict = assess(solve(build_problem(robot, [table]))).verdict
-    assert any("use offset: estimate" in text for text in verdict.errors)
+    assert any("(`offset: estimate`)" in text for text in verdict.errors)
     assert not any("systematic residuals" in text for text in (*verdict.errors, *verdict.warnings))
 
 
@@ -251,5 +251,5 @@ def test_a_forgotten_offset_is_reported_with_its_size():
     assert found.size == pytest.approx(estimate, abs=0.1 * found.sigma)
     assert abs(found.size - 5e-3) < 4.0 * found.sigma
     verdict, healthy = assess(solution).verdict, assess(estimated).verdict
-    assert any("use offset: estimate" in text for text in (*verdict.errors, *verdict.warnings))
+    assert any("(`offset: estimate`)" in text for text in (*verdict.errors, *verdict.warnings))
     assert not any("offset: estimate" in text for text in (*healthy.errors, *healthy.warnings, *healthy.notes))

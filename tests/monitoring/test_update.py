@@ -89,7 +89,7 @@ def test_an_update_at_odds_with_what_was_known_points_to_the_check():
     """After a slip that nobody declared; not to the convention, which fitted before."""
     calibration, true, rng = calibrated(78)
     updated = calibration.update(measured(slipped(true, theta3=1e-3), 8, rng))
-    assert "See `fg-calib check`" in updated.findings[0]
+    assert "see `fg-calib check`" in updated.findings[0]
     assert not any("parallel" in text for text in updated.findings)
 
 

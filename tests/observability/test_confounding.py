@@ -45,7 +45,7 @@ def test_unknown_targets_take_up_what_a_known_one_shows(instrument):
     robot, _, table = measured_by(instrument, np.random.default_rng(0))
     _, found = looked_at(robot, table)
     reasons = by_reason(found)
-    help_ = ": to see it, give places of targets (key targets)"
+    help_ = ": to see it, give places of targets (key `targets`)"
     assert set(reasons) == {BASE, TARGETS_DO + help_}
     with_one, _ = looked_at(robot, given(table, ["t0"]))
     without, _ = looked_at(robot, table)

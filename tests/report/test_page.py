@@ -9,9 +9,9 @@ import pytest
 from instruments import measured_by
 from lxml import html
 from scipy.spatial.transform import Rotation
-from simulated import measure, plus, small_arm, true_robot
+from simulated import measure, plus, small_arm, tool_points, true_robot
 
-from fg_calib import Calibration, calibrate
+from fg_calib import Calibration, Job, Options, calibrate, calibrate_job
 from fg_calib.calibration import write_report
 from fg_calib.io.result import FIGURES
 from fg_calib.report import figures
@@ -21,6 +21,7 @@ from fg_calib.robot import Compliance, ErrorCurve, Mass
 
 WEAKLY = "Weakly determined (sigma above a tenth of the prior sigma, or of 1 mrad at the reach)"
 SECTIONS = [
+    *("May I use it?", "How accurate is it?", "What the data do not determine", "What to do next"),
     *("The arm and what was measured", "Notes", "Residuals (RMS)", "Fit statistics",
       "Goodness of fit (1 sigma of a row)"),
     *("Prediction of the test rows", "Expected tool error (RMS at 10 test configurations)"),
@@ -28,7 +29,7 @@ SECTIONS = [
     "Measurement frame (world_T_base)",
     *("Not identifiable from these data", WEAKLY, "Studentised residuals", "Error over joint space"),
     *("Correlations", "Expected error over the workspace"),
-    "Inputs, options and versions",
+    "For technicians",
 ]  # fmt: skip
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -74,16 +75,42 @@ def test_a_loaded_calibration_has_the_same_page(made, folder, tmp_path):
     assert (tmp_path / "report.html").read_text() == (folder / "report.html").read_text()
 
 
-def test_the_verdict_comes_first_with_its_values(made, page):
-    verdicts = [text_of(one) for one in page.xpath("//div[contains(@class, 'verdict')]")]
-    assert verdicts[0].startswith("DOUBTFUL: not to be trusted")
-    assert all(finding in verdicts[0] for finding in made.findings)
-    assert verdicts[1].startswith("FAIL: the specified limits FAIL: position")
-    tiles = {text_of(tile) for tile in page.xpath("//div[@class='tile']")}
-    rms, of_test = made.result.residual_rms["test"]["position"], made.report_data.held_out
-    median, most = 1e3 * np.quantile(made.configurations["rms_position"].to_numpy()[of_test], [0.5, 0.95])
-    words = f"95 % below {most:.3g} mm, RMS {rms.after * 1e3:.3g} mm; before: RMS {rms.before * 1e3:.3g} mm"
-    assert f"{median:.3g} mm position, median of rows held out; {words}" in tiles
+def test_page_one_says_whether_and_how_well_it_may_be_used(made, page):
+    (verdict,) = (text_of(one) for one in page.xpath("//div[contains(@class, 'verdict')]"))
+    assert verdict.startswith("DOUBTFUL: do not use it yet FAIL: position")
+    assert all(finding in verdict for finding in made.findings)
+    lengths = 1e3 * made.configurations["rms_position"].to_numpy()[made.report_data.held_out]
+    old, new = made.result.residual_statistics["test"]["position"]["before"], np.quantile(lengths, [0.95, 1.0])
+    each = {old.mean: lengths.mean(), old.p95: new[0], old.max: new[1]}
+    cells = [text_of(cell) for cell in page.xpath("//div[@class='first']//td")]
+    assert cells == ["position [mm]", *(f"{1e3 * old:.3g} → {new:.3g}" for old, new in each.items())]
+    found = made.result.observability.observability
+    assert found.rank < len(found.names)
+    assert f"{found.rank} of {len(found.names)} parameters" in text_of(page.xpath("//div[@class='tile'][last()]")[0])
+
+
+def test_page_one_has_no_command_and_the_last_page_all_of_them(made):
+    findings = (*made.findings, "outliers: 2: let a robust loss do so (`loss: gnc`)")
+    result = made.result.model_copy(update={"findings": findings})
+    page = html.fromstring(build_page(replace(made.report_data, result=result)))
+    one, last = text_of(page.xpath("//div[@class='first']")[0]), text_of(page.xpath("//section[last()]")[0])
+    assert not any(word in one for word in ("`", "fg-calib", "--", "accept:"))
+    assert "outliers: 2: let a robust loss do so" in one
+    assert all(finding in last for finding in findings)
+
+
+def test_page_one_says_whose_arm_it_is_and_who_measured_it(tmp_path):
+    about = {"customer": "A & B", "robot_serial": 2017, "operator": None, "note": "long " * 99 + "end"}
+    m = measure(small_arm(), 12, np.random.default_rng(5))
+    job = Job(None, small_arm(TOLERANCE), m, Options(model="position", frame="known"), document={"about": about})
+    calibrate_job(job).save(tmp_path)
+    write_report(tmp_path)
+    page = html.fromstring((tmp_path / "report.html").read_text())
+    names, texts = ([text_of(one) for one in page.xpath(f"//{tag}")] for tag in ("dt", "dd"))
+    assert names == ["customer", "robot serial", "note", "date", "measured"]
+    assert texts[:2] == ["A & B", "2017"]
+    assert len(texts[2]) <= 200
+    assert about["note"] in text_of(page.xpath("//section[last()]")[0])
 
 
 def test_page_and_text_show_the_same_tables(made, page):
@@ -156,9 +183,21 @@ def with_effects():
 
 
 def test_a_gross_row_flattens_no_chart(made):
-    chart = next(figures.error_over_joints(made.report_data))
-    assert chart.caption.endswith("rings the 5 largest; 1 beyond the axis, at its edge")
-    assert list(drawn(chart, "dots a"))[1].max() < 0.5 * made.report_data.rms[1].max()
+    for chart in figures.error_over_joints(made.report_data):
+        assert np.abs(list(drawn(chart, "dots a"))[1]).max() < 0.5 * made.report_data.rms[1].max()
+
+
+def test_an_error_once_a_turn_is_a_sine_over_its_joint():
+    rng, robot = np.random.default_rng(6), small_arm(TOLERANCE)
+    q, frame = rng.uniform(-3.0, 3.0, (200, 4)), (Rotation.identity(), np.zeros(3))
+    off = 1e-3 * np.sin(q) * [0, 1, 0, 0]
+    m = measure(robot, 200, rng, readings=q + off, frame=frame, sigma=(1e-6, 1e-6))
+    data = calibrate(robot, replace(m, readings=q, test=np.ones(200, dtype=bool)), model="position").report_data
+    moved = 1e3 * np.linalg.norm(tool_points(robot, q + off) - tool_points(robot, q), axis=1)  # chords of 1 mrad
+    _, chart, *_ = figures.error_over_joints(data)
+    x, y = drawn(chart, "dots b")
+    assert x == pytest.approx(np.degrees(q[:, 1]), abs=1.0)
+    assert y == pytest.approx(-np.sign(np.sin(q[:, 1])) * moved, abs=0.03)
 
 
 def test_error_curves_are_drawn_with_two_sigma_and_the_readings(with_effects):
