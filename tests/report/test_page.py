@@ -22,15 +22,13 @@ from fg_calib.robot import Compliance, ErrorCurve, Mass
 WEAKLY = "Weakly determined (sigma above a tenth of the prior sigma, or of 1 mrad at the reach)"
 SECTIONS = [
     *("May I use it?", "How accurate is it?", "What the data do not determine", "What to do next"),
-    *("The arm and what was measured", "Notes", "Residuals (RMS)", "Fit statistics",
-      "Goodness of fit (1 sigma of a row)"),
-    *("Prediction of the test rows", "Expected tool error (RMS at 10 test configurations)"),
-    *("Parameters", "Suspicious rows", "Suspicious test rows", "Suspicious configurations"),
-    "Measurement frame (world_T_base)",
-    *("Not identifiable from these data", WEAKLY, "Studentised residuals", "Error over joint space"),
-    *("Correlations", "Expected error over the workspace"),
+    *("The arm and what was measured", "Notes", "Residuals (RMS)", "Fit statistics"),
+    *("Goodness of fit (1 sigma of a row)", "Prediction of the test rows"),
+    *("Expected tool error (RMS at 10 test configurations)", "Parameters", "Suspicious rows", "Suspicious test rows"),
+    *("Suspicious configurations", "Measurement frame (world_T_base)", "Not identifiable from these data", WEAKLY),
+    *("Studentised residuals", "Error over joint space", "Correlations", "Expected error over the workspace"),
     "For technicians",
-]  # fmt: skip
+]
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
 
@@ -68,11 +66,6 @@ def text_of(element):
 def test_every_section_is_there_in_order(page):
     assert [text_of(title) for title in page.xpath("//h2")] == SECTIONS
     assert len(page.xpath("//figure/svg")) >= 4 + 2 + 2 + 1 + 4
-
-
-def test_a_loaded_calibration_has_the_same_page(made, folder, tmp_path):
-    write_report(folder, tmp_path)
-    assert (tmp_path / "report.html").read_text() == (folder / "report.html").read_text()
 
 
 def test_page_one_says_whether_and_how_well_it_may_be_used(made, page):
@@ -239,12 +232,6 @@ def test_a_loaded_calibration_draws_its_effects_too(with_effects, tmp_path):
     assert loaded.plot_curves()[:4] == loaded.plot_compliances()[:4] == "<svg"
     assert "Error curves of joints</h2>" in page
     assert "Compliance of joints</h2>" in page
-
-
-def test_errors_of_joints_are_measured_minus_predicted(with_effects):
-    assert figures.joint_errors(with_effects.report_data)[40:, 3] == pytest.approx(
-        1e-3, rel=0.25
-    )  # noise and errors of the estimate
 
 
 @pytest.mark.slow
