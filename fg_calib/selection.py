@@ -277,7 +277,7 @@ class _Choice:
         ix, out = np.ix_(c, c), np.tile(self.rows[:, -1], (self.robot.n_joints, 1))
         whole = self.gram[ix] + noise * np.diag(prior)
         for j, rows, gram in self.held:
-            x = scipy.linalg.solve(whole - gram[ix], gram[c, -1] - self.gram[c, -1], assume_a="pos")
+            x = scipy.linalg.cho_solve(scipy.linalg.cho_factor(whole - gram[ix]), gram[c, -1] - self.gram[c, -1])
             out[j, rows] += self.rows[np.ix_(rows, c)] @ x
         return out
 
