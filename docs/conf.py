@@ -17,7 +17,8 @@ html_theme = "furo"
 html_title = f"fg_calib {version}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_copy_source = html_show_sourcelink = False
+html_search_scorer = str(Path(__file__).parent / "_ext/scorer.js")
+html_show_copyright = html_copy_source = html_show_sourcelink = False
 html_math_renderer = "mathml"
 pygments_style, pygments_dark_style = "default", "github-dark"
 
@@ -31,7 +32,7 @@ nb_execution_timeout = 300
 
 default_role = "code"  # docstrings write names in single backticks
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
+autodoc_typehints = "none"  # `reference` writes them as the source does
 autodoc_default_options = {"members": True, "inherited-members": False}
 napoleon_google_docstring, napoleon_numpy_docstring = True, False
 napoleon_use_ivar, napoleon_attr_annotations = True, False

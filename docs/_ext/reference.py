@@ -3,6 +3,7 @@
 import ast
 import inspect
 import re
+import textwrap
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,8 @@ def api(stub: Path) -> tuple[str, str]:
     """A package and its page: the names in its stub, those that another page has as links."""
     package = ".".join(("fg_calib", *stub.relative_to(STUBS[0].parent).parts[:-1]))
     module = import_module(package)
-    page = title(package) + f".. py:module:: {package}\n\n{inspect.getdoc(module)}\n\n"
+    text = re.sub(r"\n\n(?=    )", "\n\n::\n\n", inspect.getdoc(module) or "", count=1)
+    page = title(f"Package {package}") + f".. py:module:: {package}\n\n{text}\n\n"
     imports = [node for node in ast.parse(stub.read_text()).body if isinstance(node, ast.ImportFrom)]
     names = {alias.name: f"{package}.{node.module}" for node in imports for alias in node.names}
     for name in sorted(names, key=str.lower):
@@ -63,7 +65,7 @@ def api(stub: Path) -> tuple[str, str]:
             else:
                 page += f".. auto{'class' if inspect.isclass(thing) else 'function'}:: {full}\n\n"
         elif text := ModuleAnalyzer.for_module(names[name]).find_attr_docs().get(("", name)):
-            page += f".. py:data:: {full}\n\n" + indented("\n".join(text))
+            page += f".. py:data:: {name}\n\n" + indented("\n".join(text))
     return package, page
 
 
@@ -78,14 +80,32 @@ def write(*_: Any) -> None:
 
 def link(_: Any, doctree: nodes.document) -> None:
     """Link the types that the reference describes; shapes, and types of other packages, are words."""
-    short = {at.rpartition(".")[2]: at for at in DESCRIBED.values()}
+    names = [at.rpartition(".")[2] for at in DESCRIBED.values()]
+    short = {name: at for name, at in zip(names, DESCRIBED.values(), strict=True) if names.count(name) == 1}
     for node in list(doctree.findall(addnodes.pending_xref)):
         target = node.get("reftarget", "")
         if node.get("refdomain") == "py" and target not in DESCRIBED.values():
-            if at := DESCRIBED.get(target, short.get(target)):
+            if at := DESCRIBED.get(target, short.get(target.rpartition(".")[2])):
                 node["reftarget"] = at
             else:
                 node.replace_self(node.children)
+
+
+def signature(
+    app: Any, what: str, name: str, thing: Any, options: Any, args: str | None, returns: str | None
+) -> tuple[str, str | None] | None:
+    """Arguments of functions as their source has them, where there is one; those of classes by name alone."""
+    if what in ("function", "method") and not thing.__code__.co_filename.startswith("<frozen"):
+        node = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0]
+        for each in (node.args.posonlyargs, node.args.args):
+            each[:] = [arg for arg in each if arg.arg not in ("self", "cls")]
+        return f"({ast.unparse(node.args)})", node.returns and ast.unparse(node.returns).strip("'")
+    if what == "class" and args:
+        names = [
+            p.name if p.default is p.empty else f"{p.name}=..." for p in inspect.signature(thing).parameters.values()
+        ]
+        return f"({', '.join(names)})", None
+    return None
 
 
 def escape(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
@@ -97,6 +117,7 @@ def setup(app: Any) -> dict[str, bool]:
     """Write before pages are looked for."""
     app.connect("config-inited", write)
     app.connect("autodoc-process-docstring", escape, priority=400)
+    app.connect("autodoc-process-signature", signature)
     app.connect("doctree-read", link)
     app.add_lexer("csv", TextLexer)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -5,6 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
+
 DOCS = Path(__file__).resolve().parents[1]
 ROOT = DOCS.parent
 INCLUDE = re.compile(r"^```\{include\} (\S+)\n```$", re.M)
@@ -48,7 +50,18 @@ def read(app: Any, docname: str, source: list[str]) -> None:
     source[0] = INCLUDE.sub(include, with_links(source[0], page, page))
 
 
+def describe(app: Any, doctree: nodes.document, docname: str) -> None:
+    """Give figures that notebooks draw the words of their section as alternative text."""
+    for image in doctree.findall(nodes.image):
+        section = image.parent
+        while section is not None and not isinstance(section, nodes.section):
+            section = section.parent
+        if not image.get("alt") and section is not None:
+            image["alt"] = f"Figure: {section.next_node(nodes.title).astext()}"
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Connect the reader of pages."""
     app.connect("source-read", read)
+    app.connect("doctree-resolved", describe)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
