@@ -34,7 +34,7 @@ def ur5e(folder, **changes):
     return read_robot(path)
 
 
-def write_job(folder, measurements, *, angles=None, pairs=None, **keys):
+def write_job(folder, measurements, *, angles=None, **keys):
     """A job on what was measured, in m and rad; `angles` are written as roll, pitch, yaw instead of quaternions."""
     m = measurements
     columns = {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
@@ -46,9 +46,6 @@ def write_job(folder, measurements, *, angles=None, pairs=None, **keys):
     write_csv(folder / "poses.csv", columns)
     job = {"robot": "robot.yaml", "measurements": "poses.csv", "units": {"length": "m", "angle": "rad"}}
     job["noise"] = {"position": SIGMA[0], "orientation": SIGMA[1]}
-    if pairs is not None:
-        write_csv(folder / "pairs.csv", pairs)
-        job |= {"pairs": "pairs.csv", "noise": {"distance": SIGMA[0], "angle": SIGMA[1]}}
     path = folder / "job.yaml"
     path.write_text(yaml.safe_dump(job | keys))
     return path
