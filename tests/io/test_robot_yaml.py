@@ -14,16 +14,16 @@ from fg_calib.robot import CONVENTIONS, Axis, Element, Joint, RobotBuilder
 
 GOOD = """\
 name: two
-convention: mdh-hayati
 units: {length: mm, angle: deg}
+convention: mdh-hayati
 joints:
-  - {a: 0, alpha: 0, d: 100, theta: 0, beta: 0, limits: [-90, 90]}
-  - {a: 1e1, alpha: -90, d: 0.5, theta: 30, beta: 1, type: prismatic, name: slide, limits: [0, 200]}
-base: {x: 1, yaw: 90}
-tool: {z: 50}
+- {a: 0.0, alpha: 0.0, d: 100.0, theta: 0.0, beta: 0.0, limits: [-90.0, 90.0]}
+- {name: slide, a: 10.0, alpha: -90.0, d: 0.5, theta: 30.0, beta: 1.0, type: prismatic, limits: [0.0, 200.0]}
+base: {x: 1.0, yaw: 90.0}
+tool: {z: 50.0}
 fixed: [a1, beta2]
 estimate: [tool.z]
-tolerance: {a: 1, alpha: 0.5, d2: 2, tool: 5, base.yaw: 3}
+tolerance: {base.yaw: 3.0, a: 1.0, alpha: 0.5, d2: 2.0, tool: 5.0}
 """
 
 
@@ -34,7 +34,7 @@ def read(tmp_path, text, name="robot.yaml"):
 
 
 def test_a_robot_file_is_converted_to_si(tmp_path):
-    robot = read(tmp_path, GOOD)
+    robot = read(tmp_path, GOOD.replace("a: 10.0", "a: 1e1").replace("d: 100.0", "d: 100"))
     assert (robot.name, robot.convention, robot.n_joints) == ("two", "mdh-hayati", 2)
     assert robot.joints[0] == Joint("q1", lower=-math.radians(90), upper=math.radians(90))
     assert robot.joints[1] == Joint("slide", prismatic=True, lower=0.0, upper=0.2)
@@ -161,21 +161,5 @@ def test_a_robot_that_no_file_can_hold_is_refused(tmp_path):
 
 
 def test_a_written_robot_is_readable_for_people(tmp_path):
-    robot = read(tmp_path, GOOD)
-    write_robot(tmp_path / "out.yaml", robot, units=Units(length="mm", angle="deg"))
-    assert (
-        (tmp_path / "out.yaml").read_text()
-        == """\
-name: two
-units: {length: mm, angle: deg}
-convention: mdh-hayati
-joints:
-- {a: 0.0, alpha: 0.0, d: 100.0, theta: 0.0, beta: 0.0, limits: [-90.0, 90.0]}
-- {name: slide, a: 10.0, alpha: -90.0, d: 0.5, theta: 30.0, beta: 1.0, type: prismatic, limits: [0.0, 200.0]}
-base: {x: 1.0, yaw: 90.0}
-tool: {z: 50.0}
-fixed: [a1, beta2]
-estimate: [tool.z]
-tolerance: {base.yaw: 3.0, a: 1.0, alpha: 0.5, d2: 2.0, tool: 5.0}
-"""
-    )
+    write_robot(tmp_path / "out.yaml", read(tmp_path, GOOD), units=Units(length="mm", angle="deg"))
+    assert (tmp_path / "out.yaml").read_text() == GOOD
