@@ -2,11 +2,13 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import polars as pl
 import pytest
 from instruments import CAMERA, TARGETS, measured_by
+from refusals import refusal
 from scipy.stats import chi2
 from simulated import nees, small_arm, true_robot, write_job
 from sparing import diagonal
@@ -135,10 +137,7 @@ def test_a_job_with_contacts_runs_from_the_command_line(fg_calib, tmp_path):
     assert [last[k] for k in ("kind", "a", "b", "split", "unit")] == ["distance", "g0", "g3", "test", "m"]
 
 
-def refused(robot, measurements, **options):
-    with pytest.raises(ProblemError) as error:
-        build_problem(robot, measurements, **options)
-    return str(error.value)
+refused = partial(refusal, build_problem, error=ProblemError)
 
 
 def test_contacts_that_a_model_cannot_use_or_without_sigmas_are_refused():

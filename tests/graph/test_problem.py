@@ -1,9 +1,11 @@
 """What takes part in a problem, how it is whitened, and what is refused."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, planar_robot, small_arm, true_robot
 
@@ -116,10 +118,7 @@ def test_a_pair_that_lacks_a_measurement_gives_the_other_row_only():
     assert all(v == 0 for v in problem.n_excluded.values())
 
 
-def refused(robot, measurements, **options):
-    with pytest.raises(ProblemError) as error:
-        build_problem(robot, measurements, **options)
-    return str(error.value)
+refused = partial(refusal, build_problem, error=ProblemError)
 
 
 def test_what_cannot_be_solved_is_refused_in_one_line():
