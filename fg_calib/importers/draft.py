@@ -75,12 +75,19 @@ noise: {noise}
 
 _NO_TOLERANCE = """\
 # DECIDE how far off the nominal model may be: the robot file does not say it of all that is estimated, such as
-# tolerance: {a: 0.001, alpha: 0.1}, 1 sigma in its units. Without, nothing fixes what data do not determine.
+# {example}.
+# These are 1 sigma. Without, nothing fixes what data do not determine.
 """
+
+_TOLERANCES = {
+    False: "tolerance: {a: 0.001, alpha: 0.1}, in its units",
+    True: "robot: {urdf: NAME, tolerance: {x: 1, y: 1, z: 1, roll: 0.1, pitch: 0.1, yaw: 0.1}}, in this job's units",
+}
+"""Where prior sigmas stand: in a robot file, in the job of a URDF."""
 
 _NO_TOOL = """\
 # DECIDE whether exactly the robot file's tool was measured; if not: estimate: [tool.x, tool.y, tool.z]
-# in it (and tool.roll, tool.pitch, tool.yaw where orientations were measured).
+# next to it (and tool.roll, tool.pitch, tool.yaw where orientations were measured).
 """
 
 
@@ -247,7 +254,8 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
     tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
     place, noises = _path(found["robot"][0], out.parent), _flow({**noise, "joint": joint, "estimate": True})
-    notes = _NO_TOLERANCE * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool))
+    wide = _NO_TOLERANCE.format(example=_TOLERANCES[place.endswith(".urdf")].replace("NAME", place))
+    notes = wide * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool))
     entries = "\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent))
     return _TEMPLATE.format(robot=place, notes=notes, entries=entries, units=_flow(units), noise=noises)
 

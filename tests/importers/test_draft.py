@@ -145,6 +145,16 @@ def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
     assert (ended.code, ended.err) == (1, f"error: {folder / JOB}: is there already, expected a folder without it\n")
 
 
+def test_a_job_of_a_urdf_has_prior_sigmas_as_the_draft_says(fg_calib, folder):
+    folder, write = folder
+    fg_calib("export", folder / "robot.yaml", "--to", "urdf", "--out", folder / "arm.urdf")
+    drafted(fg_calib, folder, folder / "arm.urdf", write())
+    text = (folder / JOB).read_text()
+    advice = text.partition("# robot: ")[2].partition(", in this job's units")[0]
+    (folder / JOB).write_text(text.replace("robot: arm.urdf", f"robot: {advice}", 1))
+    assert not any(p.tolerance is None for p in read_job(folder / JOB).robot.parameters if p.estimated)
+
+
 REFUSED = {
     "no robot": (["poses.csv"], "init: no robot among the files, expected one, such as robot.yaml or a URDF"),
     "no table": (["robot.yaml"], "init: no table among the files, expected one, such as poses.csv"),
