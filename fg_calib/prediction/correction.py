@@ -122,8 +122,7 @@ def correct_targets(
     fitted = errors_at(posterior, found.readings, context)[1].position
     missed, expected = np.column_stack([found.miss_position, found.miss_rotation]), np.sqrt(variance)
     at, whole = (commanded.position, commanded.rotation), np.nan if fitted is None else fitted
-    more = (turned is not None, bool(context))
-    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, *more)
+    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, turned is not None, bool(context))
 
 
 def _check_targets(
