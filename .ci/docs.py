@@ -45,9 +45,9 @@ def luminance(colour: str) -> float:
 
 def faults_of_colours(style: Path) -> list[str]:
     """Texts of the report that are hard to read, light and dark."""
-    faults = []
+    faults, colours = [], {}
     for block in re.findall(r":root \{(.*?)\}", style.read_text(), re.S):
-        colours = dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", block))
+        colours |= dict(re.findall(r"--([a-z]+): (#[0-9a-f]{6})", block))
         for text in ("ink", "soft", "good", "bad", "open"):
             for ground in ("paper", "panel"):
                 dark, light = sorted(luminance(colours[name]) for name in (text, ground))
