@@ -56,8 +56,7 @@ _GUESSES = {"orientation": ("angle", 2e-4), "angle": ("angle", 2e-4), "pixel": (
 """Noise to start from by kind, [rad] or [px]; 1e-4 m of others."""
 
 _TEMPLATE = """\
-# A calibration job, written by fg-calib init. Lines with DECIDE are yours to look at; `fg-calib inspect` says what this
-# job looks like.
+# A calibration job by fg-calib init. Lines with DECIDE are yours to look at; `fg-calib inspect` looks for mistakes.
 robot: {robot}
 {notes}measurements:
 {entries}
@@ -70,7 +69,7 @@ noise: {noise}
 # pairing: star   # of models of pairs: star | chain | all | {{random: 3000, seed: 0}}
 # loss: none      # huber | cauchy | geman-mcclure | gnc where there are gross errors
 # gauge: prior    # what data do not determine: priors fix it; keep: it stays at nominal; none
-# A column split with `test` in some rows keeps them out of the fit, to check the prediction.
+# folds: 5        # checks the prediction where no column split has `test` rows; a limit: accept: {{position: 0.5 mm}}
 """
 
 _NO_TOLERANCE = """\
@@ -336,4 +335,5 @@ def _path(file: Path, folder: Path) -> str:
 
 def _flow(value: Any) -> str:
     """A value of YAML on one line."""
-    return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False, allow_unicode=False).strip()
+    plain = str(value).isprintable()  # not those that turn or hide text
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False, allow_unicode=plain).strip()

@@ -191,8 +191,8 @@ class Table(Record):
                 cells = cells.set(cells.is_null() & texts.is_not_null(), np.nan)
             elif not cells.dtype.is_numeric() and cells.dtype != pl.Null:
                 raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "numbers")
-            cells = cells.cast(pl.Float64)
-            self.require(cells.is_finite().fill_null(optional).to_numpy(), column, "a finite number")
+            finite = (cells := cells.cast(pl.Float64)).is_finite().fill_null(optional).to_numpy()
+            self.require(finite, column, "a finite number", "delete the row if nothing was measured")
             values[:, k] = cells.to_numpy()
             if (own := self.renamed.get(column)) is not None:
                 values[:, k] = (values[:, k] - own.zero) * own.scale
@@ -248,7 +248,7 @@ class Table(Record):
             found = "an empty cell" if cell in {None, ""} else shown(cell)
             if not row and str(cell).strip("[]() ").lower() in (*LENGTHS, *ANGLES, "degrees", "°"):
                 hint = "is it a row of units? delete it: units are in the job"
-            raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, hint or number_hint(cell))
+            raise InputError(f"{self.place(row)}: {column}", f"found {found}", expected, number_hint(cell) or hint)
 
     def place(self, row: int) -> str:
         """File and line of a row of a CSV (the header is line 1); of a Parquet file or a frame the 0-based row."""
@@ -640,7 +640,7 @@ def read_targets(path: Path | str | Any, robot: Robot, units: Units | None = Non
     named = table.present(*(f"q{i + 1}" for i in range(robot.n_joints)), *(joint.name for joint in robot.joints))
     if position is None and (rotation is not None or not named):
         found = "neither x y z nor joint columns" if rotation is None else "orientations without x y z"
-        raise InputError(table.name, found, "x y z, or joint values alone", f"it has {', '.join(table.columns)}")
+        raise InputError(table.name, found, "x y z, or q1 ... qn alone", f"it has {', '.join(table.columns)}")
     readings = read_readings(table, find_joint_columns(table, robot), robot, units) if named else None
     ids = tuple(read_ids(table, repeated=False).tolist())
     return Targets(ids, position, rotation, readings, _read_context(table, robot, readings))

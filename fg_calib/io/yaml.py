@@ -91,7 +91,7 @@ def first_misfit(error: ValidationError, place: str) -> InputError:
             found, expected = f"missing key{'s' * (n > 1)} {names}", ""
         case "unknown_key":
             found, expected = f"unknown key {context['key']!r}", f"one of {', '.join(context['known'])}"
-            hint = did_you_mean(context["key"], context["known"])
+            hint = did_you_mean(key := context["key"], context["known"]) or "a robot file has it" * (key == "effects")
         case "literal_error":
             hint = did_you_mean(first["input"], _options(first))
         case "string_type" if isinstance(first["input"], bool | float):

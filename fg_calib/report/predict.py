@@ -306,7 +306,7 @@ def _correction_notes(ids: Sequence[str], correction: Correction, robot: Robot) 
     doubts = {
         "Reached with the point alone, the tool rotated as near as the arm can": ~correction.reached & point,
         "Out of reach within the joint limits": ~correction.reached & ~point,
-        "Look at these first: a joint changes far (near a singularity, or on another branch)": correction.far,
+        "Look at these first: a joint changes far (singularity, another branch, or another tool)": correction.far,
     }
     for words, rows in doubts.items():
         if rows.any():

@@ -68,11 +68,11 @@ DEGREES = {f"q{i}": 180 / np.pi for i in range(1, 7)} | dict.fromkeys("xyz", 1e3
 
 def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     folder, write = folder
-    names = {f"q{i}": f"J{i} [deg]" for i in range(1, 7)} | {"x": "X (mm)", "y": "Y_mm", "z": "pos_z [mm]"}
+    names = {f"q{i}": f"J{i} [°]" for i in range(1, 7)} | {"x": "X (mm)", "y": "Y_mm", "z": "pos_z [mm]"}
     given = drafted(fg_calib, folder, folder / "robot.yaml", write(names, DEGREES))
     assert given["units"] == {"length": "mm", "angle": "deg"}
     assert given["measurements"][0]["columns"] == names
-    assert "DECIDE whether these are what the names mean" in (folder / JOB).read_text()
+    assert all(words in (folder / JOB).read_text() for words in ("J6 [°]", "DECIDE whether these are what the names mean"))
     write(name="plain.csv")
     (folder / "plain.yaml").write_text("{robot: robot.yaml, measurements: plain.csv, model: position}")
     mine, plain = (read_job(folder / f).tables[0].measurements for f in (JOB, "plain.yaml"))

@@ -125,12 +125,12 @@ ROWS = XYZ + "0.1,0.2,1,2,3\n0.4,0.5,4,5,6\n"
 POSES = [
     (ROWS.encode("utf-16"), "poses.csv:1: a null character, expected UTF-8 text; is it UTF-16, Latin-1 or Windows text? save it as UTF-8"),
     (ROWS.replace("0.2", '"0.2'), "poses.csv:2: a quote that is not closed, expected whole cells in quotes, or none"),
-    ("\n\n" + ROWS.replace("0.2", ""), "poses.csv:4: q2: found an empty cell, expected a finite number"),
+    ("\n\n" + ROWS.replace("0.2", ""), "poses.csv:4: q2: found an empty cell, expected a finite number; delete the row if nothing was measured"),
     (ROWS.replace("0.2", "1e200"), f"poses.csv:2: q2: found '1e200', expected {ORDINARY}"),
-    (ROWS + ",,,,7\n", "poses.csv:4: q1: found an empty cell, expected a finite number"),
-    (ROWS.replace("\n", "\r").replace("0.2", "?"), "poses.csv:2: q2: found '?', expected a finite number"),
+    (ROWS + ",,,,7\n", "poses.csv:4: q1: found an empty cell, expected a finite number; delete the row if nothing was measured"),
+    (ROWS.replace("\n", "\r").replace("0.2", "?"), "poses.csv:2: q2: found '?', expected a finite number; delete the row if nothing was measured"),
     ("q1,q2\n−0.5,0\n", "poses.csv:2: q1: found '−0.5', expected a finite number; its minus is another character, a dash; write -"),
-    (XYZ + "0,0,1,2,3\n\n0,0,x,2,3\n", "poses.csv:4: x: found 'x', expected a finite number"),
+    (XYZ + "0,0,1,2,3\n\n0,0,x,2,3\n", "poses.csv:4: x: found 'x', expected a finite number; delete the row if nothing was measured"),
     (XYZ + "180,0,1,2,3\n", "poses.csv:2: q1 = 180 rad is outside [-2, 2]; widen the joint's limits if the reading is right; are the columns in the joints' order?"),
     ("q1,q2,id\n0,0,a\n0,0,a\n", "poses.csv:3: id: found 'a', expected different ids"),
     ("q1,q2,sigma_x,sigma_position\n0,0,1,1\n", "poses.csv: no column sigma_y, expected sigma_x sigma_y sigma_z together"),
@@ -139,7 +139,7 @@ POSES = [
 
 GROUPS = "q1,q2,id,group\n0,0,a,g\n1,0,b,g\n1,1,c,h\n0,1,d,\n"
 PAIRS = [
-    ("A,B,Distance\na,b,x\n", "pairs.csv:2: distance: found 'x', expected a finite number"),
+    ("A,B,Distance\na,b,x\n", "pairs.csv:2: distance: found 'x', expected a finite number; delete the row if nothing was measured"),
     ("a,b,distance\na,z,1\n", "pairs.csv:2: b: found 'z', expected an id or a group"),
     ("a,b,distance\na,a,1\n", "pairs.csv:2: b: found 'a', expected another than a"),
     ("a,b,angle\na,b,4\n", "pairs.csv:2: angle: found '4', expected 0 to pi, in rad; angles of the table are in rad"),
