@@ -448,7 +448,7 @@ class Calibration(Record, repr=False, eq=False):
         return every[np.ix_(rows, rows)]
 
     def to_dataframe(self, of: DataFrameOf = "parameters") -> "pl.DataFrame":
-        """A part of it as a polars table, which `.to_pandas()` makes one of pandas.
+        """A part of it as a polars table; its `.to_pandas()` needs pandas and pyarrow.
 
         Args:
             of: `parameters`, or `covariance` with a column for each, in [m] and [rad]; `residuals` or `configurations`

@@ -113,10 +113,20 @@ def escape(app: Any, what: str, name: str, thing: Any, options: Any, lines: list
     lines[:] = [re.sub(r"(`[^`]*`)|\|", lambda found: found[1] or r"\|", line) for line in lines]
 
 
+def rejoin(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Put the words before a colon back, which napoleon takes for a type of properties and returned values."""
+    for line in [line for line in lines if re.match(r":r?type: ", line)]:
+        lines.remove(line)
+        at = next((k for k, one in enumerate(lines) if one.startswith(":returns: ")), 0)
+        field = ":returns: " * lines[at].startswith(":returns: ")
+        lines[at] = f"{field}{line.split(': ', 1)[1]}: {lines[at].removeprefix(field)}"
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Write before pages are looked for."""
     app.connect("config-inited", write)
     app.connect("autodoc-process-docstring", escape, priority=400)
+    app.connect("autodoc-process-docstring", rejoin, priority=600)
     app.connect("autodoc-process-signature", signature)
     app.connect("doctree-read", link)
     app.add_lexer("csv", TextLexer)

@@ -10,6 +10,7 @@ initial values without a word when it gets the columns wrong. So `CheckedFactor`
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from numbers import Real
@@ -261,15 +262,14 @@ def with_added(
         raise ProblemError("problem.initial", what, "one for every variable of the graph, and no others")
     for factor in factors:
         _check_factor(factor, initial)
-    variables = variables.with_added(sorted(given.difference(ours.keys)), initial)
+    variables = variables.with_added(more := sorted(given.difference(ours.keys)), initial)
     for v in (*variables.items, *variables.nuisance):
-        try:
-            fits = bool(np.isfinite(variables.parameters(initial, [v])).all())
-        except (RuntimeError, ValueError):
-            fits = False
-        if not fits:
-            expected = "a gtsam.Pose3" if v.is_pose else f"{len(v.parameters)} finite numbers"
-            raise ProblemError(f"problem.initial: {v.symbol}", "another value", expected)
+        with suppress(RuntimeError, ValueError):
+            if np.isfinite(variables.parameters(initial, [v])).all():
+                continue
+        pose = f"a {'vector or a ' * (v.key in more)}gtsam.Pose3"
+        expected = pose if v.is_pose else f"{len(v.parameters)} finite numbers"
+        raise ProblemError(f"problem.initial: {v.symbol}", "another value", expected)
     return variables, variables.parameters(initial)
 
 

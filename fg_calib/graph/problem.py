@@ -225,13 +225,12 @@ class Problem(FrozenArrays):
     @property
     def n_priors(self) -> int:
         """Scalar priors."""
-        v = self.variables
-        of_unknowns = sum(len(one.prior[0]) for one in v.nuisance if one.prior is not None)
-        return of_unknowns + sum(len(places) for places, _ in v.prior_weights.values())
+        of_unknowns = sum(len(v.prior[0]) for v in self.variables.nuisance if v.prior is not None)
+        return of_unknowns + sum(len(places) for places, _ in self.variables.prior_weights.values())
 
     @property
     def n_added(self) -> int:
-        """Scalar rows of added factors."""
+        """Scalar rows of added factors, in the problem of a solution; 0 before `solve`."""
         return sum(factor.dim() for factor in self.added)
 
     @cached_property

@@ -148,7 +148,7 @@ def _describe(hint: Any) -> str:
     if kind is Literal:
         return f"one of {', '.join(parts)}"
     if kind in (Sequence, tuple):
-        return f"a list of {getattr(parts[0], '__name__', 'them')}"
+        return f"a list of {' or '.join(getattr(part, '__name__', 'them') for part in _alternatives(parts[0]))}"
     if kind in (Mapping, dict):
         return "a mapping"
     return _WORDS.get(kind) or f"a{'n' * (kind.__name__[0] in 'AEIO')} {kind.__name__}"

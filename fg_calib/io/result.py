@@ -246,7 +246,7 @@ class Result(Section):
     n_residuals: int = of("problem.n_residuals")
     n_priors: int = of("problem.n_priors", 0)
     n_unknowns: int = 0
-    n_determined: int = of("assessed.spread.rank", 0)
+    n_determined: int = 0
     n_excluded: dict[str, int] = of("problem.n_excluded")
     solver: SolverRun = of("solution")
     trustworthy: Annotated[bool, Field(strict=True)] = of("assessed.trustworthy")
@@ -334,6 +334,7 @@ class Result(Section):
             pair_errors=problem.options.pair_errors if problem.pair_blocks else None,
             tables=tuple((label, in_words(table)) for label, table in zip(data.labels, data.tables, strict=True)),
             n_unknowns=len(problem.variables.all_scales),
+            n_determined=assessed.spread.rank + solution.system.left.rank,
             goodness={key_of(kind, goodness.kinds): kind for kind in goodness.kinds},
             residual_rms=_residual_rms(assessed.fit.residuals),
             residual_statistics=_by_kind(assessed.fit.residuals, _statistics),

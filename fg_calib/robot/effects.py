@@ -249,7 +249,7 @@ class _Loaded(Effect):
 
 
 class Compliance(_Loaded, Record):
-    """Joints that give way to gravity: q + k tau(q), k in [rad/(N m)], positive.
+    """Joints that give way to gravity: q + k tau, k in [rad/(N m)], positive; tau where they have turned.
 
     Attributes:
         masses: The masses on the arm, a payload among them; None if only products of compliance and first moments of
