@@ -157,18 +157,6 @@ def test_columns_of_no_use_and_rows_that_take_no_part_are_reported(write, caplog
     assert read_measurements(path, ARM, model="distance").labels["station"].names == ("s",)
 
 
-def test_parquet_and_csv_read_the_same(write):
-    csv = read_measurements(write(POSES), ARM, pairs=write(PAIRS, "pairs.csv"))
-    columns = pl.read_csv(write(POSES).read_bytes().replace(b" 0.5 ", b"0.5")).to_dict()
-    pairs = pl.read_csv(write(PAIRS, "pairs.csv")).to_dict()
-    parquet = read_measurements(write(columns, "poses.parquet"), ARM, pairs=write(pairs, "pairs.pq"))
-    for name in ("readings", "ids", "test", "position", "rotation"):
-        assert np.array_equal(getattr(csv, name), getattr(parquet, name)), name
-    for name in ("a", "b", "distance", "angle", "sigma_distance", "sigma_angle", "test"):
-        a, b = (getattr(pairs, name) for pairs in (csv.pairs, parquet.pairs))
-        assert np.array_equal(a, b, equal_nan=name != "test"), name
-
-
 def test_pairs_name_configurations_by_id(write):
     noise = Noise(distance=0.02, angle=0.03)
     pairs = read_measurements(write(POSES), ARM, pairs=write(PAIRS, "pairs.csv"), noise=noise).pairs

@@ -61,7 +61,7 @@ class Pandas:
         return self._columns
 
 
-@pytest.mark.parametrize("frame", ["polars", "lazy", "pandas", "mapping", "arrays"])
+@pytest.mark.parametrize("frame", ["polars", "lazy", "pandas", "mapping", "arrays", "parquet"])
 def test_every_way_in_gives_what_a_csv_gives(tmp_path, frame):
     columns, pairs, arrays = table()
     noise = Noise(orientation=2e-4, joint=1e-5, angle=3e-4)
@@ -71,6 +71,10 @@ def test_every_way_in_gives_what_a_csv_gives(tmp_path, frame):
     of_file = read_measurements(tmp_path / "poses.csv", ROBOT, pairs=tmp_path / "pairs.csv", noise=noise)
     if frame == "arrays":
         found = Measurements.from_arrays(Q, **arrays)
+    elif frame == "parquet":
+        pl.DataFrame(columns).write_parquet(tmp_path / "poses.parquet")
+        pl.DataFrame(pairs).fill_nan(None).write_parquet(tmp_path / "pairs.pq")
+        found = read_measurements(tmp_path / "poses.parquet", ROBOT, pairs=tmp_path / "pairs.pq", noise=noise)
     else:
         made = {"polars": pl.DataFrame, "lazy": pl.LazyFrame, "pandas": Pandas, "mapping": dict}[frame]
         found = Measurements.from_frame(made(columns), ROBOT, pairs=made(pairs), noise=noise)
