@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from simulated import measure, paper_robot, planar_robot, small_arm, true_robot
+from simulated import measure, paper_robot, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
@@ -18,21 +18,6 @@ TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}
 
 def sigma_of(uncertainty):
     return {p.name: p.sigma for p in uncertainty.estimates.parameters}
-
-
-def test_covariance_of_a_planar_arm_is_the_one_computed_by_hand():
-    """At q2 = 0 the planar arm's tool is at a1 + a2 along x, (a2 theta2) along y: sums and products one can do."""
-    robot = planar_robot()
-    n, sigma = 50, 2e-3
-    q = np.array([[0.0, 0.0]] * (n // 2) + [[0.0, np.pi]] * (n // 2))
-    x = np.where(q[:, 1] == 0.0, 3.0, 1.0)
-    position = np.stack([x, np.zeros(n), np.zeros(n)], axis=1)
-    measurements = Measurements.from_arrays(q, position=position, sigma_position=sigma)
-    found = sigma_of(assess(solve(build_problem(robot, measurements, model="position"))))
-    # a1 + a2 and a1 - a2 are each the mean of n / 2 values, a2 theta2 that of n values (with both signs)
-    assert found["a1"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
-    assert found["a2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
-    assert found["theta2"] == pytest.approx(sigma / np.sqrt(n), rel=1e-6)
 
 
 def test_without_priors_only_determined_parameters_have_a_sigma():
