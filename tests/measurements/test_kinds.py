@@ -148,18 +148,6 @@ def test_compiled_twins_compute_what_numpy_does(kind, convention):
         assert np.abs(found - expected).max() <= 1e-13 * np.abs(expected).max()
 
 
-@EVERY_KIND
-def test_the_reductions_are_those_of_the_rows(kind):
-    rng = np.random.default_rng(20)
-    robot = random_robot("mdh-hayati", 6, rng)
-    block, chain = random_block(kind, robot, 700, rng), chain_of(robot)
-    r, J = residuals.linearise(block, chain)
-    rows = np.concatenate([J.reshape(r.size, -1), r.reshape(-1, 1)], axis=1)
-    expected = rows.T @ rows
-    R = residuals.triangle(block, chain)
-    assert R.T @ R == pytest.approx(expected, abs=rounding(expected, 10))
-
-
 CAMERA = Camera(fx=900, fy=910, cx=640, cy=480, k1=-0.2, k2=0.1, p1=0.001, p2=-0.002, k3=0.01)
 
 
