@@ -85,29 +85,6 @@ def test_a_distance_of_zero_between_measured_poses_is_a_number_like_others():
     assert problem.n_residuals == 45
 
 
-def test_same_points_calibrate_an_arm_without_any_frame():
-    """Two configurations of a planar arm with the same tool point: elbow up, elbow down."""
-    rng = np.random.default_rng(0)
-    robot = planar_robot(tolerance={"a": 0.01, "theta": 0.01})
-    values = robot.nominal
-    values[[p.name for p in robot.parameters].index("theta2")] = 0.008
-    true = robot.with_values(values)
-    q = []
-    for elbow in rng.uniform(0.5, 2.5, 20):
-        shoulder = rng.uniform(-1, 1)
-        up = np.array([shoulder, elbow - 0.008])
-        tip = pose(true, up[None]).position[0]
-        down = np.array([0.0, -elbow - 0.008])
-        down[0] = np.arctan2(tip[1], tip[0]) - np.arctan2(*pose(true, down[None]).position[0][1::-1])
-        q += [up, down]
-    pairs = direct_pairs(np.zeros(20), np.full(20, np.nan), sigma=(1e-5, 1e-3))
-    solution = solve(build_problem(robot, bare(robot, np.array(q), pairs), model="distance"))
-    assert solution.converged
-    assert solution.problem.n_residuals == 60
-    found = dict(zip([p.name for p in robot.parameters], solution.parameters, strict=False))
-    assert found["theta2"] == pytest.approx(0.008, abs=1e-6)
-
-
 def test_a_pair_that_lacks_a_measurement_gives_the_other_row_only():
     measurements = planar_pairs([0.5, 1.0, 1.5])
     pairs = replace(measurements.pairs, distance=np.array([np.nan, 1.0, np.nan]), angle=np.array([0.5, np.nan, np.nan]))
