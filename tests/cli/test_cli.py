@@ -23,6 +23,11 @@ from fg_calib.io import Units, read_measurements
 JOB, POSES, ROBOT, TRUTH = "calibration.yaml", "poses.csv", "robot_nominal.yaml", "robot_true.yaml"
 OUTPUTS = {"result.json", "robot_calibrated.yaml", "residuals.csv", "configurations.csv"}
 NUMBER = (int, float)
+DOCUMENT = """schema version robot model frame pairing n_configurations n_pairs n_residuals n_priors n_excluded solver
+trustworthy findings chi2 dof reduced_chi2 residual_rms parameters covariance frame_estimate observability inputs"""
+SOLVER = "name converged message iterations initial_cost cost seconds history"
+OBSERVABILITY = """schema model kind n_parameters rank names gap singular_values independent ineffective relative
+null_space indices condition_number"""
 PARAMETER = "name unit nominal estimate correction sigma prior_sigma identifiability stands_for sigma_of_combination"
 
 
@@ -74,30 +79,15 @@ def test_calibrating_the_example_ends_well_and_writes_its_files(calibrated, resu
 
 
 def test_a_result_has_every_key_of_its_schema(result):
-    rms = {"train": dict, "test": dict}
-    shape = {
-        **{"schema": str, "version": str, "robot": str, "model": str, "frame": str, "pairing": str},
-        **{"n_configurations": int, "n_pairs": int, "n_residuals": int, "n_priors": int, "n_excluded": dict},
-        **{"solver": dict, "trustworthy": bool, "findings": list, "chi2": float, "dof": int, "reduced_chi2": float},
-        **{"residual_rms": dict, "parameters": list, "covariance": dict, "frame_estimate": type(None)},
-        **{"observability": dict, "inputs": dict},
-    }
-    assert {key: type(result[key]) for key in shape} == shape  # more may be added
+    assert result.keys() >= set(DOCUMENT.split())  # more may be added
     assert result["schema"] == "fg-calib/result/2"
     assert (result["version"], result["robot"]) == (__version__, "space-robot")
     assert (result["model"], result["frame"], result["pairing"]) == ("distance-rotation", "unknown", "star")
-    assert {key: type(value) for key, value in result["residual_rms"].items()} == rms
-    solver = {"name": str, "converged": bool, "message": str, "iterations": int, "initial_cost": float, "cost": float}
-    solver |= {"seconds": float, "history": list}
-    assert {key: type(result["solver"][key]) for key in solver} == solver
+    assert result["residual_rms"].keys() == {"train", "test"}
+    assert result["solver"].keys() >= set(SOLVER.split())
     assert result["solver"]["name"] == "gtsam-lm"
     assert result["solver"]["converged"] is True
-    observability = {
-        **{"schema": str, "model": str, "kind": str, "n_parameters": int, "rank": int, "names": list, "gap": float},
-        **{"singular_values": list, "independent": list, "ineffective": list, "relative": list, "null_space": list},
-        **{"indices": dict, "condition_number": float},
-    }
-    assert {key: type(result["observability"][key]) for key in observability} == observability
+    assert result["observability"].keys() >= set(OBSERVABILITY.split())
     for p in result["parameters"]:
         assert " ".join(p) == PARAMETER
         assert p["unit"] in {"m", "rad"}
@@ -105,14 +95,6 @@ def test_a_result_has_every_key_of_its_schema(result):
         assert p["correction"] == p["estimate"] - p["nominal"]
         assert isinstance(p["sigma"], NUMBER)
         assert isinstance(p["prior_sigma"], NUMBER) == (p["identifiability"] != "fixed")
-
-
-def test_cost_chi_square_and_degrees_of_freedom_agree(result):
-    prior = [(p["correction"] / p["prior_sigma"]) ** 2 for p in result["parameters"] if p["prior_sigma"]]
-    assert result["chi2"] == 2 * result["solver"]["cost"]
-    assert result["reduced_chi2"] == result["chi2"] / result["dof"]
-    assert result["n_priors"] == len(prior) == 30
-    assert result["dof"] == result["n_residuals"] + 30 - 30  # priors make every one of the 30 unknowns determined
 
 
 def test_residuals_have_a_line_for_each_scalar_residual(result, residuals):
