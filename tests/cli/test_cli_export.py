@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from exported import off, ur10
+from exported import UR10, off, ur10
 from month import placed, slipped
 from simulated import TOOL, measure, write_job
 from sparing import as_case
@@ -29,9 +29,7 @@ def calibrated(nominal, true, folder, sigma=(1e-5, 1e-5)):
 def result(tmp_path_factory):
     """A UR10 calibrated from poses, and the true one."""
     folder = tmp_path_factory.mktemp("export") / "result"
-    rows = [[*(p.nominal for p in ur10().parameters if p.owner == i + 1)] for i in range(6)]
-    rows = [[a, alpha, d, theta, beta] for theta, d, a, alpha, beta in rows]
-    nominal = Robot.from_dh(rows, "dh-hayati", name="ur10", tool=[0, 0, 0.1], tolerance=TOLERANCE)
+    nominal = Robot.from_dh(UR10, "dh-hayati", name="ur10", tool=[0, 0, 0.1], tolerance=TOLERANCE)
     calibrated(nominal, off(nominal), folder)
     return folder
 
