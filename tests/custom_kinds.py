@@ -1,12 +1,11 @@
 """A kind of measurement of a user's own: distances from the tool to fixed points of unknown place."""
 
 import numpy as np
-from simulated import small_arm, true_robot
+from simulated import LARGE, small_arm, true_robot
 
 from fg_calib.measurements import CustomMeasurements, Kind, Measurements, Rows, Table
 from fg_calib.robot.kinematics import pose
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 ANCHORS = np.array([[1.5, -0.8, 0.6], [-1.2, 1.4, 0.3], [0.2, 0.5, -1.8]])
 SIGMA = 2e-4
 
@@ -29,7 +28,7 @@ class AnchorDistance(Kind):
 def lengths_to_anchors(seed, *, n=60, sigma_joint=0.0, n_test=0):
     """An arm, the true one, and a table of lengths to three anchors in turn."""
     rng = np.random.default_rng(seed)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
     q = rng.uniform(-np.pi, np.pi, (n + n_test, 4))
     which = np.arange(len(q)) % len(ANCHORS)

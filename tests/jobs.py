@@ -3,12 +3,15 @@
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
+from simulated import measure, true_robot
 
 from fg_calib.io import read_robot, write_csv
 
 SIGMA = (5e-5, 1e-4)
 """1 sigma of a position, [m], and of an orientation, [rad]."""
 
+PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
+"""World_T_base of a tracker next to the robot."""
 
 UR5E = {
     "name": "ur5e",
@@ -32,6 +35,12 @@ def ur5e(folder, **changes):
     path = folder / "robot.yaml"
     path.write_text(yaml.safe_dump(UR5E | changes))
     return read_robot(path)
+
+
+def measured(robot, seed=0, *, placed=None, n=50, n_test=0, readings=None):
+    """What is measured of a robot whose errors are those its tolerances say."""
+    rng = np.random.default_rng(seed)
+    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed, n_test=n_test, readings=readings)
 
 
 def write_job(folder, measurements, *, angles=None, **keys):

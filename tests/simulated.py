@@ -18,6 +18,7 @@ PAPER_ALPHA = [0, -90, -90, 0, 0, 90, 90]
 PAPER_D = [2.3, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5]
 ROWS = [(0.1, 1.4, 0.3, 0.2), (0.5, 0.2, 0.1, -0.3), (0.3, -1.2, 0.2, 0.1), (0.05, 0.7, 0.1, 0.4)]  # a, alpha, d, theta
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}
+LARGE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 TOOL = [f"tool.{k}" for k in ("x", "y", "z", "roll", "pitch", "yaw")]
 
 
@@ -96,11 +97,11 @@ def plus(array, rows, amount):
 def pairs_between(true, q, ends, rng, *, sigma=(1e-3, 5e-4), source="measurements") -> Pairs:
     """Distances, and angles if they have a sigma, of the true arm between joint values q measured directly."""
     (a, b), at, n = ends, pose(true, q), len(ends[0])
-    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma[0] * rng.normal(size=n)
+    distance = np.abs(np.linalg.norm(at.position[b] - at.position[a], axis=1) + sigma[0] * rng.normal(size=n))
     angle = of_angle = np.full(n, np.nan)
     if sigma[1]:
         angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0] + sigma[1] * rng.normal(size=n)
-        of_angle = np.full(n, sigma[1])
+        angle, of_angle = np.pi - np.abs(np.pi - np.abs(angle)), np.full(n, sigma[1])
     return Pairs(a, b, distance, angle, np.full(n, sigma[0]), of_angle, np.zeros(n, dtype=bool), source)
 
 

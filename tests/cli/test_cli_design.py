@@ -7,12 +7,11 @@ import polars as pl
 import pytest
 import yaml
 from oracle import tool_pose
-from simulated import small_arm
+from simulated import LARGE, small_arm
 
 from fg_calib.io import Units, write_robot
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
-ARM = small_arm(tolerance=TOLERANCE)
+ARM = small_arm(tolerance=LARGE)
 JOINTS = ["q1", "q2", "q3", "q4"]
 UNITS = {"length": "mm", "angle": "deg"}
 IN_SI = np.array([1e-3 if joint.prismatic else np.pi / 180.0 for joint in ARM.joints])

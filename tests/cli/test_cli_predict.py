@@ -5,12 +5,11 @@ import json
 import numpy as np
 import polars as pl
 import pytest
-from simulated import measure, small_arm, true_robot
+from simulated import LARGE, measure, small_arm, true_robot
 
 from fg_calib import Calibration, calibrate
 from fg_calib.prediction import workspace
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 JOINTS = ["q1", "q2", "q3", "q4"]
 
 
@@ -18,7 +17,7 @@ JOINTS = ["q1", "q2", "q3", "q4"]
 def result(tmp_path_factory):
     """The folder of a small arm's result."""
     folder, rng = tmp_path_factory.mktemp("result"), np.random.default_rng(1)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     calibrate(robot, measure(true_robot(robot, rng), 20, rng, sigma=(1e-4, 1e-4)), model="pose").save(folder)
     return folder
 

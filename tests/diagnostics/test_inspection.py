@@ -1,23 +1,22 @@
 """What is said of a job before it is solved: each fault is named where it is, and healthy jobs are not alarmed."""
 
 from dataclasses import replace
+from functools import partial
 
+import jobs
 import numpy as np
 import pytest
-from jobs import SIGMA, ur5e
+from jobs import PLACED, ur5e
 from scenarios import INSTRUMENTS, scenario
-from scipy.spatial.transform import Rotation
-from simulated import measure, plus, true_robot
+from simulated import measure, plus
 
 from fg_calib import Job, Options, ProblemError, Robot, calibrate, simulate
 from fg_calib.diagnostics import inspect_job
 
-PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
-"""World_T_base of a tracker next to the robot."""
-
 SLOW = ("pixels", "camera in the room", "contact", "faces", "sockets")
 """Instruments whose simulation, or placing, takes longest."""
 
+measured = partial(jobs.measured, placed=PLACED, n=40, n_test=10)
 MODELS = [("pose", "unknown"), ("position", "known"), ("distance-rotation", "known"), ("distance", "known")]
 
 
@@ -25,12 +24,6 @@ MODELS = [("pose", "unknown"), ("position", "known"), ("distance-rotation", "kno
 def arm(tmp_path):
     """A UR5e with a tolerance for everything."""
     return ur5e(tmp_path)
-
-
-def measured(robot, seed=0, *, placed=PLACED, n=40, n_test=10, readings=None):
-    """What is measured of a robot whose errors are those its tolerances say."""
-    rng = np.random.default_rng(seed)
-    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed, n_test=n_test, readings=readings)
 
 
 def inspected(robot, m, model="pose", frame="unknown", **choices):

@@ -1,11 +1,11 @@
 """Where nonlinearity or an ambiguous sign makes sigmas dishonest a warning names the rows and the remedy."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import measure, pairs_between, small_arm, true_robot
 
 from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
 from fg_calib.diagnostics import linearity, verdict
@@ -167,13 +167,9 @@ def wrists(lengths, *, seed, n=60, k=6):
 
 def pairs_of(true, a, b, sigma, rng, *, angles=False):
     """Measured lengths, and angles, between configurations."""
-    at, ends = [pose(true, q) for q in (a, b)], np.arange(len(a))
-    distance = np.abs(np.linalg.norm(at[1].position - at[0].position, axis=1) + sigma * rng.normal(size=len(a)))
-    pairs = {"a": ends, "b": len(a) + ends, "distance": distance, "sigma_distance": sigma}
-    if angles:
-        turned = Rotation.from_matrix(np.swapaxes(at[0].rotation, 1, 2) @ at[1].rotation).magnitude()
-        pairs |= {"angle": np.abs(turned + sigma * rng.normal(size=len(a))), "sigma_angle": sigma}
-    return Measurements.from_arrays(np.concatenate([a, b]), pairs=pairs)
+    q, ends = np.concatenate([a, b]), np.arange(len(a))
+    pairs = pairs_between(true, q, (ends, len(a) + ends), rng, sigma=(sigma, sigma * angles))
+    return replace(Measurements.from_arrays(q), pairs=pairs)
 
 
 GANTRY = [

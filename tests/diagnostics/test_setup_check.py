@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jobs import SIGMA, only, ur5e, write_job
+from jobs import PLACED, SIGMA, measured, only, ur5e, write_job
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
@@ -15,15 +15,6 @@ from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
 from fg_calib.graph import solver
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS
-
-PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
-"""World_T_base of a tracker next to the robot."""
-
-
-def measured(robot, seed=0, *, placed=None, n=50):
-    """What is measured of a robot whose errors are those its tolerances say."""
-    rng = np.random.default_rng(seed)
-    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed)
 
 
 def exchanged(m, i, j):

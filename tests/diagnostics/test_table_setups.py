@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jobs import ur5e
-from scipy.spatial.transform import Rotation
+from jobs import PLACED, ur5e
 from simulated import TOOL, measure, pairs_between, true_robot
 from sparing import diagonal
 
@@ -13,7 +12,6 @@ from fg_calib import Table, build_problem, solve
 from fg_calib.diagnostics.setup_check import OTHER_TOOL, check_problem
 
 TOLERANCE = {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.05, "beta": 0.05, "tool": 0.001}
-PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 
 
 def tracker(true, rng, **keys):

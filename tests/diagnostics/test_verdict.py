@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import measure, plus, small_arm, true_robot
+from simulated import LARGE, measure, plus, small_arm, true_robot
 
 from fg_calib import assess, build_problem, solve
 from fg_calib.diagnostics import SetupCheck
@@ -16,7 +16,6 @@ from fg_calib.diagnostics.verdict import Case, check_chi_square
 from fg_calib.robot import pose
 from fg_calib.statistics import ChiSquare, GrossErrors, estimate_noise
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 FRAME = (Rotation.from_rotvec([0.3, 0.2, -0.5]), np.array([1.0, 2.0, 3.0]))
 
 
@@ -26,7 +25,7 @@ FRAME = (Rotation.from_rotvec([0.3, 0.2, -0.5]), np.array([1.0, 2.0, 3.0]))
 def drifted(seed=3, degrees=0.03):
     """Poses of a true arm by a good tracker; its second joint has drifted where the test rows were measured."""
     rng = np.random.default_rng(seed)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
     m = measure(true, 30, rng, sigma=(1e-4, 1e-4), n_test=10)
     drift = np.where(m.test[:, None], [0.0, np.deg2rad(degrees), 0.0, 0.0], 0.0)
@@ -58,7 +57,7 @@ def test_a_wrong_test_row_is_named(model):
 
 def test_an_arm_that_is_its_nominal_one_is_no_error():
     """A calibration gains nothing then: half of all draws predict some test rows worse."""
-    robot, found = small_arm(tolerance=TOLERANCE), []
+    robot, found = small_arm(tolerance=LARGE), []
     for seed in range(6):
         m = measure(robot, 30, np.random.default_rng(seed), sigma=(1e-4, 1e-4), n_test=20)
         found.append(assess(solve(build_problem(robot, m, model="pose"))).verdict)
@@ -110,7 +109,7 @@ def test_gross_errors_are_not_all_that_is_wrong_beside_a_change_or_an_effect(mor
 
 def test_tolerances_specified_too_small_for_all_are_a_finding():
     rng = np.random.default_rng(33)
-    robot, loose = (small_arm(tolerance={k: f * v for k, v in TOLERANCE.items()}) for f in (1.0, 2.5))
+    robot, loose = (small_arm(tolerance={k: f * v for k, v in LARGE.items()}) for f in (1.0, 2.5))
     m = measure(true_robot(loose, rng), 30, rng, sigma=(1e-4, 1e-4))
     found = assess(solve(build_problem(robot, m, model="pose")))
     assert found.fit.priors.chi2 > 2 * found.fit.priors.expected
@@ -125,7 +124,7 @@ def test_tolerances_specified_too_small_for_all_are_a_finding():
 def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(choices, error):
     """The true arm, or an uncalibrated one."""
     rng = np.random.default_rng(41)
-    nominal = small_arm(tolerance=TOLERANCE)
+    nominal = small_arm(tolerance=LARGE)
     true = true_robot(nominal, rng)
     robot = nominal.with_values(true.nominal + error * (nominal.nominal - true.nominal))
     frame = FRAME if "frame" in choices else None
@@ -140,7 +139,7 @@ def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(choices, error):
 def test_noise_estimated_as_large_as_the_motions_is_no_noise():
     """Orientations that were never measured: all are the same."""
     rng = np.random.default_rng(0)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 40, rng)
     m = replace(m, rotation=np.tile(np.eye(3), (40, 1, 1)))
     found = assess(estimate_noise(build_problem(robot, m, model="pose")))
@@ -154,7 +153,7 @@ def test_noise_estimated_as_large_as_the_motions_is_no_noise():
 ])  # fmt: skip
 def test_estimated_noise_far_above_the_specified_is_a_warning_that_names_gross_rows(wrong, words):
     rng = np.random.default_rng(0)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4))
     m = replace(m, position=plus(m.position, list(wrong), rng.choice([-5e-3, 5e-3], (len(wrong), 3))))
     found = assess(estimate_noise(build_problem(robot, m, model="pose")))

@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from simulated import measure, small_arm, true_robot
+from simulated import measure, pairs_between, small_arm, true_robot
 
 from fg_calib import InputError, Measurements, Pairing, Table, assess, build_problem, solve
 from fg_calib.graph import relinearized_at, solver, subsampled, whitening_of
-from fg_calib.robot import pose
 
 TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
@@ -18,14 +16,9 @@ def pairs_of(n, robot, rng, n_configurations=200):
     """Pairs measured directly, some of lengths near 0."""
     true = true_robot(robot, rng)
     q = rng.uniform(-3.0, 3.0, (n_configurations, robot.n_joints))
-    at = pose(true, q)
     a = rng.integers(0, len(q), n)
     b = (a + rng.integers(1, len(q), n)) % len(q)
-    distance = np.linalg.norm(at.position[a] - at.position[b], axis=1) + 1e-3 * rng.normal(size=n)
-    turn = Rotation.from_matrix(at.rotation[a]).inv() * Rotation.from_matrix(at.rotation[b])
-    angle = np.abs(turn.magnitude() + 1e-3 * rng.normal(size=n))
-    pairs = {"a": a, "b": b, "distance": np.abs(distance), "angle": np.minimum(angle, 2.0 * np.pi - angle)}
-    return Measurements.from_arrays(q, pairs=pairs | {"sigma_distance": 1e-3, "sigma_angle": 1e-3})
+    return replace(Measurements.from_arrays(q), pairs=pairs_between(true, q, (a, b), rng, sigma=(1e-3, 1e-3)))
 
 
 @pytest.fixture(scope="module")

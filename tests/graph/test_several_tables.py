@@ -9,7 +9,7 @@ import pytest
 import yaml
 from custom_kinds import lengths_to_anchors
 from scipy.spatial.transform import Rotation
-from simulated import measure, pairs_between, paper_robot, small_arm, true_robot
+from simulated import LARGE, measure, pairs_between, paper_robot, small_arm, true_robot
 from touches import corners, touch
 
 from fg_calib import ProblemError, Table, assess, build_problem, solve
@@ -17,7 +17,6 @@ from fg_calib.io import Units, write_csv, write_robot
 from fg_calib.measurements import Groups, no_pairs
 from fg_calib.simulation import table_columns
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 PLACED = (Rotation.from_rotvec([0.4, -1.1, 2.0]), np.array([3.0, -1.0, 0.5]))
 ANOTHER = (Rotation.from_rotvec([-2.0, 0.3, 0.7]), np.array([-2.0, 4.0, 1.0]))
 SIGMA = (5e-4, 5e-4)
@@ -32,7 +31,7 @@ def pairs_of(true, q, rng, sigma=2e-4):
 def mixture(seed, *, n=16, sigma_joint=0.0, shared=True):
     """Positions by a tracker somewhere, and lengths of a ball bar, at the same configurations or at others."""
     rng = np.random.default_rng(seed)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
     stood = rng.uniform(-np.pi, np.pi, (n, 4))
     read = stood + sigma_joint * rng.normal(size=stood.shape)
@@ -74,7 +73,7 @@ def test_each_table_has_its_own_frame():
 
 def test_the_order_of_tables_and_one_table_in_parts_change_nothing():
     rng = np.random.default_rng(6)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 30, rng, sigma=SIGMA, sigma_joint=3e-4)
     parts = [m.select(rows) for rows in (np.arange(12), np.arange(12, 30))]
     whole = assess(solve(build_problem(robot, m, model="pose")))
@@ -91,7 +90,7 @@ def test_the_order_of_tables_and_one_table_in_parts_change_nothing():
 def test_a_point_of_one_name_in_two_tables_is_one_point():
     """Touches of three points, the last of them and the distances in a second table: the same as one table."""
     rng = np.random.default_rng(7)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
     m = touch(true, corners(robot, 3, rng), 8, rng, distances=((1, 2, 1e-5),))
     of_first = np.arange(24) < 13  # touches of the second point are in both
@@ -192,7 +191,7 @@ def test_two_tables_that_contradict_each_other_are_refused():
 ])  # fmt: skip
 def test_a_table_given_twice_is_refused(models, said):
     rng = np.random.default_rng(9)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
     places = {"reversed": np.arange(12)[::-1], "a part": np.arange(5)}
 
@@ -210,7 +209,7 @@ def test_a_table_given_twice_is_refused(models, said):
 @pytest.mark.parametrize("model", ["pose", "position", "distance-rotation"])
 def test_a_block_that_was_pasted_twice_into_a_table_is_warned_of(model, caplog):
     rng = np.random.default_rng(9)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 12, rng, sigma=SIGMA)
 
     def pasted(rows):
@@ -247,7 +246,7 @@ def test_pairs_in_both_directions_are_warned_of_and_repeats_are_not(caplog):
 def test_pairs_measured_again_are_not_the_same():
     rng = np.random.default_rng(9)
     q = rng.uniform(-np.pi, np.pi, (10, 4))
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = replace(measure(robot, 10, rng, readings=q), pairs=pairs_of(robot, q, rng))
     other = replace(m, pairs=replace(m.pairs, distance=m.pairs.distance + 1e-5))
     assert build_problem(robot, [Table(m, "distance"), Table(other, "distance")]).n_residuals == 18
@@ -258,7 +257,7 @@ def test_pairs_measured_again_are_not_the_same():
 @pytest.mark.slow
 def test_a_loss_that_drops_a_whole_table_is_a_finding():
     rng = np.random.default_rng(3)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
     good = measure(true, 20, rng, sigma=(1e-4, 1e-4))
     bad = measure(true, 8, rng, sigma=(1e-4, 1e-4))
@@ -272,7 +271,7 @@ def test_a_loss_that_drops_a_whole_table_is_a_finding():
 @pytest.mark.parametrize("model", ["distance-rotation", "distance", "pose"])
 def test_test_rows_have_no_say_in_the_fit(model, apart):
     rng = np.random.default_rng(3)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 20, rng, sigma_joint=1e-4, n_test=12)
     train, test = m.select(np.flatnonzero(~m.test)), m.select(np.flatnonzero(m.test))
     together = [Table(part, model) for part in (train, replace(test, source="others"))] if apart else Table(m, model)

@@ -7,7 +7,7 @@ import pytest
 from oracle import central_differences
 from reported import format_report
 from scipy.stats import kstest
-from simulated import measure, pairs_between, plus, small_arm, true_robot
+from simulated import LARGE, measure, pairs_between, plus, small_arm, true_robot
 from touches import SIGMA, TOOL_POINT, corners, touch
 
 from fg_calib import Pairing, Table, assess, build_problem, calibrate, solve
@@ -16,8 +16,6 @@ from fg_calib.graph import problem as problem_module
 from fg_calib.robot import pose
 from fg_calib.statistics import FLAGS, KindFit, estimate_noise
 from fg_calib.statistics import variance_components as noise
-
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3}
 
 
 def measured_directly(m, robot, rng, a, b, sigma=(1e-3, 5e-4), sigma_joint=0.0):
@@ -62,7 +60,7 @@ def test_leverages_are_those_of_the_hat_matrix():
 def test_a_row_beyond_noise_that_is_specified_too_large_is_suspect():
     """2 mm where the noise is 0.4 mm and 1 mm was specified: two sigma as specified, five of the others' noise."""
     rng = np.random.default_rng(1)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 40, rng, sigma=(4e-4, 5e-4))
     m = replace(m, position=plus(m.position, (17, 0), 2e-3), sigma_position=2.5 * m.sigma_position)
     found = calibrate(robot, m, model="pose")
@@ -73,7 +71,7 @@ def test_a_row_beyond_noise_that_is_specified_too_large_is_suspect():
 
 def test_a_kind_with_too_little_left_keeps_its_specified_noise(monkeypatch):
     monkeypatch.setattr(noise, "LEAST_REDUNDANCY", 11.0)
-    rng, robot = np.random.default_rng(10), small_arm(tolerance=TOLERANCE)
+    rng, robot = np.random.default_rng(10), small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 16, rng, sigma=(1e-3, 5e-4))
     twice = replace(m, sigma_position=2.0 * m.sigma_position, sigma_orientation=2.0 * m.sigma_orientation)
     solution = estimate_noise(build_problem(robot, twice, model="distance-rotation"))
@@ -101,7 +99,7 @@ def test_kept_parameters_are_estimated_with_estimated_noise_too():
 def test_a_same_point_that_is_not_is_suspect():
     """Each of its three coordinates is a row of 1 sigma; two readings that are nearly the same tell it nothing."""
     rng = np.random.default_rng(13)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     a = np.arange(20)
     m = measured_directly(measure(robot, 40, rng), robot, rng, a, a + 20)
     distance, readings = m.pairs.distance.copy(), m.readings.copy()
@@ -125,7 +123,7 @@ def test_a_same_point_that_is_not_is_suspect():
 
 def test_robust_weights_count_rows_and_flag_outliers():
     rng = np.random.default_rng(17)
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     m = measure(true_robot(robot, rng), 30, rng)
     m = replace(m, position=plus(m.position, 5, 0.05))
     problem = build_problem(robot, m, model="pose")
@@ -168,9 +166,9 @@ def predicted(name, rng):
     """A problem with test rows of a drawn true robot."""
     sigma_joint = 2e-4 if "joint" in name else 0.0
     if name.startswith("touches"):
-        robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+        robot = small_arm(tolerance=LARGE | {"tool": 5e-3}, estimate=TOOL_POINT)
         return build_problem(robot, touched(robot, rng, sigma_joint=sigma_joint), model="distance")
-    robot = small_arm(tolerance=TOLERANCE)
+    robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
     m = measure(true, 16, rng, sigma=(1e-3, 5e-4), sigma_joint=sigma_joint, n_test=10)
     if name == "poses":
@@ -217,7 +215,7 @@ def test_touches_of_a_point_that_is_their_mean_share_its_noise():
     To 1e-3 of it or of the noise: derivatives of rows are less `a x (p - point)`, the noise times an angle's error.
     """
     rng = np.random.default_rng(22)
-    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    robot = small_arm(tolerance=LARGE | {"tool": 5e-3}, estimate=TOOL_POINT)
     m = touched(robot, rng)
     m = replace(m, test=m.groups.index >= 3)
     solution = solve(build_problem(robot, m, model="distance"))
@@ -242,7 +240,7 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
 
     Without the errors in common the sigmas of the predicted rows would be up to a quarter larger.
     """
-    robot, rng, n, sigma_joint = small_arm(tolerance=TOLERANCE), np.random.default_rng(5), 12, 1e-3
+    robot, rng, n, sigma_joint = small_arm(tolerance=LARGE), np.random.default_rng(5), 12, 1e-3
     i, j = np.array(np.triu_indices(n, 1))[:, rng.permutation(66)]
     true = true_robot(robot, rng)
     m = measured_directly(measure(true, n, rng), true, rng, i, j, sigma=(3e-4, 1e-4), sigma_joint=sigma_joint)
@@ -279,7 +277,7 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
 def test_degrees_of_freedom_count_core_and_landmarks():
     """Five points touched eight times: three coordinates each come off, and every parameter, for all have priors."""
     rng = np.random.default_rng(31)
-    robot = small_arm(tolerance=TOLERANCE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    robot = small_arm(tolerance=LARGE | {"tool": 5e-3}, estimate=TOOL_POINT)
     true = true_robot(robot, rng)
     problem = build_problem(robot, touch(true, corners(true, 5, rng), 8, rng), model="distance")
     n_estimated = sum(p.estimated for p in robot.parameters)
