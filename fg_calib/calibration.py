@@ -103,8 +103,7 @@ def calibrate_job(job: Job | Path | str, executor: Executor | None = None) -> "C
     except (ArithmeticError, np.linalg.LinAlgError) as error:
         if not options.estimate_noise:
             raise
-        found = "noise cannot be estimated from these rows, which leave no error: specify it"
-        raise SolverError(found) from error
+        raise SolverError("noise cannot be estimated from these rows, which leave no error: specify it") from error
     return Calibration.of(solution, assessment, inputs=given.inputs, job=given.document, effects=effects)
 
 

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import assessment, graph, measurements, observability, simulation
 from fg_calib.designs.candidates import Pool, pool_of
+from fg_calib.initialization import Camera
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
 from fg_calib.job import Job
 from fg_calib.robot import pose
@@ -116,7 +117,7 @@ def _instrument_of(problem: graph.Problem, number: int, name: str, configuration
     elif "board" in measurements.INSTRUMENTS[str(model)].labels:
         robot = problem.robot.with_values(problem.start[problem.variables.robot_span])
         boards = {one: places["B", one] for one in _names(m, "board") or ("board",)}
-        given = given | _seen(boards, pose(robot, m.readings).position)
+        given = given | _seen(boards, pose(robot, m.readings).position, m.image, table.camera)
         given |= {} if configurations is None else {"configurations": configurations}
     if m.image is not None:
         given |= {"camera": table.camera, "corners": np.unique(m.image[:, 2:], axis=0)}
@@ -155,19 +156,26 @@ def _noise_of(problem: graph.Problem, number: int) -> measurements.Noise:
     return measurements.Noise().updated(**specified)
 
 
-def _seen(boards: Mapping[str, Floats], tool: Floats) -> dict[str, Any]:
+def _seen(boards: Mapping[str, Floats], tool: Floats, image: Floats | None, camera: Camera | None) -> dict[str, Any]:
     """The boards, whether they were seen from behind, and views of the first of them.
 
-    Views are from the measured range of distances, at the measured angles and a little more oblique ones.
+    Views are from the measured range of distances, at the measured angles and a little more oblique ones. Corners stay
+    in the largest circle about the optical axis that the measured ones reach in u and in v.
     """
     placed = {name: Placement(Rotation.from_rotvec(at[:3]).as_matrix(), at[3:]) for name, at in boards.items()}
     behind = [name for name, b in placed.items() if np.median((tool - b.position) @ b.rotation[:, 2]) < 0.0]
     first, board = next(iter(placed.items()))
-    if first in behind:
-        board = Placement(board.rotation @ np.diag([1.0, -1.0, -1.0]), board.position)
+    points = np.zeros((1, 2)) if image is None else image[:, 2:]
+    centre, size = 0.5 * (points.min(axis=0) + points.max(axis=0)), np.ptp(points, axis=0)
+    turn = np.diag([1.0, -1.0, -1.0]) if first in behind else np.eye(3)
+    board = Placement(board.rotation @ turn, board.position + board.rotation[:, :2] @ centre)
     away = tool - board.position
     distance = np.linalg.norm(away, axis=1)
     oblique = np.arccos(np.clip(away @ board.rotation[:, 2] / distance, -1.0, 1.0))
     span, cone = (0.8 * float(distance.min()), 1.2 * float(distance.max())), float(np.quantile(oblique, 0.9))
     views = simulation.BoardViews(board, count=1, distance=span, cone=max(MIN_CONE_RAD, cone))
+    if image is not None and camera is not None and size.min() > 0.0:
+        off = np.abs(image[:, :2] - [camera.cx, camera.cy]).max(axis=0) / [camera.fx, camera.fy]
+        angle = np.arctan(max(off.min(), 0.5 * np.hypot(*size) / distance.max()))  # far away all of the board is seen
+        views = replace(views, field_of_view=float(angle), board_size=tuple(size.tolist()))
     return {"boards": placed, "from_behind": tuple(behind), "configurations": views}

@@ -145,8 +145,7 @@ def estimate_offset(joints: JointStream, poses: PoseStream, robot: Robot) -> Clo
     if correlation[best] < MIN_CORRELATION:
         place = f"topics {joints.source.topic} and {poses.source.topic}"
         found = f"the poses do not move as the joints do (correlation {correlation[best]:.2f})"
-        hint = "or specify the offset of the clocks: --offset 0"
-        raise InputError(place, found, "poses of this robot's tool", hint)
+        raise InputError(place, found, "poses of this robot's tool", "or specify the offset of the clocks: --offset 0")
     return ClockOffset(float(first + best * LAG_STEP_S), float(correlation[best]))
 
 

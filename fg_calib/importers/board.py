@@ -101,8 +101,7 @@ class CalibrationBoard(io.Schema):
         """Places of the corners in the board's frame, x and y, row by row, shape (n_corners, 2), [m]."""
         columns, rows = self.shape
         j, i = np.divmod(np.arange(columns * rows), columns)
-        first = 1.0 if self.type == "charuco" else 0.0
-        return self.square * (np.stack([i, j], axis=1) + first)
+        return self.square * (np.stack([i, j], axis=1) + (1.0 if self.type == "charuco" else 0.0))
 
     @property
     def ambiguous(self) -> bool:
@@ -266,8 +265,7 @@ def estimate_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[
         InputError: There are too few views, or they do not determine it.
     """
     if len(points) < MIN_IMAGES:
-        expected = f"at least {MIN_IMAGES} to estimate a camera from"
-        raise InputError("images", f"{len(points)} with a board", expected)
+        raise InputError("images", f"{len(points)} with a board", f"at least {MIN_IMAGES} to estimate a camera from")
     cv2 = load_opencv()
     places = [np.column_stack([p, np.zeros(len(p))]).astype(np.float32) for p in points]
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)

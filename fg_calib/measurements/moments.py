@@ -126,8 +126,7 @@ def _near_length(f: Floats, along: Floats, across: Floats) -> Moments:
     fold = _fold(f, s[:, 0] ** 2)
     excess = fold.excess + np.sum(rest * (density[0] + density[1]), axis=1)
     slope = fold.slope + np.sum(rest * (right * density[0] - left * density[1]) / s, axis=1)
-    variance = f**2 + along + 2.0 * across - (f + excess) ** 2
-    return Moments(excess, slope, variance)
+    return Moments(excess, slope, f**2 + along + 2.0 * across - (f + excess) ** 2)
 
 
 def _folded(f: Floats, inner: Moments, own: Floats) -> Moments:

@@ -209,8 +209,7 @@ def lost_directions(lost: Sequence[LostDirection]) -> Table:
     by_reason: dict[str, list[str]] = {}
     for direction in lost:
         by_reason.setdefault(direction.reason, []).append(format_relation(direction.relation))
-    rows = [(", ".join(relations), reason) for reason, relations in by_reason.items()]
-    return table_of(("", "because"), rows)
+    return table_of(("", "because"), [(", ".join(relations), reason) for reason, relations in by_reason.items()])
 
 
 def format_sum(factors: Mapping[str, float]) -> str:

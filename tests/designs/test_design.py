@@ -9,7 +9,7 @@ from simulated import small_arm
 
 from fg_calib import InputError, Job, Options, Pairing, build_problem, calibrate_job, simulate, solve
 from fg_calib.designs.design import design
-from fg_calib.designs.from_job import solve_for_design
+from fg_calib.designs.from_job import scenario_of, solve_for_design
 from fg_calib.designs.information import Posterior
 from fg_calib.graph import square_root
 from fg_calib.io import Units
@@ -129,6 +129,17 @@ def test_more_of_every_instrument_is_planned(kind):
     plan = design(job_of(INSTRUMENTS[kind], GivenReadings(q)), n=4, n_candidates=80, candidates=RandomReadings(1))
     assert plan.n == 4
     assert 0.0 < plan.expected.position <= plan.before.position
+
+
+def test_a_camera_is_to_see_the_whole_board_where_it_saw_corners_wherever_the_boards_origin_is():
+    q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
+    job = job_of(INSTRUMENTS["pixels"], GivenReadings(q))
+    table, m = job.tables[0], job.tables[0].measurements
+    moved = replace(job, measurements=(replace(table, measurements=replace(m, image=m.image + [0, 0, 0.1, 0.2])),))
+    here, there = (scenario_of(solve_for_design(one)).instruments[0].configurations for one in (job, moved))
+    assert np.allclose([*there.board.position, *there.board_size], [*here.board.position, *here.board_size], atol=1e-6)
+    seen = np.abs(m.image[:, :2] - [table.camera.cx, table.camera.cy]) / [table.camera.fx, table.camera.fy]
+    assert np.tan(there.field_of_view) == pytest.approx(seen.max(axis=0).min())
 
 
 def test_a_board_seen_from_below_is_seen_from_below_again():
