@@ -290,8 +290,8 @@ def _inverted(setup: Setup) -> _Found:
         return
     inverse = Rotation.from_matrix(m.rotation.copy()).inv()
     if m.position is not None and setup.sees_lengths:
-        measured, fixed = ("board", "camera") if setup.instrument.sees_landmarks else ("tool", "world")
-        words = f"the poses are inverted ({measured}_T_{fixed} instead of {fixed}_T_{measured})"
+        a, b, c = ("camera", "board", "") if setup.instrument.sees_landmarks else ("world", "tool", "; or model board")
+        words = f"the poses are inverted ({b}_T_{a} instead of {a}_T_{b}{c})"
         yield words, _rotated(setup, inverse).measuring(position=-inverse.apply(m.position.copy()))
     if setup.instrument.sees_orientation:
         yield "the orientations are inverted", _rotated(setup, inverse)
@@ -326,8 +326,7 @@ def _orientations(setup: Setup) -> _Found:
         return
     if m.roll_pitch_yaw is None:
         wxyz = Rotation.from_matrix(m.rotation.copy()).as_quat()
-        words = "columns qx, qy, qz, qw hold w, x, y, z"
-        yield words, _rotated(setup, Rotation.from_quat(np.roll(wxyz, -1, axis=1)))
+        yield "columns qx, qy, qz, qw hold w, x, y, z", _rotated(setup, Rotation.from_quat(np.roll(wxyz, -1, axis=1)))
         return
     for words, rotation_of in ORIENTATIONS.items():
         yield words, _rotated(setup, rotation_of(m.roll_pitch_yaw.copy()), m.roll_pitch_yaw)

@@ -202,9 +202,10 @@ def _frame_words(robot: Robot, owner: int) -> str:
 
 def _frames_outside(robot: Robot, start: str, end: str) -> list[str]:
     """Notes that a format has no place for the arm's base and tool, if any."""
-    found = {f"base, which is before {start}": _frame_words(robot, 0)}
-    found[f"tool, which is behind {end}"] = _frame_words(robot, robot.n_joints + 1)
-    return [f"it has no place for the frame {name}: {words} (mm, deg)" for name, words in found.items() if words]
+    owners = {f"base, which is before {start}": 0, f"tool, which is behind {end}": robot.n_joints + 1}
+    found = {name: [robot.parameters[i].nominal for i in robot.owned_by(owner)] for name, owner in owners.items()}
+    form = 'it has no place for the frame {0}: <origin xyz="{1:.9g} {2:.9g} {3:.9g}" rpy="{6:.9g} {5:.9g} {4:.9g}"/>'
+    return [form.format(name, *values) for name, values in found.items() if any(values)]
 
 
 def _urdf(robot: Robot, comments: Sequence[str]) -> _Content:

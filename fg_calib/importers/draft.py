@@ -61,6 +61,7 @@ robot: {robot}
 {notes}measurements:
 {entries}
 # Models of pairs need no frame: distance for position, rotation for orientation, distance-rotation for pose.
+# camera_T_board, seen by a camera that is the tool, is of model board, without frame.
 units: {units}  # DECIDE where headers do not say: they are guessed from the values' sizes
 # DECIDE the noise, 1 sigma in the units above: the values are guesses, so it is estimated from residuals;
 # put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings.
@@ -169,7 +170,7 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
     present = tuple(name for name in every if name not in joints)
     model = None if is_pairs else _find_model(set(present))
     columns = {name: table.columns[k] for name, k in every.items() if name != table.columns[k]}
-    unused = tuple(c for k, c in enumerate(table.columns) if k not in every.values())
+    unused = tuple(c for k, c in enumerate(table.columns) if k not in every.values() and c != "id")
     repeats = bool(joints) and table.frame[:, list(joints.values())].is_duplicated().any()
     return _Recognised(path, model, present, columns, units, unused, skip_lines, repeats)
 
@@ -296,8 +297,7 @@ def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
     if not pairs:
         return tables
     if not tables:
-        expected = "the table of the configurations that they are of too"
-        raise InputError(pairs[0].path.name, "pairs alone", expected)
+        raise InputError(pairs[0].path.name, "pairs alone", "the table of the configurations that they are of too")
     first, *others = sorted(tables, key=lambda t: 0 if t.model is None else 1 if "group" in t.present else 2)
     measured = ("distance" in pairs[0].present, "angle" in pairs[0].present)
     model = {of: model for model, of in PAIR_MODELS.items()}.get(measured, "distance")

@@ -103,8 +103,7 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
         k = int(good[-1]) + 1 if len(taken) + len(good) == n else len(reason)  # none after the last that is wanted
         taken, asked = np.concatenate([taken, readings[good]]), asked + k
         counts.update(reason[:k].tolist())
-    rejected = {why: counts[why] for why in REASONS if counts[why]}
-    return Candidates(taken, asked, rejected)
+    return Candidates(taken, asked, {why: counts[why] for why in REASONS if counts[why]})
 
 
 def _draw(robot: Robot, of: Configurations, generator: np.random.Generator, place: str) -> Draw:

@@ -135,7 +135,9 @@ def test_a_camera_is_to_see_the_whole_board_where_it_saw_corners_wherever_the_bo
     q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
     job = job_of(INSTRUMENTS["pixels"], GivenReadings(q))
     table, m = job.tables[0], job.tables[0].measurements
-    moved = replace(job, measurements=(replace(table, measurements=replace(m, image=m.image + [0, 0, 0.1, 0.2])),))
+    moved = replace(
+        job, measurements=(replace(table, measurements=replace(m, image=m.image + np.array([0, 0, 0.1, 0.2]))),)
+    )
     here, there = (scenario_of(solve_for_design(one)).instruments[0].configurations for one in (job, moved))
     assert np.allclose([*there.board.position, *there.board_size], [*here.board.position, *here.board_size], atol=1e-6)
     seen = np.abs(m.image[:, :2] - [table.camera.cx, table.camera.cy]) / [table.camera.fx, table.camera.fy]
