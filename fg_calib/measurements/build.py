@@ -234,8 +234,8 @@ def find_copies(table: Table) -> tuple[int, str, int]:
     Pairs count whichever end is a.
     """
     m, (ends, figures) = table.measurements, _rows_of(table)
-    of_rows = [of.index for of in (*m.labels.values(), m.groups) if of is not None]
-    at = np.hstack([*(m.readings[k] for k in ends.T), *(index[ends] for index in of_rows)]) + 0.0  # no -0
+    own = [of.index for of in (*m.labels.values(), m.groups) if of] + ([] if m.image is None else [*m.image[:, 2:].T])
+    at = np.hstack([*(m.readings[k] for k in ends.T), *(index[ends] for index in own)]) + 0.0  # no -0
     n_places = len({row.tobytes() for row in at})
     if not figures or n_places == len(ends):
         return 0, "", len(ends) - n_places

@@ -54,6 +54,7 @@ def test_a_healthy_table_of_every_instrument_is_ready(name, seed):
     found = inspect_job(Job(None, simulation.robot, tuple(simulation.tables), Options()))
     assert found.findings == ()
     assert [check.table for check in found.setups] == [t.name if len(found.tables) > 1 else "" for t in found.tables]
+    assert all(t.n_repeats == 0 for t in found.tables)  # corners of one image are none
 
 
 def test_rows_to_test_alone_are_inspected_as_an_evaluation(arm):
