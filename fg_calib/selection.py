@@ -170,8 +170,10 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
         ProblemError: The measurements do not suffice for the geometry.
         SolverError: GTSAM could not solve a step at all.
     """
-    effects, kept = job.robot.effects, frozenset[_Group]()
-    solution = solve(_with_effects(job, kept)) if job.robot.select_effects and effects else None
+    effects, kept, of = job.robot.effects, frozenset[_Group](), job.options
+    # By the noise as specified a robust loss would take for outliers what effects explain.
+    bare = replace(job, options=replace(of, estimate_noise=of.estimate_noise or of.loss != "none"))
+    solution = solve(_with_effects(bare, kept)) if job.robot.select_effects and effects else None
     if solution is None or solution.problem.evaluated:
         return job, ()
     choice, found, order = _Choice(job, solution), dict[int, EffectTest](), list(EFFECTS.values())
@@ -179,8 +181,8 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
         before = kept
         for i in sorted({i for i, _ in choice.groups}, key=lambda i: order.index(type(effects[i]))):
             others = frozenset(group for group in kept if group[0] != i)
-            found[i], of = choice.test(others, frozenset(group for group in choice.groups if group[0] == i))
-            kept = others | of
+            found[i], more = choice.test(others, frozenset(group for group in choice.groups if group[0] == i))
+            kept = others | more
         if kept == before:
             break
     return _with_effects(job, kept), tuple(found.values())
@@ -214,8 +216,7 @@ class _Choice:
 
     def __init__(self, job: Job, solution: graph.Solution) -> None:
         robot, x, n = job.robot, solution.parameters, len(solution.problem.robot.parameters)
-        options = replace(job.options, encoder="propagated", pair_errors="independent")
-        options = replace(options, gauge="none")
+        options = replace(job.options, encoder="propagated", pair_errors="independent", gauge="none")
         full = graph.problem_of_tables(robot, graph.tables_of(job.measurements, options), options)
         start = np.concatenate([x[:n], np.zeros(len(robot.parameters) - n), x[n:]])
         problem = graph.with_factors(full, start, solution.problem.state)
