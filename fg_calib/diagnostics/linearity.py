@@ -34,7 +34,7 @@ FEW = 200
 """Configurations at which the tool is looked at."""
 
 N_DRAWS = 8
-"""Draws of d: sums of all determined directions, each a sigma one way or the other."""
+"""Draws of d: the symmetric root of the covariance times random signs."""
 
 
 class Nonlinearity(Record):
@@ -63,19 +63,19 @@ def check_linearity(solution: Solution, spread: Spread) -> Nonlinearity:
         problem = subsampled(problem, MAX_ROWS / problem.n_residuals, solution.parameters)
     scales, rng = spread.variables.prior_scales, np.random.default_rng(0)
     root = spread.root[:, :rank]
-    scaled = root / scales[:, None]
-    in_sigma = (scaled / np.sum(scaled**2, axis=0)).T / scales  # the inverse of `root`, whose columns are orthogonal
+    sigma = np.linalg.norm(root / scales[:, None], axis=0)
+    Q = root / scales[:, None] / sigma  # orthonormal
     here = solution.system if problem is solution.problem else problem.linearize(solution.parameters)
     steps, shifts = list[Floats](), list[Floats]()
     try:
         while len(shifts) < N_DRAWS:
-            core = root @ rng.choice([-1.0, 1.0], rank)
+            core = root @ (Q.T @ rng.choice([-1.0, 1.0], n))  # by the symmetric root: whatever basis LAPACK chose
             step = np.concatenate([core, here.left.follow @ core])
             plus, minus = (
                 problem.linearize(problem.variables.moved(solution.parameters, d)).step for d in (step, -step)
             )
             steps, shifts = [*steps, step], [*shifts, 0.5 * (plus + minus) - here.step]
-            squares = np.mean((np.array(shifts)[:, :n] @ in_sigma.T) ** 2)
+            squares = np.mean((np.array(shifts)[:, :n] / scales @ (Q / sigma)) ** 2)
             if len(shifts) == 1 and squares < NEGLIGIBLE:
                 break
     except SolverError:
