@@ -34,7 +34,10 @@ def positions(n, sigma, seed):
 
 
 def by_second_differences(solution, spread, n_draws):
-    """Mean of |R^T J^T q|^2 over directions, q what positions are beyond linear at draws R z, J by differences."""
+    """Mean of |R^T J^T q|^2 over directions, q what positions are beyond linear at draws d, J by differences.
+
+    d are Gaussian, with the covariance: independent of the draws that are tested, which have its symmetric root.
+    """
     m = solution.problem.data.tables[0].measurements
     robot = solution.problem.robot.with_values(solution.parameters[solution.problem.variables.robot_span])
     names = [i for i, p in enumerate(robot.parameters) if p.estimated]
@@ -47,8 +50,8 @@ def by_second_differences(solution, spread, n_draws):
 
     J = np.array([(rows(h) - rows(-h)) / 2e-6 for h in 1e-6 * np.eye(len(names))]).T
     curved = []
-    for signs in np.random.default_rng(5).choice([-1.0, 1.0], (n_draws, spread.rank)):
-        change = root @ signs
+    for z in np.random.default_rng(5).normal(size=(n_draws, spread.rank)):
+        change = root @ z
         q = 0.5 * (rows(change) + rows(-change)) - rows(np.zeros(len(names)))
         curved.append(np.mean((root.T @ (J.T @ q)) ** 2))
     return np.mean(curved)
