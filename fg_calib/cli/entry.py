@@ -66,6 +66,8 @@ def run() -> None:
     except MemoryError:
         _fail("there is not enough memory for this")
     except OSError as error:
+        if error.filename is None:  # of stdout, which Python would flush once more at its end, and fail again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         _fail(f"{error.filename or 'the output cannot be written'}: {error.strerror or error}")
 
 

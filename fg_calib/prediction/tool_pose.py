@@ -80,8 +80,7 @@ def expected_error(problem: Problem, covariance: TangentCovariance) -> ExpectedE
     """
     judged, at = judged_configurations(problem.data)
     chosen = _evenly(judged)
-    context = context_at(problem.data.context, chosen)
-    base, fitted = errors_at(covariance, problem.data.readings[chosen], context)
+    base, fitted = errors_at(covariance, problem.data.readings[chosen], context_at(problem.data.context, chosen))
     return ExpectedError(base, fitted, at, len(chosen), len(judged), ObservedQuantities.of(problem).blind_to_base)
 
 
@@ -109,8 +108,7 @@ def errors_at(
     """
     every = np.arange(len(readings))
     few = _evenly(every) if len(covariance.curves) else every
-    there = context_at(context, few)
-    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), readings[few], there)
+    points, motion, _ = tool_derivatives(covariance, base_chain(covariance), readings[few], context_at(context, few))
     return pose_rms(points, motion, covariance.variance)
 
 
