@@ -223,7 +223,8 @@ def test_the_report_shows_the_figures_in_millimetres_and_degrees(simulated_job):
 
 
 @pytest.mark.slow
-def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, example):
+def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, example, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")  # of 80 columns, as parallel tests have, titles wrap where times are long
     job = example / "calibration.yaml"
     ended = fg_calib("compare", job)
     assert (ended.code, ended.err) == (0, "")
