@@ -18,7 +18,7 @@ PAGES = {
     for page in DOCS.glob("*.md")
     if (found := INCLUDE.search(page.read_text()))
 }
-"""Pages of files that lie elsewhere in the repository."""
+"""Pages of files outside `docs/`."""
 
 
 def with_links(text: str, file: Path, page: Path) -> str:
