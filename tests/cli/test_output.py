@@ -119,7 +119,8 @@ def test_a_report_that_nobody_takes_loses_no_result(example, command, stdout):
         os.close(end)
     else:
         sink = os.open(stdout, os.O_WRONLY)
-    streams = {"stdout": sink, "stderr": subprocess.PIPE, "capture_output": False}
+    buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    streams = {"stdout": sink, "stderr": subprocess.PIPE, "capture_output": False, "env": buffered}
     code, _, err = run([command, job, "--out", example / "out"], **streams)
     os.close(sink)
     full = "error: the output cannot be written: No space left on device\n"

@@ -2,12 +2,15 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from reported import format_report
 from simulated import measure, planar_robot, plus, small_arm, true_robot
 
 from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
+from fg_calib.report import compare
 from fg_calib.report.tables import plain_text, table_of
 
 
@@ -163,3 +166,16 @@ def test_a_wrong_pose_of_pairs_is_the_first_suspicious_configuration():
     found = sections(report(robot, m, model="distance", pairing=Pairing("all")))
     assert found["Suspicious configurations"].splitlines()[1].split()[:2] == ["p7", "11"]
     assert "p7" in found["Suspicious rows"].splitlines()[1].split()[:2]
+
+
+def test_a_history_counts_no_whole_turns():
+    """An angle found a turn away has changed by what is left; another one by more, in its sigma."""
+    before, run = (
+        SimpleNamespace(parameters={"theta1": (angle, 1e-3, "rad"), "a1": (length, 1e-4, "m")})
+        for angle, length in ((3.1, 0.5), (3.1 + 2e-3 - 2.0 * np.pi, 0.5003))
+    )
+    most = compare._largest_change(before, run)
+    assert (most["name"], most["in_sigma"]) == ("a1", pytest.approx(3.0))
+    for one in (before, run):
+        del one.parameters["a1"]
+    assert compare._largest_change(before, run)["change"] == pytest.approx(2e-3)
