@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from fg_calib.calibration import Calibration, calibrate_job
-from fg_calib.inputs import InputError, Record, checked, escaped, shown
+from fg_calib.inputs import InputError, Record, checked, escaped, pl, shown
 from fg_calib.io import fill_folder, read_job, require_no_input, require_writable
 from fg_calib.job import Job
 from fg_calib.parallel import Failure, map_jobs
@@ -186,8 +186,6 @@ def write_jobs(folder: Path, jobs: Sequence[JobSummary], seconds: float) -> None
     Raises:
         InputError: The folder cannot be written.
     """
-    import polars as pl
-
     heads = ("name", "job", "verdict", "robot", "n_configurations", "reduced_chi2", "seconds")
     kinds = {kind: unit for job in jobs for kind, unit in job.units.items()}
     columns = {head: [getattr(job, head) for job in jobs] for head in heads}

@@ -14,7 +14,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from fg_calib import inputs, io, parallel
 from fg_calib.assessment import Assessment, assess, solve_job
 from fg_calib.graph import Knowledge, Solution, Variables, build_variables, frame_of, tables_of
-from fg_calib.inputs import Brief, CalibrationError, Floats, InputError, Options, Record, SolverError, checked
+from fg_calib.inputs import Brief, CalibrationError, Floats, InputError, Options, Record, SolverError, checked, pl
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, check_readings
 from fg_calib.monitoring import Calibrated, Check, Rows, check_rows, counted_before, predicted_before, updated
@@ -32,9 +32,6 @@ from fg_calib.report import Drawing, ReportData, draw, format_result, judged, no
 from fg_calib.robot import Context, Robot, names_of
 from fg_calib.selection import select_effects
 from fg_calib.statistics import CrossValidation, ParameterEstimate, TangentCovariance, cross_validate
-
-if TYPE_CHECKING:
-    import polars as pl
 
 DataFrameOf = Literal["parameters", "covariance", "residuals", "configurations"]
 
@@ -456,8 +453,6 @@ class Calibration(Record, repr=False, eq=False):
         Raises:
             InputError: There is no such part, or it was loaded from a folder that lacks that table.
         """
-        import polars as pl
-
         inputs.check("of", of, DataFrameOf)
         if of == "covariance":
             names, matrix = list(self.result.covariance.names), self.covariance()

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names, optimize
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Chain, Robot, build_chain, names_of
@@ -158,8 +158,6 @@ def gauss_newton(evaluate: Evaluate, x: Floats) -> Fit:
 
 def scipy_fit(evaluate: Evaluate, x: Floats) -> Fit:
     """Minimum by MINPACK's Levenberg-Marquardt, which needs as many rows as unknowns."""
-    from scipy import optimize  # here: it takes as long to import as a small calibration
-
     ends = {"ftol": 1e-15, "xtol": _SMALL_STEP, "gtol": 1e-15, "max_nfev": _STEPS}  # near the least that MINPACK takes
     both = {"fun": lambda x: evaluate(x)[0], "jac": lambda x: evaluate(x)[1]}
     options: dict[str, Any] = {**both, "x0": x, "method": "lm", "x_scale": "jac", **ends}

@@ -57,7 +57,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats, InputError, Record
+from fg_calib.inputs import Floats, InputError, Record, optimize
 from fg_calib.robot import Axis, Element, Poses, Robot, RobotBuilder, build_chain, forward, model, pose, random_readings
 
 TableConvention = Literal["dh", "mdh", "mdh-hayati", "dh-hayati"]
@@ -448,14 +448,12 @@ def fit_parameters(start: Robot, calibrated: Robot, readings: Floats) -> Robot:
 
 def _fit(predict: Callable[[Floats], Poses], start: Floats, wanted: Robot, readings: Floats, hold: float) -> Floats:
     """The values that bring predicted poses nearest to those of an arm."""
-    from scipy.optimize import least_squares  # here, for it takes as long to import as a small calibration
-
     weight, at = np.repeat([wanted.reach, 1.0], 3), poses(wanted, readings)
 
     def residual(x: Floats) -> Floats:
         return np.concatenate([(weight * _miss(predict(x), at)).ravel(), hold * (x - start)])
 
-    return least_squares(residual, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200).x
+    return optimize.least_squares(residual, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200).x
 
 
 def _miss(found: Poses, wanted: Poses) -> Floats:

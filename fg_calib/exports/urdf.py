@@ -30,7 +30,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from fg_calib.exports.dh import Links, in_table, links_of, row_transform, transform
-from fg_calib.inputs import Floats, InputError, Record
+from fg_calib.inputs import Floats, InputError, Record, etree
 from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_values
 
 FARTHEST_SLIDE = 1000.0
@@ -79,7 +79,6 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
     Raises:
         InputError: A name has letters that XML cannot hold.
     """
-    from lxml import etree
 
     def numbers(figures: Sequence[float]) -> str:
         return " ".join(repr(float(figure)) for figure in figures)

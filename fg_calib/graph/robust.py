@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from fg_calib.inputs import Floats, Loss, Record
+from fg_calib.inputs import Floats, Loss, Record, optimize
 
 EFFICIENCY = 0.95
 """Efficiency on clean Gaussian measurements of losses that do not reject."""
@@ -90,8 +90,6 @@ def tuning(loss: Loss, dim: int) -> float:
         return np.inf
     if loss == "gnc":
         return float(np.sqrt(2.0 * special.gammaincinv(dim / 2.0, INLIERS)))
-
-    from scipy import optimize  # here, for it takes as long to import as a small calibration
 
     def excess(c: float) -> float:
         _, squared, slope = _moments(loss, c, dim)

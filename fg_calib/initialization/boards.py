@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.initialization.camera import Camera
 from fg_calib.initialization.hand_eye import Frame
-from fg_calib.inputs import Booleans, Floats
+from fg_calib.inputs import Booleans, Floats, optimize
 from fg_calib.robot import left_jacobian
 
 LEAST_CORNERS = 4
@@ -179,8 +179,6 @@ def _refined_on_most(camera: Camera, image: Floats, weight: Floats, start: Frame
 
 def refine_board(camera: Camera, image: Floats, weight: Floats, start: Frame) -> Frame | None:
     """The pose of least squares on the pixels; None where a point is not ahead of the camera."""
-    from scipy.optimize import leastsq  # here, for it takes as long to import as a small calibration
-
     points = image[:, 2:] @ start.rotation[:, :2].T
     if np.min(points[:, 2] + start.translation[2]) <= 0.0:
         return None
@@ -196,7 +194,7 @@ def refine_board(camera: Camera, image: Floats, weight: Floats, start: Frame) ->
         turns = np.cross(turned(x)[:, None], J) @ left_jacobian(x[None, :3])[0]
         return np.concatenate([turns, J], axis=2).reshape(-1, 6)
 
-    x = leastsq(misses, np.append(np.zeros(3), start.translation), Dfun=derivatives, full_output=True)[0]
+    x = optimize.leastsq(misses, np.append(np.zeros(3), start.translation), Dfun=derivatives, full_output=True)[0]
     if np.min(turned(x)[:, 2] + x[5]) <= 0.0:
         return None
     return Frame(Rotation.from_rotvec(x[:3]).as_matrix() @ start.rotation, x[3:])

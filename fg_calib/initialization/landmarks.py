@@ -9,7 +9,7 @@ References:
 import numpy as np
 
 from fg_calib.initialization.hand_eye import Frame, align_points, lifted
-from fg_calib.inputs import Floats, Integers
+from fg_calib.inputs import Floats, Integers, optimize
 from fg_calib.robot import nearest_rotation
 
 
@@ -124,7 +124,6 @@ def _trilaterated(points: Floats, length: Floats) -> Floats:
 
 def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:
     """The point of least squares of the lengths that is best of those from some starts, shape (k, 3)."""
-    from scipy.optimize import leastsq  # here, for it takes as long to import as a small calibration
 
     def misses(a: Floats) -> Floats:
         return np.append(np.linalg.norm(a - points, axis=1) - length, np.zeros(3))  # no fewer than coordinates
@@ -133,7 +132,7 @@ def _by_lengths(points: Floats, length: Floats, starts: Floats) -> Floats:
         away = a - points
         return np.vstack([away / np.maximum(np.linalg.norm(away, axis=1), 1e-300)[:, None], np.zeros((3, 3))])
 
-    found = [leastsq(misses, start, Dfun=slopes, full_output=True, maxfev=MOST_STEPS)[0] for start in starts]
+    found = [optimize.leastsq(misses, start, Dfun=slopes, full_output=True, maxfev=MOST_STEPS)[0] for start in starts]
     return min(found, key=lambda a: float(np.sum(misses(a) ** 2)))
 
 
@@ -173,8 +172,6 @@ def _unit_solution(A: Floats, b: Floats) -> Floats:
     least = 1e-15 * max(values[0] ** 2, 1e-60)  # rounding: where b says nothing along the third axis n is along it
     g[2] = np.copysign(max(abs(g[2]), least), g[2])
     bounds = 0.5 * abs(g[2]), 2.0 * float(np.linalg.norm(g))
-    from scipy.optimize import brentq  # here, for it takes as long to import as a small calibration
-
-    m = brentq(lambda m: 1.0 / np.linalg.norm(g / (above + m)) - 1.0, *bounds, xtol=1e-14 * least, maxiter=1000)
+    m = optimize.brentq(lambda m: 1 / np.linalg.norm(g / (above + m)) - 1, *bounds, xtol=1e-14 * least, maxiter=1000)
     n: Floats = V.T @ (g / (above + m))
     return n / np.linalg.norm(n)

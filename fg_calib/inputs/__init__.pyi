@@ -45,6 +45,7 @@ from .arrays import (
     shape_of,
 )
 from .errors import CalibrationError, InputError, ProblemError, SolverError, escaped, printable, shown, within
+from .libraries import etree, optimize, pl
 from .options import (
     LIMITED,
     MODELS,
@@ -122,10 +123,13 @@ __all__ = [
     "checked",
     "did_you_mean",
     "escaped",
+    "etree",
     "is_one",
     "known_names",
     "listed",
     "once",
+    "optimize",
+    "pl",
     "printable",
     "require",
     "shape_of",

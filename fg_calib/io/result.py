@@ -21,7 +21,7 @@ from hashlib import file_digest, sha256
 from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn
 
 import numpy as np
 import scipy
@@ -30,16 +30,13 @@ from pydantic.functional_serializers import PlainSerializer, WrapSerializer
 
 from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, Variables
-from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, Probability, checked
+from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, Probability, checked, pl
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
 from fg_calib.observability import Identifiability
 from fg_calib.robot import EFFECT_KINDS, SCALES, SPAN, Robot, model, pose
 from fg_calib.selection import EffectTest
-
-if TYPE_CHECKING:
-    import polars as pl
 
 SCHEMA, FORMER_SCHEMA = "fg-calib/result/2", "fg-calib/result/1"
 OBSERVABILITY_SCHEMA = "fg-calib/observability/1"
@@ -587,8 +584,6 @@ RESOLUTION = 1e-8
 
 def residual_frame(solution: Solution, assessed: assessment.Assessment) -> "pl.DataFrame":
     """Every scalar residual, as `residuals.csv` has it."""
-    import polars as pl
-
     table, fit = assessed.fit.residuals, assessed.fit.goodness
     ends, sources = solution.problem.end_names, solution.problem.data.labels
     measured = table.measured - table.excess  # so that predicted minus measured is 0 on average
@@ -610,16 +605,12 @@ def residual_frame(solution: Solution, assessed: assessment.Assessment) -> "pl.D
 
 def _coded(words: Sequence[str], codes: Any) -> "pl.Series":
     """A column of words by their codes, four bytes a row, empty words as null."""
-    import polars as pl
-
     kept = pl.Enum(list(dict.fromkeys(filter(None, words))))
     return pl.Series([word or None for word in words], dtype=kept)[np.asarray(codes, dtype=np.uint32)]
 
 
 def configuration_frame(solution: Solution, assessed: assessment.Assessment) -> "pl.DataFrame":
     """Every measured configuration, as `configurations.csv` has it."""
-    import polars as pl
-
     data, robot = solution.problem.data, assessed.robot
     readings, n = data.readings, data.n_configurations
     held_out = data.held_out | solution.problem.evaluated
@@ -639,8 +630,6 @@ def configuration_frame(solution: Solution, assessed: assessment.Assessment) -> 
 
 def joint_frame(found: statistics.JointErrors, solution: Solution) -> "pl.DataFrame":
     """Every estimated joint position, as `joints.csv` has it."""
-    import polars as pl
-
     n, k = found.error.shape
     joint, units = np.tile(np.arange(k), n), [solution.problem.robot.joints[j].unit for j in found.joints]
     configurations = _coded(solution.problem.end_names, np.repeat(found.configurations + 1, k))
@@ -740,8 +729,6 @@ def read_table(folder: Path, name: str, result: Result) -> "pl.DataFrame | None"
     Raises:
         InputError: The table is damaged, or that of another result.
     """
-    import polars as pl
-
     file = next((folder / f"{name}.{e}" for e in ("csv", "parquet") if exists(folder / f"{name}.{e}")), None)
     if file is None:
         return None

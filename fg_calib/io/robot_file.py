@@ -25,7 +25,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
@@ -33,15 +33,11 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
 from fg_calib import inputs
-from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, known_names, listed, shown
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, etree, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
 from fg_calib.io.yaml import FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
 from fg_calib.robot import Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
-
-if TYPE_CHECKING:  # lxml is imported where it is used: `fg-calib --help` need not wait for it
-    from lxml.etree import _Element as Element
-
 
 _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 """The attributes of `<origin>` and the kinds of parameters that they hold."""
@@ -58,7 +54,7 @@ _NO_ENTITIES = "a URDF without entities: they are not expanded"
 class _UrdfJoint:
     """A joint as the file has it; its axis, limit and mimic matter only on the chain and are read there."""
 
-    element: Element
+    element: etree._Element
     name: str
     parent: str
     child: str
@@ -126,12 +122,12 @@ def read_urdf(
     return _with_effects(builder, effects or {}, links, place or path.name, urdf=source, **choices)
 
 
-def _links_of(root: Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base_link: str) -> dict[str, Any]:
+def _links_of(root: etree._Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base: str) -> dict[str, Any]:
     """What makes a mass on the arm of a mass on each link that hangs on the chain, and the masses of all inertials.
 
     Links that hang on other joints that move are taken at readings of zero.
     """
-    on_chain, number, at = {base_link: (0, np.eye(4))}, 0, np.eye(4)
+    on_chain, number, at = {base: (0, np.eye(4))}, 0, np.eye(4)
     for joint, backwards in chain:
         origin, moves = model.matrix_of_frame(joint.origin), joint.element.get("type") != "fixed"
         number += moves
@@ -248,8 +244,6 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
         text: The URDF, as it was read.
         origins: By joint x, y, z, roll, pitch and yaw, [m] and [rad].
     """
-    from lxml import etree
-
     root = etree.fromstring(text, etree.XMLParser(**_SAFE))
     for joint in root.findall("joint"):
         name = joint.get("name", "")
@@ -258,7 +252,7 @@ def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
     return f'<?xml version="1.0"?>\n{etree.tostring(root.getroottree(), encoding="unicode")}\n'
 
 
-def _set_origin(joint: Element, wanted: Mapping[str, float]) -> None:
+def _set_origin(joint: etree._Element, wanted: Mapping[str, float]) -> None:
     """Give a joint's `<origin>` these numbers; 0 is what a missing one means."""
     element = joint.find("origin")
     for name, kinds in _ORIGIN.items():
@@ -276,10 +270,8 @@ _SAFE: Mapping[str, Any] = {"resolve_entities": False, "load_dtd": False, "no_ne
 """Options of lxml's parser: neither entities nor other files are read."""
 
 
-def _parse(data: bytes, place: str) -> tuple[str, Element]:
+def _parse(data: bytes, place: str) -> tuple[str, etree._Element]:
     """The text, without its declaration, and the root element of an XML file without entities and other files."""
-    from lxml import etree
-
     try:
         root = etree.fromstring(data, etree.XMLParser(**_SAFE))
     except etree.XMLSyntaxError as error:
@@ -297,7 +289,7 @@ def _parse(data: bytes, place: str) -> tuple[str, Element]:
     return etree.tostring(root.getroottree(), encoding="unicode"), root
 
 
-def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
+def _read_joints(root: etree._Element, place: str) -> list[_UrdfJoint]:
     """All joints, each with a name of its own, an origin, a parent and a child."""
     joints: dict[str, _UrdfJoint] = {}
     for joint in root.findall("joint"):
@@ -315,20 +307,20 @@ def _read_joints(root: Element, place: str) -> list[_UrdfJoint]:
     return list(joints.values())
 
 
-def _origin(joint: Element, place: str) -> dict[str, float]:
+def _origin(joint: etree._Element, place: str) -> dict[str, float]:
     xyz, rpy = (_numbers(joint, "origin", name, "0 0 0", place) for name in _ORIGIN)
     if max(map(abs, rpy)) > model.MOST_ANGLE:
         raise InputError(f"{place}: origin rpy", f"found {rpy}", model.IN_RAD, "are they in deg?")
     return dict(zip((*_ORIGIN["xyz"], *_ORIGIN["rpy"]), (*xyz, *rpy), strict=True))
 
 
-def _attribute(joint: Element, child: str, attribute: str, default: str) -> str:
+def _attribute(joint: etree._Element, child: str, attribute: str, default: str) -> str:
     """An attribute of a joint's first child of some name; `default` where either is missing."""
     element = joint.find(child)
     return default if element is None else element.get(attribute, default)
 
 
-def _numbers(joint: Element, child: str, attribute: str, default: str, place: str) -> list[float]:
+def _numbers(joint: etree._Element, child: str, attribute: str, default: str, place: str) -> list[float]:
     """An attribute of as many numbers as its default; only limits may be infinite.
 
     Raises:
@@ -389,7 +381,7 @@ class _Tree:
         """`link`, if there is such a link."""
         if link not in self._links:
             hint = did_you_mean(link, self._links, NEAR)
-            raise InputError(self._place, f"no link {link!r}", known_names(self._links, 40), hint)
+            raise InputError(self._place, f"no link {link!r}", inputs.known_names(self._links, 40), hint)
         return link
 
     def root(self) -> str:

@@ -13,22 +13,19 @@ from dataclasses import field, replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from fg_calib import inputs, measurements, parallel
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked, within
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked, pl, within
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import ANGLES, LENGTHS, Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
 from fg_calib.measurements import Column as ColumnSet
 from fg_calib.robot import Context, Robot
-
-if TYPE_CHECKING:  # polars is imported where it is used: `fg-calib --help` need not wait for it
-    import polars as pl
-
 
 _log = logging.getLogger(__name__)
 
@@ -127,8 +124,6 @@ class Table(Record):
             InputError: The table cannot be read, it has no rows, or `columns` does not fit.
         """
         parallel.require_polars(name)
-        import polars as pl
-
         is_file = isinstance(table, os.PathLike | str)
         name = Path(table).name if is_file else name
         try:
@@ -176,8 +171,6 @@ class Table(Record):
         Raises:
             InputError: A cell is empty, or no finite number.
         """
-        import polars as pl
-
         values = np.empty((self.n_rows, len(columns)))
         for k, column in enumerate(columns):
             if column not in self.frame.columns:
@@ -212,8 +205,6 @@ class Table(Record):
 
         Whole numbers have no fraction: pandas makes floats of them where cells are empty.
         """
-        import polars as pl
-
         cells: pl.Series = self.frame[column]
         if cells.dtype.is_nested() or cells.dtype == pl.Object:
             raise InputError(f"{self.name}: {column}", f"type {cells.dtype}", "text")
@@ -261,8 +252,6 @@ def _read_file(path: Path, skip_lines: int) -> Table:
     Raises:
         InputError: The file is missing, or is no table.
     """
-    import polars as pl
-
     ending = path.suffix.lower()
     if ending == ".csv":
         return _read_csv(path.name, decoded(read_bytes(path), path.name, "cp1252"), skip_lines)
@@ -281,8 +270,6 @@ def _read_csv(name: str, text: str, skip_lines: int) -> Table:
     Raises:
         InputError: The file is empty, a quote is not closed on its line, or a row's cells do not match the header.
     """
-    import polars as pl
-
     if not text.strip(" \t\r\n,;"):
         raise InputError(f"{name}:1", "an empty file", "a header and rows")
     read = partial(pl.read_csv, has_header=False, infer_schema=False)
@@ -347,9 +334,6 @@ def _as_polars(table: Any, name: str) -> "pl.DataFrame":
     Raises:
         InputError: The frame is no table.
     """
-    import polars as pl
-    import polars.selectors as cs
-
     frame = table if isinstance(table, Mapping) else inputs.as_frame(name, table)
     if frame is None or not (isinstance(frame, Mapping | pl.DataFrame) or hasattr(frame, "to_dict")):
         raise InputError(name, f"found a {type(table).__name__}", "a path, or a frame of polars or pandas")
@@ -360,13 +344,11 @@ def _as_polars(table: Any, name: str) -> "pl.DataFrame":
         frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
     if not frame.columns:
         raise InputError(name, "a frame without columns", "a frame with rows")
-    return frame.with_columns(cs.float().fill_nan(None))
+    return frame.with_columns(pl.selectors.float().fill_nan(None))
 
 
 def _series(values: Any) -> Any:
     """A column with None for what pandas has for a missing value; cells of several types become texts."""
-    import polars as pl
-
     if not isinstance(values, list):
         return values
     missing = [v is None or type(v).__name__ == "NAType" or v != v for v in values]  # noqa: PLR0124
@@ -386,8 +368,6 @@ def write_csv(path: Path | str, columns: Mapping[str, ArrayLike | None]) -> None
     Raises:
         InputError: The folder does not exist or may not be written to.
     """
-    import polars as pl
-
     given = {name: np.asarray(values) for name, values in columns.items() if values is not None}
     frame = pl.DataFrame(given).with_columns(pl.lit(None).alias(name) for name in columns if name not in given)
     write_text(Path(path), frame.select(*columns).write_csv())
@@ -706,8 +686,6 @@ def _one_of(table: Table, columns: Iterable[str], present: Container[str]) -> st
 
 def _rotation(table: Table, first: str, values: Floats) -> dict[str, Floats]:
     """Orientations of the rows, from quaternions, angles or rotation vectors, as the first column says."""
-    from scipy.spatial.transform import Rotation
-
     if first == "roll":  # about fixed axes: Rz(yaw) Ry(pitch) Rx(roll)
         return {"rotation": Rotation.from_euler("xyz", values).as_matrix(), "roll_pitch_yaw": values}
     if first == "rx":
@@ -747,8 +725,6 @@ def _labels(table: Table, column: str, *, optional: bool) -> Labels:
 
 def _places(names: "pl.Series", place: dict[str, int]) -> Integers:
     """The place of each name, -1 for others and for none."""
-    import polars as pl
-
     return np.asarray(names.replace_strict(place, default=-1, return_dtype=pl.Int64).to_numpy(), dtype=np.int64)
 
 

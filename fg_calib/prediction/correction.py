@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations, optimize
 from fg_calib.measurements import check_readings
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
 from fg_calib.robot import Context, Robot, build_chain, context_at, forward, rotation_vector, solve_inverse
@@ -237,8 +237,6 @@ def misses(
 
 def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context: Context | None = None) -> Floats:
     """The configuration nearest in orientation with the tool point in place, from one whose point is there."""
-    from scipy.optimize import least_squares  # here, for it takes as long to import as a small calibration
-
     chain = build_chain(robot)
 
     def misses(q: Floats) -> Floats:
@@ -246,6 +244,6 @@ def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context
         turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
         return np.concatenate([(at.position - position)[0] * _WEIGHT, turn[0]])
 
-    best = least_squares(misses, q, jac="3-point", bounds=tuple(robot.limits.T), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+    best = optimize.least_squares(misses, q, "3-point", tuple(robot.limits.T), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
     found = solve_inverse(robot, position, None, context, near=best, n_starts=1)
     return found.readings[0] if found.reached[0] else q

@@ -3,21 +3,18 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib import robot, simulation
-from fg_calib.inputs import Booleans, Floats, InputError
+from fg_calib.inputs import Booleans, Floats, InputError, pl
 from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.tables import figure, in_words, shown_in
 from fg_calib.report.text import ReportData
 from fg_calib.statistics import ParameterEstimate
-
-if TYPE_CHECKING:
-    import polars as pl
 
 CELLS = 22
 """Cells along each side of a slice of the workspace."""

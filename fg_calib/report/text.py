@@ -6,7 +6,7 @@ It is made of a typed result and its tables, so that a loaded calibration prints
 from collections.abc import Iterable, Iterator
 from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rich.console import Group
@@ -14,13 +14,11 @@ from rich.table import Table
 
 from fg_calib import assessment, graph, inputs, measurements, prediction, statistics
 from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
+from fg_calib.inputs import pl
 from fg_calib.io import Result, key_of
 from fg_calib.report import tables
 from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
 from fg_calib.robot import Robot, kind_of
-
-if TYPE_CHECKING:
-    import polars as pl
 
 UNMOVED = 1e-9
 """How far an estimate that no step meant to move may be from its start, [m] and [rad]."""

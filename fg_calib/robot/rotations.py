@@ -5,6 +5,7 @@ References:
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats
 
@@ -17,8 +18,6 @@ QUARTER_TURN = 1e-9
 
 def rotation_vector(rotation: Floats) -> Floats:
     """Rotation vectors of rotation matrices, shape (n, 3), exact near 0, [rad]."""
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_matrix(rotation).as_rotvec()
 
 
@@ -54,8 +53,6 @@ def yaw_pitch_roll(rotation: Floats, near: Floats | None = None) -> Floats:
 
 def rotation_of(yaw: float, pitch: float, roll: float) -> Floats:
     """The matrix Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3); angles in [rad]."""
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
 
 
