@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from rich.console import Group
 
-from fg_calib import importers, io
+from fg_calib import importers, io, report
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, names_in, option, say, show_result
 
 _OFFSET = "Stamp of a pose minus that of the joints at the same moment, in s; 0: as stamped."
@@ -38,7 +38,7 @@ def bag(
     if out is not None:
         importers.write_stops(out, stops, arm)
     found = recording.name, {"joints": _topic(of_joints), "pose": _topic(of_pose)}, stops
-    show_result(as_json, lambda: _document(*found), lambda: _report(*found))
+    show_result(as_json, _document, _report, *found)
     nothing = "nothing is written: --out poses.csv writes the table"
     say(nothing if out is None else f"wrote {len(stops.ids)} poses to {out}")
 
@@ -49,19 +49,15 @@ def _topic(stream: "importers.JointStream | importers.PoseStream") -> dict[str, 
 
 def _document(name: str, topics: dict[str, Any], stops: "importers.Stops") -> dict[str, Any]:
     """The content of the recording for programs: [m], [rad], [s]."""
-    from fg_calib.report import plain
-
     found = {"n_found": len(stops.ids) + len(stops.skipped), "n_written": len(stops.ids)}
     offsets = {"offset": stops.offset, "applied_offset": stops.applied}
     skipped = [s._asdict() for s in stops.skipped]
     more = {"topics": topics, **offsets, **found, "skipped": skipped, "scatter": stops.scatter}
-    return plain({"schema": "fg-calib/bag/1", "bag": name, **more})
+    return report.plain({"schema": "fg-calib/bag/1", "bag": name, **more})
 
 
 def _report(name: str, topics: dict[str, Any], stops: "importers.Stops") -> Group:
     """The content of the recording for the terminal: topics, clocks, scatter and what is left out."""
-    from fg_calib.report import line, report, section, table_of
-
     named, n = zip(("joints", "poses"), topics.values(), strict=True), len(stops.ids)
     streams = [(what, t["topic"], t["type"], t["messages"], 1.0 / t["period"]) for what, t in named]
     units = {"position": "mm", "joint": "mrad or mm"}
@@ -71,13 +67,13 @@ def _report(name: str, topics: dict[str, Any], stops: "importers.Stops") -> Grou
         scatter.append((what, *cells, f"{s.correlation_samples:.3g} samples"))
         if s.slow and what != "joint":
             rough.append(f"noise of {what} is slower than the stops are long: its sigmas are rough")
-    return report(
-        line(f"{name}: {n + len(stops.skipped)} stops found, {n} used, {len(stops.skipped)} skipped", "bold"),
-        table_of(("", "topic", "type", "messages|d", "Hz|.4g"), streams),
+    return report.report(
+        report.line(f"{name}: {n + len(stops.skipped)} stops found, {n} used, {len(stops.skipped)} skipped", "bold"),
+        report.table_of(("", "topic", "type", "messages|d", "Hz|.4g"), streams),
         *(f"{t['topic']}: {note}" for t in topics.values() for note in t["notes"]),
-        *section("Clocks", *_clocks(stops)),
-        *section("Scatter during stops", table_of(columns, scatter), *rough),
-        *section("Skipped", *(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
+        *report.section("Clocks", *_clocks(stops)),
+        *report.section("Scatter during stops", report.table_of(columns, scatter), *rough),
+        *report.section("Skipped", *(f"{s.id} at {s.begin:.1f} s: {s.reason}" for s in stops.skipped)),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Group
 
-from fg_calib import importers, io
+from fg_calib import importers, io, report
 from fg_calib.cli.output import Angle, Json, Length, argument, end, option, say, show_result
 
 _READINGS = "Joint readings; id is an image's name without its ending."
@@ -48,8 +48,6 @@ def _report(tables: "importers.BoardTables") -> Group:
     """Corners, images and the camera, then what to know of the tables."""
     import numpy as np
 
-    from fg_calib.report import line, report, section, table_of
-
     fit, board = tables.fit, tables.fit.board
     n_images = len(fit.views) + len(fit.without_pose) + len(tables.without)
     size = f"{board.columns} x {board.rows}, square {1e3 * board.square:g} mm"
@@ -65,19 +63,17 @@ def _report(tables: "importers.BoardTables") -> Group:
         camera.append((name, f"{getattr(fit.camera, name):.{decimals}f}", f"{sigma:.{decimals}f}", unit))
     pose = ("distance mm|m:.1f", "sigma mm|m", "sigma deg|rad")
     columns = ("Image", "corners|d", "RMS px|.3f", "sigma px|.3f", *pose, "")
-    return report(
-        line(f"{board.type} {size}: {seen}"),
-        *(line(f"DOUBTFUL: {finding}", "bold red") for finding in fit.findings),
-        line(f"RMS of residuals {fit.rms:.3f} px, sigma of a corner {fit.sigma:.3f} px"),
-        table_of(columns, images),
-        *section("Camera (1 sigma)", table_of(("", "estimate|>", "sigma|>", ""), camera)),
-        *section("Notes", *_notes(tables)),
+    return report.report(
+        report.line(f"{board.type} {size}: {seen}"),
+        *(report.line(f"DOUBTFUL: {finding}", "bold red") for finding in fit.findings),
+        report.line(f"RMS of residuals {fit.rms:.3f} px, sigma of a corner {fit.sigma:.3f} px"),
+        report.table_of(columns, images),
+        *report.section("Camera (1 sigma)", report.table_of(("", "estimate|>", "sigma|>", ""), camera)),
+        *report.section("Notes", *_notes(tables)),
     )
 
 
 def _notes(tables: "importers.BoardTables") -> Iterator[str]:
-    from fg_calib.report import shortened
-
     fit, units = tables.fit, tables.units
     for name, reason in tables.without.items():
         yield f"No board in {name}: {reason}."
@@ -89,7 +85,7 @@ def _notes(tables: "importers.BoardTables") -> Iterator[str]:
         ("Rows of joint readings without an image of the board:", tables.without_image),
     ):
         if names:
-            yield f"{words} {shortened(list(names), 20)}."
+            yield f"{words} {report.shortened(list(names), 20)}."
     if fit.camera_sigma is not None:
         yield "The covariances of poses assume an exact camera; its error moves all boards together."
     if tables.readings is None:

@@ -12,6 +12,8 @@ import typer
 from rich.console import Group
 
 import fg_calib
+from fg_calib import io
+from fg_calib import report as reports
 from fg_calib.cli.output import Json, ResultFolder, argument, end, option, say, show_result
 
 Residuals = Literal["csv", "parquet", "none"]
@@ -28,8 +30,7 @@ def calibrate(
     as_json: Json = False,
 ) -> None:
     """Estimate a robot's parameters from measurements, with their uncertainties."""
-    from fg_calib import batch, io
-    from fg_calib.parallel import local_processes
+    from fg_calib import batch, parallel
 
     if out is None and (report or figures):
         raise typer.BadParameter("needs --out, the folder to write to", param_hint="--report and --figures")
@@ -40,7 +41,7 @@ def calibrate(
     saved = {"report": report, "figures": figures, "residuals": residuals}
     folders = [None if out is None else out / name for name in names]
     orders = [batch.Order(*one, folds, saved) for one in zip(names, jobs, folders, strict=True)]
-    with local_processes(workers) if workers else nullcontext() as executor:
+    with parallel.local_processes(workers) if workers else nullcontext() as executor:
         if several:
             _calibrate_many(orders, out, executor, as_json)
         else:
@@ -49,9 +50,7 @@ def calibrate(
 
 def show_calibration(found: "fg_calib.Calibration", as_json: bool) -> None:
     """Print a calibration, and end with 3 where it is not to be trusted or not accepted."""
-    from fg_calib.report import build_report
-
-    show_result(as_json, found.result.document, lambda: build_report(found.report_data))
+    show_result(as_json, found.result.document, lambda: reports.build_report(found.report_data))
     end(found.findings, not_accepted=found.not_accepted)
 
 
@@ -65,7 +64,7 @@ def _calibrate_many(
     seconds = time.perf_counter() - clock
     if out is not None:
         write_jobs(out, found, seconds)
-    show_result(as_json, lambda: jobs_document(found, seconds), lambda: _jobs_table(found, seconds))
+    show_result(as_json, jobs_document, _jobs_table, found, seconds)
     for job in found:
         for reason in job.reasons:
             say(f"{job.name}: {reason}")
@@ -75,18 +74,17 @@ def _calibrate_many(
 
 def _jobs_table(jobs: "Sequence[fg_calib.batch.JobSummary]", seconds: float) -> Group:
     """Many jobs for the terminal: a line of each, then how many are good; `seconds` is the duration of all together."""
-    from fg_calib.report import in_order, line, shown_in, table_of
-
     units = {kind: unit for job in jobs for kind, unit in job.units.items()}
-    kinds, rows = in_order(units), []
+    kinds, rows = reports.in_order(units), []
     for job in jobs:
         values = [job.rms.get(kind) for kind in kinds]
         reason = "; ".join(job.reasons[:1])
         rows.append((job.name, job.verdict, job.rows, *values, job.reduced_chi2, job.seconds, reason))
-    columns = [f"{kind} {shown_in(units[kind]).unit}|{units[kind]}| " for kind in kinds]
-    table = table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows)
+    columns = [f"{kind} {reports.shown_in(units[kind]).unit}|{units[kind]}| " for kind in kinds]
+    table = reports.table_of(("job", "verdict", "rows", *columns, "chi2/dof|.3g| ", "s|.3g| ", "reason"), rows)
     counts = ", ".join(f"{count} {verdict}" for verdict, count in Counter(job.verdict for job in jobs).items())
-    return Group(table, line(f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration", "bold"))
+    total = f"{len(jobs)} jobs in {seconds:.1f} s: {counts}; RMS after the calibration"
+    return Group(table, reports.line(total, "bold"))
 
 
 def report(

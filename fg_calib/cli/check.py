@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
+import fg_calib
+from fg_calib import inputs, io, report, robot
 from fg_calib.cli.calibrate import show_calibration
 from fg_calib.cli.output import Json, ResultFolder, argument, option, quantity, show_result
 
@@ -25,13 +27,10 @@ def check(
     as_json: Json = False,
 ) -> None:
     """Say whether a calibration is still good by new rows, and what changed if it is not."""
-    from fg_calib.calibration import Calibration
-    from fg_calib.report import build_check_report, check_document
-
-    calibration = Calibration.load(result)
+    calibration = fg_calib.Calibration.load(result)
     found = calibration.check(table, limit=limit, limit_angle=limit_angle, pairs=pairs, like=like)
     joints = [joint.unit for joint in calibration.robot.joints]
-    show_result(as_json, lambda: check_document(found), lambda: build_check_report(found, joints))
+    show_result(as_json, lambda: report.check_document(found), lambda: report.build_check_report(found, joints))
     if found.verdict != "pass":
         raise typer.Exit(3)
 
@@ -49,13 +48,11 @@ def update(
     as_json: Json = False,
 ) -> None:
     """Add new rows to the information of a calibration: its own rows are not read again."""
-    from fg_calib import calibration, inputs, io, robot
-
     if out.resolve() == (result.parent if result.is_file() else result).resolve():
         raise inputs.InputError(str(out), "the folder of the result that is updated", "another one, for the new result")
     io.require_writable(out)
     io.require_no_input(out, Path("job"), {str(path): "" for path in (table, pairs) if path is not None})
-    before = calibration.Calibration.load(result)
+    before = fg_calib.Calibration.load(result)
     units = {name: p.unit for p in before.robot.parameters for name in (robot.tolerance_kind(p), p.name) if name}
     since: dict[str, Any] = {"date": date, "growth": _growth(growth or (), units), "changed": changed or ()}
     found = before.update(table, **since, anchors_stay=anchors_stay, pairs=pairs, like=like)
@@ -69,8 +66,6 @@ def _growth(given: Sequence[str], units: Mapping[str, str]) -> dict[str, float]:
     Raises:
         InputError: One is not `NAME=FIGURE` with a unit.
     """
-    from fg_calib import inputs, io
-
     found = {}
     for one in given:
         name, equals, figure = one.partition("=")
@@ -82,9 +77,6 @@ def _growth(given: Sequence[str], units: Mapping[str, str]) -> dict[str, float]:
 
 def history(result: ResultFolder, as_json: Json = False) -> None:
     """Show the runs that a calibration came from."""
-    from fg_calib.io import read_result
-    from fg_calib.report import build_history, history_document
-
-    found = read_result(result)
+    found = io.read_result(result)
     runs = (*found.history, found.run)
-    show_result(as_json, lambda: history_document(found.robot, runs), lambda: build_history(found.robot, runs))
+    show_result(as_json, report.history_document, report.build_history, found.robot, runs)

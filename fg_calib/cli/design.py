@@ -42,7 +42,7 @@ def design(
         choices[key] = None if path is None else io.read_joint_table(path, robot, units)[1]
     found = designed(subject, fitted=fitted, **choices, **_candidates(candidates, robot, units))
     names = report.write_design(out, found, units) if out is not None else ()
-    show_result(as_json, lambda: report.design_document(found), lambda: report.build_design_report(found))
+    show_result(as_json, report.design_document, report.build_design_report, found)
     say(f"wrote {', '.join(names)} to {out}" if out else "nothing is written: --out DIR writes tables and a job")
     end([] if found.reached else ["the target is not reached"], "doubtful")
 

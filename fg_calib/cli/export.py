@@ -6,6 +6,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+import fg_calib
+from fg_calib import exports, io
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, say, show, show_json
 from fg_calib.inputs import InputError, escaped
 
@@ -30,32 +32,26 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write the calibrated arm as others read it: URDF, ROS, Tesseract, tables, joint zeros."""
-    from fg_calib.calibration import Calibration
-    from fg_calib.exports.export import export as export_arm
-    from fg_calib.io import is_folder, read_robot, require_absent
-
-    is_result = is_folder(arm) or arm.suffix.lower() == ".json"
+    is_result = io.is_folder(arm) or arm.suffix.lower() == ".json"
     if is_result and (base_link or tip_link):
         raise typer.BadParameter("a RESULT knows its links", param_hint="--base-link and --tip-link")
     if at == "measured" and not is_result:
         raise typer.BadParameter("needs a RESULT with its configurations", param_hint="--at measured")
     if out is not None:
-        require_absent(out.parent, [out.name])
-    found = Calibration.load(arm) if is_result else read_robot(arm, base_link=base_link, tip_link=tip_link)
+        io.require_absent(out.parent, [out.name])
+    found = fg_calib.Calibration.load(arm) if is_result else io.read_robot(arm, base_link=base_link, tip_link=tip_link)
     choices = {"far": far, "ur_base": ur_base, "ur_hash": ur_hash}
-    before = None if nominal is None else read_robot(nominal, base_link=base_link, tip_link=tip_link)
-    q = found.measured if isinstance(found, Calibration) and at == "measured" else None
+    before = None if nominal is None else io.read_robot(nominal, base_link=base_link, tip_link=tip_link)
+    q = found.measured if isinstance(found, fg_calib.Calibration) and at == "measured" else None
     if at == "measured" and q is None:
         raise InputError(str(arm), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
-    made = export_arm(found, to, nominal=before, configurations=q, tool=tool, **choices)  # type: ignore[arg-type]
+    made = fg_calib.export(found, to, nominal=before, configurations=q, tool=tool, **choices)  # type: ignore[arg-type]
     show_export(made, out, as_json)
     end(made.findings, not_accepted=made.not_accepted)
 
 
 def show_export(made: Any, out: Path | None, as_json: bool) -> None:
     """Write an `Export` to a new file, or print it; its notes on stderr where they are not in what is printed."""
-    from fg_calib.exports.export import with_names
-
     if out is not None:
         made.write(out)
         say(f"wrote {out}")
@@ -66,4 +62,4 @@ def show_export(made: Any, out: Path | None, as_json: bool) -> None:
         show("\n".join(escaped(line.expandtabs()) if sys.stdout and sys.stdout.isatty() else line for line in lines))
     for note in made.notes:
         if as_json or out is not None or note not in made.text:
-            say(note if out is None else with_names(note, out.stem))
+            say(note if out is None else exports.with_names(note, out.stem))

@@ -1,10 +1,12 @@
 """`fg-calib inspect`, `observe` and `compare`: what rows can determine, and what estimators make of them."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
+import fg_calib
+from fg_calib import diagnostics, io, measurements, observability, report
 from fg_calib.cli.output import Angle, BaseLink, Json, Length, TipLink, argument, end, names_in, option, show_result
-from fg_calib.inputs import FrameKnowledge, Model
+from fg_calib.inputs import FrameKnowledge, Model, Pairing
 
 Sigma = float | None
 Strategy = Literal["star", "chain", "all"]
@@ -12,12 +14,9 @@ Strategy = Literal["star", "chain", "all"]
 
 def inspect(job: Annotated[Path, argument("JOB", "The job, such as calibration.yaml.")], as_json: Json = False) -> None:
     """Say what a job holds, what looks wrong with it, and what it can determine, without solving it."""
-    from fg_calib import diagnostics, io
-    from fg_calib.report import build_inspection_report, inspection_document
-
     given = io.read_job(job)
     found = diagnostics.inspect_job(given)
-    show_result(as_json, lambda: inspection_document(found, given), lambda: build_inspection_report(found, given))
+    show_result(as_json, report.inspection_document, report.build_inspection_report, found, given)
     end(found.findings, "look at this first")
 
 
@@ -40,26 +39,22 @@ def observe(
     as_json: Json = False,
 ) -> None:
     """Say which parameters measurements can determine, which only together, and why not the others."""
-    from fg_calib import inputs, measurements
-    from fg_calib.io import Units, read_measurements, read_robot
-    from fg_calib.observability import observe_configurations, observe_structure
-    from fg_calib.report import build_identifiability_report, observability_document, write_document
-
-    arm, names = read_robot(robot, base_link=base_link, tip_link=tip_link), names_in(prefer)
+    arm, names = io.read_robot(robot, base_link=base_link, tip_link=tip_link), names_in(prefer)
     if configurations is None:
-        found = observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
+        found = observability.observe_structure(arm, model, frame=frame, prefer=names, seed=seed)
     else:
-        units = Units(length, angle)
+        units = io.Units(length, angle)
         noise = measurements.Noise(
             position=None if position_noise is None else position_noise * units.factor("m"),
             orientation=None if orientation_noise is None else orientation_noise * units.factor("rad"),
             joint=tuple(joint_noise * units.factor(joint.unit) for joint in arm.joints),
         )
-        table = read_measurements(configurations, arm, units=units, noise=noise)
-        found = observe_configurations(arm, table, model, frame=frame, pairing=inputs.Pairing(pairing), prefer=names)
+        table = io.read_measurements(configurations, arm, units=units, noise=noise)
+        how: dict[str, Any] = {"frame": frame, "pairing": Pairing(pairing), "prefer": names}
+        found = observability.observe_configurations(arm, table, model, **how)
     if out is not None:
-        write_document(out, "observability.json", observability_document(found))
-    show_result(as_json, lambda: observability_document(found), lambda: build_identifiability_report(found))
+        report.write_document(out, "observability.json", report.observability_document(found))
+    show_result(as_json, report.observability_document, report.build_identifiability_report, found)
 
 
 def compare(
@@ -68,12 +63,8 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare the factor graph with plain least squares on the same job."""
-    from fg_calib import baseline, io
-    from fg_calib.report import compare as report
-    from fg_calib.report import write_document
-
-    found = baseline.comparison.compare(io.read_job(job))
+    found = fg_calib.compare(io.read_job(job))
     if out is not None:
-        write_document(out, "comparison.json", report.comparison_document(found))
-    show_result(as_json, lambda: report.comparison_document(found), lambda: report.build_comparison_report(found))
+        report.write_document(out, "comparison.json", report.comparison_document(found))
+    show_result(as_json, report.comparison_document, report.build_comparison_report, found)
     end(found.findings)

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from rich.console import Console
 
+from fg_calib import io, report
 from fg_calib.inputs import AngleUnit, LengthUnit, printable
 
 
@@ -35,8 +37,6 @@ def quantity(name: str, unit: Literal["m", "rad"], about: str) -> Any:
     """An option that takes a number with its unit."""
 
     def read(text: str) -> float:
-        from fg_calib import io
-
         return io.quantity(text, unit, None, name)
 
     return option(name, {"m": "LENGTH", "rad": "ANGLE"}[unit], about, parser=read)
@@ -59,8 +59,6 @@ def progress() -> Iterator[None]:
     if not sys.stderr.isatty():
         yield
         return
-    from rich.console import Console
-
     from fg_calib.parallel import listener
 
     with Console(file=sys.stderr).status("working") as status:
@@ -91,25 +89,22 @@ def show_json(document: dict[str, Any]) -> None:
     show(json.dumps(document, allow_nan=False))
 
 
-def show_result(as_json: bool, document: Callable[[], dict[str, Any]], report: Callable[[], Any]) -> None:
+def show_result(as_json: bool, document: Callable[..., dict[str, Any]], build: Callable[..., Any], *of: Any) -> None:
     """Print a result as JSON, or as a report as wide as the terminal or `COLUMNS` (`WIDTH` in a pipe).
 
     Args:
         as_json: Whether as JSON.
         document: Makes the document.
-        report: Makes the report.
+        build: Makes the report.
+        of: Arguments of both.
     """
     if as_json:
-        show_json(document())
+        show_json(document(*of))
         return
-    from rich.console import Console
-
-    from fg_calib.report import WIDTH, width_for
-
-    shown = report()
+    shown = build(*of)
     _hide_progress()
     given = Console().is_terminal or "COLUMNS" in os.environ
-    Console(highlight=False, width=width_for(shown, Console().width if given else WIDTH)).print(shown)
+    Console(highlight=False, width=report.width_for(shown, Console().width if given else report.WIDTH)).print(shown)
 
 
 def names_in(text: str) -> list[str]:

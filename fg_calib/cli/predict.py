@@ -4,6 +4,8 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import fg_calib
+from fg_calib import io, report
 from fg_calib.cli.output import Angle, Json, Length, ResultFolder, argument, end, option, quantity, say, show_result
 
 
@@ -17,15 +19,12 @@ def predict(
     as_json: Json = False,
 ) -> None:
     """Say how far off the calibrated tool is expected to be: over the workspace, or at configurations."""
-    from fg_calib import calibration, io, report
-    from fg_calib.calibration import predict as predict_tool
-
     units = io.Units(length, angle)
     if out is not None:
         io.require_writable(out)
-    arm = calibration.Calibration.load(result)
+    arm = fg_calib.Calibration.load(result)
     ids, readings, context = ((), None, {}) if at is None else io.read_joint_table(at, arm.robot, units)
-    found = predict_tool(arm, readings, context, limit=limit)
+    found = fg_calib.predict(arm, readings, context, limit=limit)
     if out is not None:
         report.write_prediction(out, found, arm.result, arm.robot, ids, units)
     document = partial(report.prediction_document, found, arm.result, ids)
@@ -46,15 +45,12 @@ def correct(
     as_json: Json = False,
 ) -> None:
     """Find what to command so that the calibrated arm reaches targets: joint values, and poses for a nominal model."""
-    from fg_calib import calibration, io, report
-    from fg_calib.calibration import correct as correct_targets
-
     if out is not None:
         io.require_absent(out.parent, [out.name])
-    found, units = calibration.Calibration.load(result), io.Units(length, angle)
+    found, units = fg_calib.Calibration.load(result), io.Units(length, angle)
     wanted = io.read_targets(targets, found.robot, units)
     where, near = (wanted.position, wanted.rotation, wanted.context), wanted.readings
-    commands = correct_targets(found, *where, near=near, world=world, table=table)
+    commands = fg_calib.correct(found, *where, near=near, world=world, table=table)
     if out is not None:
         report.write_commands(out, wanted.ids, commands, found.robot, units)
     document = partial(report.correction_document, found.robot.name, wanted.ids, commands)

@@ -1,3 +1,3 @@
-from .export import Export
+from .export import Export, with_names
 
-__all__ = ["Export"]
+__all__ = ["Export", "with_names"]

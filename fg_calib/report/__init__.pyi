@@ -1,5 +1,6 @@
 from .compare import (
     build_check_report,
+    build_comparison_report,
     build_history,
     check_document,
     comparison_document,
@@ -42,6 +43,7 @@ __all__ = [
     "Drawing",
     "ReportData",
     "build_check_report",
+    "build_comparison_report",
     "build_correction_report",
     "build_design_report",
     "build_history",
