@@ -599,8 +599,7 @@ def _as_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:
 def _possible_readings(name: str, given: ArrayLike, robot: Robot) -> Floats:
     """Readings of at least one configuration, within the limits."""
     readings = _as_readings(name, given, robot)
-    if not len(readings):
-        raise InputError(name, "no configurations", "one or more")
+    inputs.expect(len(readings), name, "no configurations", "one or more")
     check_readings(readings, robot, name)
     return readings
 

@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names, optimize
+from fg_calib.inputs import Booleans, Brief, Floats, InputError, Integers, Record, check_names, expect, optimize
 from fg_calib.measurements import Block, Dataset, residuals, unit_whitening, usable_pairs
 from fg_calib.parallel import single_threaded
 from fg_calib.robot import Chain, Robot, build_chain, names_of
@@ -115,8 +115,7 @@ def fit_least_squares(
     clock = time.perf_counter()
     wanted = [p.name for p in robot.parameters if p.estimated] if names is None else list(names)
     check_names("names", wanted, names_of(robot.parameters))
-    if not wanted:
-        raise InputError("names", "nothing to estimate", "at least one parameter")
+    expect(wanted, "names", "nothing to estimate", "at least one parameter")
     system = _System(robot, data, [i for i, p in enumerate(robot.parameters) if p.name in wanted], start, weighted)
     fit, weights = system.solve()
     m, (r, J), parameters = len(wanted), system.evaluate(fit.x, weights), system.parameters(fit.x)

@@ -69,8 +69,7 @@ def _growth(given: Sequence[str], units: Mapping[str, str]) -> dict[str, float]:
     found = {}
     for one in given:
         name, equals, figure = one.partition("=")
-        if not equals:
-            raise inputs.InputError("--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
+        inputs.expect(equals, "--growth", f"found {one!r}", "NAME=FIGURE, such as theta=0.001deg")
         found[name] = io.quantity(figure, units.get(name, "rad"), None, f"--growth: {name}")
     return found
 

@@ -51,8 +51,7 @@ def example(
     out: Annotated[Path, option("--out", "DIR", "Folder to write it to.")],
 ) -> None:
     """Write a ready job to try the package on: robot, measurements and calibration.yaml."""
-    if name not in EXAMPLES:
-        raise inputs.InputError("example", f"found {name!r}", f"one of {', '.join(EXAMPLES)}")
+    inputs.expect(name in EXAMPLES, "example", f"found {name!r}", f"one of {', '.join(EXAMPLES)}")
     files = {file.name: file.read_bytes() for file in sorted((cli.EXAMPLES / name).iterdir()) if file.is_file()}
     io.require_absent(out, files)
     io.fill_folder(out, files)

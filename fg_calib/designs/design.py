@@ -170,8 +170,7 @@ def _build_pool(
 ) -> Pool:
     """The pool of a scenario, or of a job that is solved first."""
     if isinstance(of, job.Job):
-        if given is not None:
-            raise InputError("given", "with a job", "a scenario: what a job measured counts already")
+        inputs.expect(given is None, "given", "with a job", "a scenario: what a job measured counts already")
         source, problem = "job" if of.path is None else of.path.name, solve_for_design(of)
         if isinstance(candidates, str):
             return pool_of_rows(problem, source)
@@ -189,8 +188,7 @@ def _check_values(n: int | None, target: float | None, n_candidates: int, lever:
     Raises:
         InputError: One makes no sense.
     """
-    if n is not None and target is not None:
-        raise InputError("target", "together with n", "one of the two")
+    inputs.expect(n is None or target is None, "target", "together with n", "one of the two")
     if n is not None:
         check_number("n", n, least=1, whole=True, most=MAX_POSES)
     if target is not None:
@@ -209,8 +207,7 @@ def _check_readings(name: str, given: object, robot: Robot) -> Floats | None:
     if given is None:
         return None
     q = inputs.as_floats(name, given, f"(n, {robot.n_joints})")
-    if not len(q):
-        raise InputError(name, "no configurations", "at least one")
+    inputs.expect(len(q), name, "no configurations", "at least one")
     return q
 
 
@@ -225,8 +222,7 @@ def design_from_pool(
 ) -> Design:
     """Choose from a pool for a task, and compare with random sets; arguments as of `design`."""
     measurable = np.setdiff1d(np.flatnonzero(np.any(pool.rows.rows, axis=(1, 2))), pool.given)
-    if not len(measurable):
-        raise InputError("candidates", "none at which anything is measured", "some")
+    inputs.expect(len(measurable), "candidates", "none at which anything is measured", "some")
     after = pool.before is not None
     form = task.quadratic_form(pool.problem, curves=after)
     system = build_system(pool.rows, pool.known, form).with_known(pool.given)

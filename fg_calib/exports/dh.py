@@ -57,7 +57,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats, InputError, Record, optimize
+from fg_calib.inputs import Floats, Record, expect, optimize
 from fg_calib.robot import Axis, Element, Poses, Robot, RobotBuilder, build_chain, forward, model, pose, random_readings
 
 TableConvention = Literal["dh", "mdh", "mdh-hayati", "dh-hayati"]
@@ -300,8 +300,7 @@ def links_of(robot: Robot) -> Links:
     Raises:
         InputError: A joint's value is more than its reading plus a constant: no other format has that.
     """
-    if robot.effects:
-        raise InputError(robot.name, "joints with effects", "plain readings")
+    expect(not robot.effects, robot.name, "joints with effects", "plain readings")
     base, tool = set(robot.owned_by(0)), set(robot.owned_by(robot.n_joints + 1))
     parts: list[list[Element]] = [[], [], []]  # base, what is between joints, tool; more are put before the tool
     for element in robot.elements:

@@ -17,7 +17,7 @@ from fg_calib.exports import dh
 from fg_calib.exports.poe import screw_content
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
-from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, printable, shown
+from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, expect, printable, shown
 from fg_calib.io import Units, effects_mapping, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, build_chain, frame_values, spline
 
@@ -290,8 +290,7 @@ def _zeros(arm: Robot | Calibration, start: Robot | None, tool: ToolOfZeros, at:
     fitted, given = dh.drawn(robot, dh.N_FITTED, 0), dict[str, Floats]()
     if at is not None:
         given["measured"] = fitted = as_floats("configurations", at, f"(n, {robot.n_joints})")
-        if not len(fitted):
-            raise InputError("configurations", "none", "at least one")
+        expect(len(fitted), "configurations", "none", "at least one")
     behind = robot.n_joints + 1
     kept = (0, behind) if tool == "calibrated" else (0,)
     nominal = dh.with_frames_of(start, robot, kept)

@@ -489,8 +489,7 @@ def read_bag(
         from rosbags import highlevel, typesys
     except ImportError:
         raise CalibrationError("fg-calib bag needs rosbags: pip install 'fg_calib[ros]'") from None
-    if not path.exists():
-        raise InputError(str(path), "no such bag")
+    inputs.expect(path.exists(), str(path), "no such bag")
     try:
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
@@ -520,8 +519,7 @@ def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...
     if len(fitting) == 1:
         return fitting[0]
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in fitting or every)
-    if fitting:
-        raise InputError(bag, f"{len(fitting)} topics fit: {listed}", f"one of them: --{what} TOPIC")
+    inputs.expect(not fitting, bag, f"{len(fitting)} topics fit: {listed}", f"one of them: --{what} TOPIC")
     raise InputError(bag, f"no topic {name or ''} for --{what}", hint=f"the bag has {listed or 'nothing'}")
 
 
@@ -607,8 +605,7 @@ def _sort(
         what = f"stamps go back by {back.max():.3g} s at message {int(np.argmax(back > MAX_BACK_S)) + 1}"
         raise InputError(place, what, "a clock that runs on")
     stamps, first = np.unique(stamps, return_index=True)
-    if len(stamps) < 2:
-        raise InputError(place, f"{len(stamps)} different stamps with finite values", "a recording")
+    inputs.expect(len(stamps) >= 2, place, f"{len(stamps)} different stamps with finite values", "a recording")
     found = {**counts, "with nan left out": np.sum(~finite), "out of order put in order": np.sum(back > 0.0)}
     found["with the stamp of another left out"] = len(values) - len(first)
     notes += [f"{n} message{'s' * int(n != 1)} {what}" for what, n in found.items() if n]

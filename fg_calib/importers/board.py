@@ -34,7 +34,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib import __version__, io, measurements, parallel
 from fg_calib.initialization import Camera, boards_from_image, refine_board
-from fg_calib.inputs import Floats, InputError, Integers, Record, check
+from fg_calib.inputs import Floats, InputError, Integers, Record, check, expect
 
 Image = NDArray[np.uint8]
 
@@ -170,8 +170,7 @@ def charuco_board(board: CalibrationBoard, place: str) -> Any:
     cv2 = load_opencv()
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     needed, there = board.columns * board.rows // 2, len(dictionary.bytesList)
-    if needed > there:
-        raise InputError(f"{place}: dictionary", f"{board.dictionary} has {there} markers", f"{needed} or more")
+    expect(needed <= there, f"{place}: dictionary", f"{board.dictionary} has {there} markers", f"{needed} or more")
     made = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, board.marker, dictionary)
     made.setLegacyPattern(board.legacy)
     return made
@@ -414,8 +413,7 @@ def fit_board(
     if camera is None:
         camera = estimate_camera(list(points.values()), [one.uv for one in found], size)
     fits = {one.name: fit for one in found if (fit := _fit(camera, points[one.name], one.uv)) is not None}
-    if not fits:
-        raise InputError("images", "corners that no pose of the board explains", "images of this board by this camera")
+    expect(fits, "images", "corners that no pose of the board explains", "images of this board by this camera")
     taken = 6.0 + (0.0 if given else len(INTRINSICS) / len(fits))
     squares, n = (sum(of) for of in zip(*((fit.squares, len(fit.J)) for fit in fits.values()), strict=True))
     variance = squares / (n - taken * len(fits))
@@ -495,8 +493,7 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
         raise InputError(f"{place}: square", found, f"at most {MAX_SQUARE_M:g} m", "is it in mm? units: {length: mm}")
     if file.type == "charuco":
         for key in ("marker", "dictionary"):
-            if not getattr(file, key):
-                raise InputError(place, f"missing key {key!r}")
+            expect(getattr(file, key), place, f"missing key {key!r}")
         if board.marker >= board.square:
             expected = f"a side shorter than a square's, {io.shown(file.square)}"
             raise InputError(f"{place}: marker", f"found {io.shown(file.marker)}", expected)
@@ -524,8 +521,7 @@ def image_files(given: Sequence[Path]) -> list[Path]:
         found = [path]
         if path.is_dir():
             found = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith("."))
-        if not found:
-            raise InputError(str(path), "no images", f"files that end in {', '.join(_ENDINGS)}")
+        expect(found, str(path), "no images", f"files that end in {', '.join(_ENDINGS)}")
         files += found
     names: dict[str, Path] = {}
     for file in files:
@@ -595,11 +591,9 @@ def read_readings(path: Path) -> Readings:
     """
     table = io.Table.read(path, "configurations")
     columns = {name.lower() if name.lower() in io.KNOWN else name: name for name in table.columns}
-    if "id" not in columns:
-        raise InputError(table.name, "no column id", "the name of each row's image without its ending")
+    expect("id" in columns, table.name, "no column id", "the name of each row's image without its ending")
     kept = [name for name in columns if name not in io.KNOWN]
-    if not kept:
-        raise InputError(table.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
+    expect(kept, table.name, "no columns of joint readings", "q1, q2 and so on, or the joints' names")
     ids = table.texts(columns["id"], "the name of an image without its ending")
     table.require(ids.is_first_distinct().to_numpy(), columns["id"], "one row an image")
     comma = r"^([-+]?\d*),(\d+(?:[eE][-+]?\d+)?)$" if table.separator != "," else r"$^"  # of decimals: we write points

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from fg_calib import io
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, Record, printable
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, Record, expect, printable
 from fg_calib.io import ANGLES, KNOWN, LENGTHS, OF_PAIRS, Table, decoded, names_of, read_bytes, read_robot, read_yaml
 from fg_calib.measurements import COVARIANCE, INSTRUMENTS
 from fg_calib.robot import Robot
@@ -277,11 +277,9 @@ def _sort(files: Sequence[Path]) -> dict[str, list[Path]]:
             raise InputError(file.name, "neither robot, camera nor table", expected)
         found[kind].append(file)
     for kind, example in (("robot", "robot.yaml or a URDF"), ("table", "poses.csv")):
-        if not found[kind]:
-            raise InputError("init", f"no {kind} among the files", f"one, such as {example}")
+        expect(found[kind], "init", f"no {kind} among the files", f"one, such as {example}")
     for kind in ("robot", "camera"):
-        if len(found[kind]) > 1:
-            raise InputError("init", f"several {kind}s: {', '.join(f.name for f in found[kind])}", "one")
+        expect(len(found[kind]) <= 1, "init", f"several {kind}s: {', '.join(f.name for f in found[kind])}", "one")
     return found
 
 
@@ -292,8 +290,7 @@ def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
         InputError: There are several tables of pairs, or one alone.
     """
     pairs, tables = ([one for one in recognised if ("a" in one.present) == which] for which in (True, False))
-    if len(pairs) > 1:
-        raise InputError("init", f"several tables of pairs: {', '.join(t.path.name for t in pairs)}", "one")
+    expect(len(pairs) <= 1, "init", f"several tables of pairs: {', '.join(t.path.name for t in pairs)}", "one")
     if not pairs:
         return tables
     if not tables:

@@ -44,7 +44,7 @@ from .arrays import (
     require,
     shape_of,
 )
-from .errors import CalibrationError, InputError, ProblemError, SolverError, escaped, printable, shown, within
+from .errors import CalibrationError, InputError, ProblemError, SolverError, escaped, expect, printable, shown, within
 from .libraries import etree, optimize, pl
 from .options import (
     LIMITED,
@@ -124,6 +124,7 @@ __all__ = [
     "did_you_mean",
     "escaped",
     "etree",
+    "expect",
     "is_one",
     "known_names",
     "listed",

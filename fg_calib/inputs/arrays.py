@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 from pydantic import BeforeValidator, Field, PlainSerializer, PlainValidator
 
 from fg_calib.inputs.arguments import LEAST_SIZE, MOST_SIZE, ORDINARY
-from fg_calib.inputs.errors import InputError, shown
+from fg_calib.inputs.errors import InputError, expect, shown
 
 
 def _read_as(dtype: DTypeLike) -> PlainValidator:
@@ -152,8 +152,7 @@ def as_floats(name: str, given: object, shape: str, *, missing: bool = False) ->
     fits = floats.ndim == len(wanted) and all(
         not word.isdigit() or int(word) == n for word, n in zip(wanted, floats.shape, strict=True)
     )
-    if not fits:
-        raise InputError(name, f"shape {floats.shape}", shape)
+    expect(fits, name, f"shape {floats.shape}", shape)
     check_sizes(name, floats, missing=missing)
     return floats
 
@@ -205,8 +204,7 @@ def as_rotations(name: str, given: object, n: int) -> Floats:
 def as_indices(name: str, given: Any, n: int, most: int | None) -> Integers:
     """Whole numbers from 0, a row each of n, up to `most` where there is such."""
     values = as_array(name, given, "iu", f"whole numbers, a row for each of {n}").copy()
-    if values.shape[:1] != (n,):
-        raise InputError(name, f"shape {values.shape}", f"a row for each of {n}")
+    expect(values.shape[:1] == (n,), name, f"shape {values.shape}", f"a row for each of {n}")
     good = (values >= 0) & ((values <= most) if most is not None else True)
     require(good, name, values, "0 and above" if most is None else f"0 to {most}")
     return values
@@ -232,8 +230,7 @@ def as_sigmas(name: str, given: Any, shape: tuple[int, ...]) -> Floats:
 def as_mask(name: str, given: object, n: int) -> Booleans:
     """A mask of n rows."""
     mask = as_array(name, given, "b", f"True or False for each of {n} rows").astype(np.bool_)
-    if mask.shape != (n,):
-        raise InputError(name, f"shape {mask.shape}", f"({n},), one a row")
+    expect(mask.shape == (n,), name, f"shape {mask.shape}", f"({n},), one a row")
     return mask
 
 

@@ -53,6 +53,12 @@ class InputError(CalibrationError):
         return type(self), (self.place, self.found, self.expected, self.hint)
 
 
+def expect(fits: object, place: str, found: str, expected: str = "", hint: str = "") -> None:
+    """Raise `InputError` of these words where something does not fit."""
+    if not fits:
+        raise InputError(place, found, expected, hint)
+
+
 @contextmanager
 def within(place: str) -> Iterator[None]:
     """The place of what is refused in the block is within another place, unless it is already."""

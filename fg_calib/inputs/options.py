@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from fg_calib.inputs.arguments import check, check_fields, check_names, check_number, check_type, listed
 from fg_calib.inputs.arrays import Record
-from fg_calib.inputs.errors import InputError
+from fg_calib.inputs.errors import InputError, expect
 
 POSE_MODELS = {"pose": (True, True), "position": (False, True), "orientation": (True, False)}
 """Whether a model uses orientations and positions."""
@@ -171,8 +171,7 @@ class Options(Record):
             prior = choices.pop("prior")
             check_type("prior", prior, bool)
             gauge = choices.setdefault("gauge", "prior" if prior else "none")
-            if prior != (gauge == "prior"):
-                raise InputError("prior", f"found {prior} with gauge: {gauge}", "gauge alone")
+            expect(prior == (gauge == "prior"), "prior", f"found {prior} with gauge: {gauge}", "gauge alone")
         choices["prefer"] = listed("prefer", choices.get("prefer", ()))
         return cls(**choices)
 

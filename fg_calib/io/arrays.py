@@ -63,8 +63,7 @@ def read_arrays(
         InputError: An array cannot be used; the message names it and its row.
     """
     q = inputs.as_floats("readings", readings, "(n, n_joints)")
-    if not q.size:
-        raise InputError("readings", f"shape {q.shape}", "(n, n_joints) with at least one row and joint")
+    inputs.expect(q.size, "readings", f"shape {q.shape}", "(n, n_joints) with at least one row and joint")
     given = {name: values for name, values in arrays.items() if values is not None}
     inputs.check_names("Measurements.from_arrays", given, NAMES, "argument")
     rotation = given.pop("rotation", None)

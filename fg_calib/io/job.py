@@ -284,8 +284,7 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
     model, of_job = entry.model, place.partition(": measurement")[0]
     noise, _ = _noise(file.noise, file.units, robot, f"{of_job}: noise")
     own, estimated = _noise(entry.noise, entry.units, robot, f"{place}: noise")
-    if estimated:
-        raise InputError(f"{place}: noise", "estimate in the entry of a table", "the key noise of the job")
+    inputs.expect(not estimated, f"{place}: noise", "estimate in the entry of a table", "the key noise of the job")
     pairs = None if entry.pairs is None else folder / entry.pairs
     noise = noise.updated(**{key: own.get(key) for key in entry.noise or ()})
     how: dict[str, Any] = {"units": entry.units, "columns": entry.columns, "skip_lines": entry.skip_lines}
@@ -436,8 +435,7 @@ def joint_noise(given: Any, units: Units, robot: Robot, place: str) -> tuple[flo
     """
     listed, n = isinstance(given, list), robot.n_joints
     sigmas = yaml.validate(_JointNoises, {"joint": given if listed else [given]}, place).joint * (1 if listed else n)
-    if len(sigmas) != n:
-        raise InputError(f"{place}: joint", f"{len(sigmas)} values", f"one for all or {n}, one a joint")
+    inputs.expect(len(sigmas) == n, f"{place}: joint", f"{len(sigmas)} values", f"one for all or {n}, one a joint")
     return tuple(units.sigma(s, j.unit, f"{place}: joint") for s, j in zip(sigmas, robot.joints, strict=True))
 
 

@@ -30,7 +30,7 @@ from pydantic.functional_serializers import PlainSerializer, WrapSerializer
 
 from fg_calib import __version__, assessment, diagnostics, measurements, monitoring, prediction, statistics
 from fg_calib.graph import JOINT_NOISE, SIZE, Problem, Solution, Variables
-from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, Probability, checked, pl
+from fg_calib.inputs import Figure, Floats, FrameKnowledge, InputError, Model, Options, Probability, checked, expect, pl
 from fg_calib.io.atomic import exists, fill_folder, is_folder, read_bytes, read_text, require_own, write_text
 from fg_calib.io.robot_file import as_read, has_own_zeros, read_robot, require_same_chain, write_robot, write_urdf
 from fg_calib.io.yaml import Units, first_misfit, shown
@@ -486,8 +486,7 @@ def read_result(path: Path | str) -> Result:
     """
     path = Path(path)
     file = path / "result.json" if is_folder(path) else path
-    if not exists(file):
-        raise InputError(str(path), "no result.json", "what `fg-calib calibrate --out` wrote")
+    expect(exists(file), str(path), "no result.json", "what `fg-calib calibrate --out` wrote")
     try:
         document = json.loads(read_text(file), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
@@ -502,8 +501,7 @@ def read_result(path: Path | str) -> Result:
     except ValidationError as error:
         raise first_misfit(error, str(file)) from None
     for key, found, expected in _shapes(result):
-        if found != expected:
-            raise InputError(f"{file}: {key}", f"found {found}", str(expected), "was the file changed?")
+        expect(found == expected, f"{file}: {key}", f"found {found}", str(expected), "was the file changed?")
     return result
 
 

@@ -180,8 +180,7 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
         here = f"{place}: joint {joint.name!r}"
         tags = [child.tag for child in joint.element if isinstance(child.tag, str)]
         for tag in tags:  # of a misspelt or doubled element a default or the first would take the place
-            if tag in _CHILDREN and tags.count(tag) > 1:
-                raise InputError(here, f"two elements <{tag}>", "one")
+            inputs.expect(tag not in _CHILDREN or tags.count(tag) == 1, here, f"two elements <{tag}>", "one")
             if tag not in _CHILDREN and (hint := did_you_mean(tag, _CHILDREN)):
                 raise InputError(here, f"element <{tag}>", hint=hint)
         if joint.element.get("type") == "fixed":
@@ -284,8 +283,7 @@ def _parse(data: bytes, place: str) -> tuple[str, etree._Element]:
     types: Any = root.getroottree().docinfo.internalDTD
     if types is not None and (types.system_url or types.entities()):
         raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
-    if root.tag != "robot":
-        raise InputError(place, f"root element <{root.tag}>", "<robot>")
+    inputs.expect(root.tag == "robot", place, f"root element <{root.tag}>", "<robot>")
     return etree.tostring(root.getroottree(), encoding="unicode"), root
 
 
@@ -297,12 +295,10 @@ def _read_joints(root: etree._Element, place: str) -> list[_UrdfJoint]:
         here = f"{place}:{joint.sourceline}: joint {name!r}"
         if not name:
             raise InputError(f"{place}:{joint.sourceline}", "a joint without a name")
-        if name in joints:
-            raise InputError(here, "a second joint of this name", "different names")
+        inputs.expect(name not in joints, here, "a second joint of this name", "different names")
         for end in ("parent", "child"):
             links.append(_attribute(joint, end, "link", ""))
-            if not links[-1]:
-                raise InputError(here, f"no <{end}>", f'<{end} link="..."/>')
+            inputs.expect(links[-1], here, f"no <{end}>", f'<{end} link="..."/>')
         joints[name] = _UrdfJoint(joint, name, links[0], links[1], _origin(joint, here))
     return list(joints.values())
 
@@ -351,8 +347,7 @@ def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
     (lower,), (upper,) = (_numbers(joint.element, "limit", end, "0", place) for end in ("lower", "upper"))
     if kind == "continuous" or lower == upper == 0.0:
         return Joint(joint.name, kind == "prismatic")
-    if not lower < upper:
-        raise InputError(f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
+    inputs.expect(lower < upper, f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
     return Joint(joint.name, kind == "prismatic", lower, upper)
 
 
@@ -360,8 +355,7 @@ def _axis(joint: _UrdfJoint, place: str) -> NDArray[np.float64]:
     """The joint's unit axis, shape (3,); x where the file says none."""
     axis = np.array(_numbers(joint.element, "axis", "xyz", "1 0 0", place))
     length = math.hypot(*axis)
-    if length < LEAST_SIZE:
-        raise InputError(f"{place}: axis", f"found {axis.tolist()}", "a direction of three numbers")
+    inputs.expect(length >= LEAST_SIZE, f"{place}: axis", f"found {axis.tolist()}", "a direction of three numbers")
     return axis / length
 
 
@@ -386,8 +380,7 @@ class _Tree:
 
     def root(self) -> str:
         """The only link without a parent."""
-        if not self._links:
-            raise InputError(self._place, "no links and joints", "<link> and <joint> within <robot>")
+        inputs.expect(self._links, self._place, "no links and joints", "<link> and <joint> within <robot>")
         return self._only([link for link in self._links if self._up(link) == [link]], "root", "base_link")
 
     def leaf(self, base: str) -> str:
@@ -607,8 +600,7 @@ def _build_rows(file: _DhRobot | _PoeRobot, place: str, estimate: Sequence[str])
         if name in names[:i]:
             raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
         lower, upper = row.limits
-        if not lower < upper:
-            raise InputError(f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
+        inputs.expect(lower < upper, f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
         factor = file.units.factor("m" if row.type == "prismatic" else "rad")
         joint = Joint(name, row.type == "prismatic", lower * factor, upper * factor)
         if isinstance(row, _ScrewRow):

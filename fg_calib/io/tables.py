@@ -137,8 +137,7 @@ class Table(Record):
         except (Exception, pl.exceptions.PanicException) as error:  # of a frame's objects polars may raise anything
             first = str(error).strip().partition("\n")[0]
             raise InputError(name, f"no table: {first or type(error).__name__}") from None
-        if not found.n_rows:
-            raise InputError(name, "no rows", "at least one")
+        inputs.expect(found.n_rows, name, "no rows", "at least one")
         return replace(found, columns=tuple(names), renamed=dict(columns or {}))
 
     @property
@@ -270,8 +269,7 @@ def _read_csv(name: str, text: str, skip_lines: int) -> Table:
     Raises:
         InputError: The file is empty, a quote is not closed on its line, or a row's cells do not match the header.
     """
-    if not text.strip(" \t\r\n,;"):
-        raise InputError(f"{name}:1", "an empty file", "a header and rows")
+    inputs.expect(text.strip(" \t\r\n,;"), f"{name}:1", "an empty file", "a header and rows")
     read = partial(pl.read_csv, has_header=False, infer_schema=False)
     content = text.replace("\r\n", "\n").replace("\r", "\n").encode()
     every = read(content, separator="\x1f", quote_char=None, new_columns=["line"]).with_row_index("number", 1)
@@ -288,8 +286,7 @@ def _read_csv(name: str, text: str, skip_lines: int) -> Table:
     if misfits.any():
         row = int(np.argmax(misfits))
         place, n = f"{name}:{lines['number'][row]}", n_cells[row]
-        if '"' in unquoted[row]:
-            raise InputError(place, "a quote that is not closed", "whole cells in quotes, or none")
+        inputs.expect('"' not in unquoted[row], place, "a quote that is not closed", "whole cells in quotes, or none")
         found = f"{n} cell{'s' * (n != 1)}"
         raise InputError(place, found, f"{len(header)} as in the header", _SKIP * (row == 1))
     if lines.height < every.height:
@@ -342,8 +339,7 @@ def _as_polars(table: Any, name: str) -> "pl.DataFrame":
         columns = frame if isinstance(frame, Mapping) else (frame.reset_index() if named else frame).to_dict("list")
         inputs.check_different(name, columns)
         frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
-    if not frame.columns:
-        raise InputError(name, "a frame without columns", "a frame with rows")
+    inputs.expect(frame.columns, name, "a frame without columns", "a frame with rows")
     return frame.with_columns(pl.selectors.float().fill_nan(None))
 
 

@@ -296,8 +296,7 @@ def quantity(given: object, unit: str, units: Units | None, place: str) -> float
     number, name = given, "" if units is None else units.name(unit)
     if isinstance(given, str) and (read := _QUANTITY.fullmatch(given)):
         number, name = read["number"], read["unit"] or name
-        if not name:
-            raise InputError(place, number, hint=f"give a unit, such as {number}{SCALES[unit].unit}")
+        inputs.expect(name, place, number, hint=f"give a unit, such as {number}{SCALES[unit].unit}")
     if name not in known:
         expected = f"a number with one of {', '.join(known)}"
         raise InputError(place, f"found {shown(given)}", expected, did_you_mean(name, known))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fg_calib.inputs import Floats, InputError, Integers, as_array, check_number, require, shown
+from fg_calib.inputs import Floats, InputError, Integers, as_array, check_number, expect, require, shown
 from fg_calib.robot import cross_matrix
 
 
@@ -290,8 +290,7 @@ def checked_rows(
     arrays, shapes = [], ((n, h), (n, kind.ends, h, 6), (n, h, kind.n_nuisances))
     for name, given, shape in zip(Rows._fields, each, shapes, strict=True):
         numbers = as_array(f"{place}: {name}", given, "iuf", f"numbers of shape {shape}")
-        if numbers.shape != shape:
-            raise InputError(f"{place}: {name}", f"shape {numbers.shape}", f"{shape}")
+        expect(numbers.shape == shape, f"{place}: {name}", f"shape {numbers.shape}", f"{shape}")
         arrays.append(np.ascontiguousarray(numbers, dtype=np.float64))
     return arrays[0], arrays[1], arrays[2]
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fg_calib import robot, simulation
-from fg_calib.inputs import Booleans, Floats, InputError, pl
+from fg_calib.inputs import Booleans, Floats, expect, pl
 from fg_calib.report import charts
 from fg_calib.report.charts import Chart, Plot, limits_of, standalone
 from fg_calib.report.tables import figure, in_words, shown_in
@@ -71,8 +71,7 @@ def draw(data: ReportData, name: str) -> Drawing:
         InputError: Its tables were not saved, or there is nothing to draw.
     """
     charts = figures_of(data)[name]
-    if not charts:
-        raise InputError(name, "nothing to draw: its tables were not saved, or nothing of it was estimated")
+    expect(charts, name, "nothing to draw: its tables were not saved, or nothing of it was estimated")
     return Drawing(standalone(charts))
 
 

@@ -450,8 +450,7 @@ class Robot(inputs.Record):
         """
         expected = f"(n, {self.n_joints}) for the robot's joints"
         shape = shape_of("readings", readings, expected)
-        if len(shape) != 2 or shape[1] != self.n_joints:
-            raise InputError("readings", f"shape {shape}", expected)
+        inputs.expect(len(shape) == 2 and shape[1] == self.n_joints, "readings", f"shape {shape}", expected)
         for name, given in (context or {}).items():
             if len(given) != shape[0]:
                 raise InputError(f"context {name}", f"{len(given)} rows", f"{shape[0]}, one a configuration")
@@ -480,8 +479,7 @@ class Robot(inputs.Record):
         Raises:
             InputError: A joint that there is not, or two effects with the same parameters.
         """
-        if self.effects:
-            raise InputError(self.name, "it has effects already", "all of them together")
+        inputs.expect(not self.effects, self.name, "it has effects already", "all of them together")
         for effect in effects:
             if not isinstance(effect, Effect):
                 raise InputError("effects", f"found {shown(effect)}", "effects, such as Harmonics([1, 2])")
@@ -794,8 +792,7 @@ class RobotBuilder:
         return replace(robot, parameters=tuple(parameters))
 
     def _check_joints(self, place: str) -> None:
-        if len(self._joints) > MOST_JOINTS:
-            raise InputError(place, f"{len(self._joints)} joints", f"at most {MOST_JOINTS}")
+        inputs.expect(len(self._joints) <= MOST_JOINTS, place, f"{len(self._joints)} joints", f"at most {MOST_JOINTS}")
         for joint in self._joints:
             if not joint.prismatic and np.isfinite([joint.lower, joint.upper]).all() and joint.upper > MOST_LIMIT:
                 limits = f"{joint.lower:g} to {joint.upper:g} rad"
@@ -876,25 +873,21 @@ def _joints(
     names: Sequence[str] | None,
 ) -> list[Joint]:
     """The joints of a table of n rows, by what was given for all of them or for each."""
-    if not n:
-        raise InputError("rows", "no joints", "at least one")
+    inputs.expect(n, "rows", "no joints", "at least one")
     kinds = [types] * n if isinstance(types, str) else listed("types", types, "a type, or one a joint")
     ranges = [None] * n if limits is None else listed("limits", limits, "lower and upper of each joint")
     called = [f"q{i + 1}" for i in range(n)] if names is None else listed("names", names)
     for key, count in (("types", len(kinds)), ("limits", len(ranges)), ("names", len(called))):
-        if count != n:
-            raise InputError(key, f"{count} for {n} joints", "one a joint")
+        inputs.expect(count == n, key, f"{count} for {n} joints", "one a joint")
     joints: list[Joint] = []
     for i, (kind, given, name) in enumerate(zip(kinds, ranges, called, strict=True), start=1):
         inputs.check(f"types: joint {i}", kind, JointType)
         if not isinstance(name, str) or not name:
             raise InputError(f"names: joint {i}", f"found {shown(name)}", "a word")
-        if name in called[: i - 1]:
-            raise InputError(f"names: joint {i}", f"found {name!r}, as before", "different names")
+        inputs.expect(name not in called[: i - 1], f"names: joint {i}", f"found {name!r}, as before", "different names")
         pair = (-np.inf, np.inf) if given is None else inputs.as_figures(f"limits: joint {i}", given, "lower and upper")
         lower, upper = pair if np.shape(pair) == (2,) else (np.nan, np.nan)
-        if not lower < upper:
-            raise InputError(f"limits: joint {i}", f"found {shown(given)}", "lower below upper, or None")
+        inputs.expect(lower < upper, f"limits: joint {i}", f"found {shown(given)}", "lower below upper, or None")
         joints.append(Joint(str(name), kind == "prismatic", float(lower), float(upper)))
     return joints
 

@@ -403,8 +403,7 @@ def _the_one_of(given: Mapping[str, Any]) -> tuple[str, Any]:
         InputError: None or several are.
     """
     found = {key: value for key, value in given.items() if value is not None}
-    if len(found) != 1:
-        raise InputError("", f"found {' and '.join(found) or 'none'}", f"one of {', '.join(given)}")
+    inputs.expect(len(found) == 1, "", f"found {' and '.join(found) or 'none'}", f"one of {', '.join(given)}")
     return next(iter(found.items()))
 
 

@@ -116,11 +116,9 @@ def cross_validate(
     """
     inputs.check_number("folds", n, least=2, whole=True)
     for table in job.tables:
-        if table.own:
-            raise InputError("folds", f"custom measurements in {table.measurements.source}", "tables without")
+        inputs.expect(not table.own, "folds", f"custom measurements in {table.measurements.source}", "tables without")
     tables = tuple(_train_tables(job.tables))
-    if not tables:
-        raise InputError("folds", "test rows alone", "rows to calibrate with, and to hold out")
+    inputs.expect(tables, "folds", "test rows alone", "rows to calibrate with, and to hold out")
     whole = replace(job, measurements=tables)
     data = graph.problem_of(whole).data  # whose tables are those of one station each
     fold = _divided(data, n, np.random.default_rng(0))
