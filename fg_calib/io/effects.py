@@ -163,11 +163,11 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
     return out | ({"values": values} if values else {})
 
 
-def _mapping_of(masses: Sequence[Mass]) -> dict[int, Any]:
+def _mapping_of(masses: Sequence[Mass]) -> dict[int | str, Any]:
     """Masses by link; those on one link together."""
-    out = {}
-    for link in dict.fromkeys(one.link for one in masses):
-        each = [one for one in masses if one.link == link]
+    out, links = dict[int | str, Any](), [one.hinges[-1].link if one.hinges else one.link for one in masses]
+    for link in dict.fromkeys(links):
+        each = [one for one, its in zip(masses, links, strict=True) if its == link]
         total = sum(one.mass for one in each)
         com = np.array([one.mass for one in each]) @ np.array([one.com for one in each]) / total
         out[link] = {"mass": total, "com": com.tolist()}

@@ -37,7 +37,7 @@ from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, di
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
 from fg_calib.io.yaml import FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
-from fg_calib.robot import Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
+from fg_calib.robot import Hinge, Joint, Mass, Parameter, Robot, RobotBuilder, UrdfSource, model, names_of, rotations
 
 _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 """The attributes of `<origin>` and the kinds of parameters that they hold."""
@@ -125,7 +125,7 @@ def read_urdf(
 def _links_of(root: etree._Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base: str) -> dict[str, Any]:
     """What makes a mass on the arm of a mass on each link that hangs on the chain, and the masses of all inertials.
 
-    Links that hang on other joints that move are taken at readings of zero.
+    Joints outside the chain that mimic others, and floating or planar ones, are taken at readings of zero.
     """
     on_chain, number, at = {base: (0, np.eye(4))}, 0, np.eye(4)
     for joint, backwards in chain:
@@ -135,14 +135,22 @@ def _links_of(root: etree._Element, tree: _Tree, chain: list[tuple[_UrdfJoint, b
         on_chain[joint.parent if backwards else joint.child] = number, at
 
     def maker(link: str) -> Any:
-        place, below = np.eye(4), link
+        places, below, moving = [np.eye(4)], link, list[_UrdfJoint]()  # from the link up
         while below not in on_chain and (joint := tree.above(below)) is not None:
-            place, below = model.matrix_of_frame(joint.origin) @ place, joint.parent
+            if joint.element.get("type") in _MOVING and joint.element.find("mimic") is None:
+                moving.append(joint)
+                places.append(np.eye(4))
+            places[-1], below = model.matrix_of_frame(joint.origin) @ places[-1], joint.parent
         if below not in on_chain:
             return None
         owner, first = on_chain[below]
-        T = first @ place
-        return lambda mass, com: Mass(owner, mass, tuple((T[:3, :3] @ np.array(com) + T[:3, 3]).tolist()))
+        places[-1] = first @ places[-1]
+        hinges = tuple(
+            Hinge(_moving_joint(j, j.name), j.child, origin.tolist(), _axis(j, j.name).tolist())
+            for j, origin in zip(moving[::-1], places[:0:-1], strict=True)
+        )
+        T = places[0]
+        return lambda mass, com: Mass(owner, mass, tuple((T[:3, :3] @ com + T[:3, 3]).tolist()), "", hinges)
 
     links: dict[str, Any] = {str(i): partial(Mass, i) for i in range(number + 1)}
     links |= {name: made for link in root.findall("link") if (made := maker(name := link.get("name", "")))}
@@ -168,6 +176,9 @@ def _with_effects(builder: RobotBuilder, given: Any, links: Mapping[Any, Any], p
 
 _CHILDREN = ("origin", "parent", "child", "axis", "calibration", "dynamics", "limit", "mimic", "safety_controller")
 """Elements of a joint of a URDF."""
+
+_MOVING = ("revolute", "continuous", "prismatic")
+"""Types of joints that move by one reading."""
 
 _ROWS = "`fg-calib export --to yaml` writes the arm as rows of dh-hayati, whose d is the zero of a slide"
 _XACRO = "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"
@@ -339,7 +350,7 @@ def _figures(text: str) -> list[float]:
 def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
     """The joint with its limits; URDF's missing limit is 0, and two zeros are none at all."""
     kind, mimic = joint.element.get("type"), joint.element.find("mimic")
-    if kind not in {"revolute", "continuous", "prismatic"}:
+    if kind not in _MOVING:
         raise InputError(place, f"type {shown(kind)}", "revolute, continuous, prismatic or fixed on the chain")
     if mimic is not None:
         found = f"mimics joint {shown(mimic.get('joint', ''))}"

@@ -25,7 +25,7 @@ from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import ANGLES, LENGTHS, Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
 from fg_calib.measurements import Column as ColumnSet
-from fg_calib.robot import Context, Robot
+from fg_calib.robot import Context, Robot, outside_joints
 
 _log = logging.getLogger(__name__)
 
@@ -417,8 +417,7 @@ def read_measurements(
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
     found = measurements_of(table, readings, between, units, noise, model)
     with within(table.name):
-        context = [effect.context(robot, readings, table.numbers) for effect in robot.effects]
-    return replace(found, context={name: values for one in context for name, values in one.items()})
+        return replace(found, context=_read_context(table, robot, readings, units, needed=True))
 
 
 def _check_use(table: Table, model: Model | None) -> None:
@@ -560,21 +559,24 @@ def read_joint_table(
     Raises:
         InputError: The file is missing, is no table, lacks columns or holds a cell that cannot be used.
     """
-    table = read_table(path, robot)
-    readings = read_readings(table, find_joint_columns(table, robot), robot, units or Units())
-    return tuple(read_ids(table, repeated=True).tolist()), readings, _read_context(table, robot, readings)
+    table, units = read_table(path, robot), units or Units()
+    readings = read_readings(table, find_joint_columns(table, robot), robot, units)
+    return tuple(read_ids(table, repeated=True).tolist()), readings, _read_context(table, robot, readings, units)
 
 
-def _read_context(table: Table, robot: Robot, readings: Floats | None) -> Context:
-    """What effects depend on besides readings, where a table has it."""
-    context = [effect.context(robot, readings, partial(_numbers_if_any, table)) for effect in robot.effects]
+def _read_context(
+    table: Table, robot: Robot, readings: Floats | None, units: Units, *, needed: bool = False
+) -> Context:
+    """What effects depend on besides readings, where a table has it; joints outside the chain are at 0 if needed."""
+    outside = outside_joints(robot)
+
+    def read(columns: Sequence[str]) -> Floats:
+        if set(columns) <= set(table.frame.columns) or (needed and columns[0] not in outside):
+            return table.numbers(columns) * [units.factor(outside[c].unit) if c in outside else 1.0 for c in columns]
+        return np.full((table.n_rows, len(columns)), 0.0 if needed else np.nan)
+
+    context = [effect.context(robot, readings, read) for effect in robot.effects]
     return {name: values for one in context for name, values in one.items() if not np.isnan(values).all()}
-
-
-def _numbers_if_any(table: Table, columns: Sequence[str]) -> Floats:
-    """Columns of a table as `Table.numbers` gives them, nan if it lacks any."""
-    there = set(columns) <= set(table.frame.columns)
-    return table.numbers(columns) if there else np.full((table.n_rows, len(columns)), np.nan)
 
 
 class Targets(FrozenArrays):
@@ -619,7 +621,7 @@ def read_targets(path: Path | str | Any, robot: Robot, units: Units | None = Non
         raise InputError(table.name, found, "x y z, or q1 ... qn alone", f"it has {', '.join(table.columns)}")
     readings = read_readings(table, find_joint_columns(table, robot), robot, units) if named else None
     ids = tuple(read_ids(table, repeated=False).tolist())
-    return Targets(ids, position, rotation, readings, _read_context(table, robot, readings))
+    return Targets(ids, position, rotation, readings, _read_context(table, robot, readings, units))
 
 
 # --- columns of configurations ----------------------------------------------------------------------------------------

@@ -1,4 +1,17 @@
-from .effects import EFFECTS, Backlash, Bending, Compliance, Coupling, ErrorCurve, Gain, Harmonics, Mass, Thermal
+from .effects import (
+    EFFECTS,
+    Backlash,
+    Bending,
+    Compliance,
+    Coupling,
+    ErrorCurve,
+    Gain,
+    Harmonics,
+    Hinge,
+    Mass,
+    Thermal,
+    outside_joints,
+)
 from .inverse import N_STARTS, REACHED, Inverse, random_readings, solve_inverse
 from .kernels import LANES, fill, whiten_small
 from .kinematics import (
@@ -84,6 +97,7 @@ __all__ = [
     "ErrorCurve",
     "Gain",
     "Harmonics",
+    "Hinge",
     "Inverse",
     "Joint",
     "Mass",
@@ -106,6 +120,7 @@ __all__ = [
     "left_jacobian",
     "names_of",
     "nearest_rotation",
+    "outside_joints",
     "over_processors",
     "over_spans",
     "pose",

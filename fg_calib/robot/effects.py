@@ -33,7 +33,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from fg_calib.inputs import MOST_SIZE, Floats, InputError, Record, as_floats, check_names, check_number, shown
-from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Parameter, Robot, Term, names_of
+from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Joint, Parameter, Robot, Term, names_of
 
 _log = logging.getLogger(__name__)
 
@@ -168,20 +168,61 @@ class ErrorCurve(Effect, Record):
         return np.zeros((len(readings), 0, 2))
 
 
+class Hinge(NamedTuple):
+    """A joint outside the chain, whose readings are the column of its name.
+
+    Attributes:
+        joint: The joint.
+        link: The link that it moves.
+        origin: Where it is in the frame of the link, or of the hinge, that it hangs on, shape (4, 4), [m].
+        axis: Unit vector in its own frame, shape (3,).
+    """
+
+    joint: Joint
+    link: str
+    origin: Sequence[Sequence[float]]
+    axis: Sequence[float]
+
+    def place(self, points: Floats, context: Context) -> Floats:
+        """Points that it moves, from its own frame to that of what it hangs on, shape (n, 3) or (1, 3), [m]."""
+        q, T, u = context.get(self.joint.name, np.zeros(1))[:, None], np.array(self.origin), np.array(self.axis)
+        if self.joint.prismatic:
+            moved = points + q * u
+        else:
+            moved = np.cos(q) * points + np.sin(q) * np.cross(u, points) + (1.0 - np.cos(q)) * (points @ u)[:, None] * u
+        return moved @ T[:3, :3].T + T[:3, 3]
+
+
 class Mass(NamedTuple):
     """A point mass on the arm.
 
     Attributes:
         link: Number of the joint that moves it; 0 for the base.
         mass: [kg].
-        com: Where it is in the frame behind that joint's figures (a DH frame, a URDF's link), [m].
+        com: Where it is in the frame behind that joint's figures (a DH frame, a URDF's link) or, with hinges, of the
+            last hinge's link, [m].
         column: Column of the table that has the mass of each row instead, [kg], such as a payload that is put on.
+        hinges: Joints outside the chain between the link and the mass.
     """
 
     link: int
     mass: float
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)
     column: str = ""
+    hinges: Sequence[Hinge] = ()
+
+    def at(self, context: Context) -> Floats:
+        """Where it is in the frame of its link, shape (n, 3) or (1, 3), [m]."""
+        points = np.array([self.com])
+        for hinge in self.hinges[::-1]:
+            points = hinge.place(points, context)
+        return points
+
+
+def outside_joints(robot: Robot) -> dict[str, Joint]:
+    """The joints outside the chain that masses hang on, by their names."""
+    masses = [m for effect in robot.effects for m in getattr(effect, "masses", None) or ()]
+    return {hinge.joint.name: hinge.joint for m in masses for hinge in m.hinges}
 
 
 class _Moments:
@@ -195,7 +236,8 @@ class _Moments:
         of_joints = (_moving(robot, j)[0] + k for j in range(robot.n_joints) for k in (0, 1))
         self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
         each = [np.reshape(context.get(m.column, m.mass), (-1, 1)) for m in masses]
-        at = [p + R @ m.com for m, (R, p) in zip(masses, map(self._frames.get, ends), strict=True)]  # type: ignore[misc]
+        frames = zip(masses, map(self._frames.__getitem__, ends), strict=True)
+        at = [p + np.einsum("nij,nj->ni", R, np.broadcast_to(m.at(context), p.shape)) for m, (R, p) in frames]
         self._masses = list(zip(ends, each, at, strict=True))
 
     def of_masses(self, place: int) -> Floats:
@@ -246,6 +288,20 @@ class _Loaded(Effect):
         gravity = as_floats("gravity", GRAVITY if self.gravity == "estimate" else self.gravity, "(3)")
         if not 0.0 < np.linalg.norm(gravity) < MOST_GRAVITY:
             raise InputError("gravity", f"found {shown(self.gravity)}", "m/s^2, such as [0, 0, -9.81]")
+
+    @property
+    def assumed(self) -> str:
+        masses = self.masses or ()
+        words = [f"{m.column} {m.mass:g} kg" for m in masses if m.column]
+        return ", ".join(words + ["joints outside the chain at 0"] * any(m.hinges for m in masses))
+
+    def context(self, robot: Robot, readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
+        masses = self.masses or ()
+        found = {m.column: read([m.column])[:, 0] for m in masses if m.column}
+        for name, each in found.items():
+            if np.any(each < 0.0):
+                raise InputError(name, f"found {np.nanmin(each):g}", "masses, 0 or above")
+        return found | {h.joint.name: read([h.joint.name])[:, 0] for m in masses for h in m.hinges}
 
 
 class Compliance(_Loaded, Record):

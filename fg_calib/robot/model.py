@@ -249,8 +249,8 @@ class Effect(ABC):
 
     @property
     def assumed(self) -> str:
-        """What is taken where nothing is known of what it depends on besides readings; without masses of rows empty."""
-        return ", ".join(f"{m.column} {m.mass:g} kg" for m in getattr(self, "masses", None) or () if m.column)
+        """What is taken where nothing is known of what it depends on besides readings."""
+        return ""
 
     @abstractmethod
     def values(self, robot: "Robot", readings: Floats, context: Context, at: Floats) -> Floats:
@@ -264,7 +264,7 @@ class Effect(ABC):
         """
 
     def context(self, robot: "Robot", readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
-        """What else the values depend on, for the rows of a table: of loads the masses that the rows have.
+        """What else the values depend on, for the rows of a table.
 
         Args:
             robot: The robot.
@@ -275,11 +275,7 @@ class Effect(ABC):
         Raises:
             InputError: A row has what cannot be.
         """
-        found = {m.column: read([m.column])[:, 0] for m in getattr(self, "masses", None) or () if m.column}
-        for name, masses in found.items():
-            if np.any(masses < 0.0):
-                raise InputError(name, f"found {np.nanmin(masses):g}", "masses, 0 or above")
-        return found
+        return {}
 
 
 class Element(inputs.Record):

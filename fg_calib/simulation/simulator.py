@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib import initialization, inputs, io, measurements, parallel
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Brief, Floats, FrameKnowledge, InputError, Integers
 from fg_calib.measurements import INSTRUMENTS, Groups, KnownPoint, Labels, Measurements, Noise, Pairs, Table
-from fg_calib.robot import N_STARTS, Poses, Robot, Thermal, build_chain, forward, pose, solve_inverse
+from fg_calib.robot import N_STARTS, Poses, Robot, Thermal, build_chain, forward, outside_joints, pose, solve_inverse
 from fg_calib.simulation.scenario import BoardViews, Configurations, Instrument, Placement, Plane, Scenario, Spot
 from fg_calib.simulation.views import find_readings
 
@@ -153,7 +153,7 @@ class Measuring:
         return forward(build_chain(self.true_robot), self.true_robot.trig(self.visits.true_readings, self.context))
 
     def read(self, names: Sequence[str]) -> Floats:
-        """Columns that effects depend on, shape (n, k): temperatures, payloads or sides of approach."""
+        """Columns that effects depend on, shape (n, k): temperatures, payloads, sides, or joints outside the chain."""
         effects = self.true_robot.effects
         thermal = {effect.column for effect in effects if isinstance(effect, Thermal)}
         payloads = {m.column: m.mass for effect in effects for m in getattr(effect, "masses", None) or ()}
@@ -161,6 +161,9 @@ class Measuring:
         drawn, (cold, warm) = np.reshape(each, (self.n, len(names))), self.scenario.temperature
         if names[0] in payloads:  # on or off
             return payloads[names[0]] * np.round(drawn)
+        if joint := outside_joints(self.true_robot).get(names[0]):
+            lower, upper = np.clip([joint.lower, joint.upper], -np.pi, np.pi)
+            return lower + (upper - lower) * drawn
         return cold + (warm - cold) * drawn if names[0] in thermal else np.sign(drawn - 0.5)
 
     def noise(self, kind: str, *shape: int) -> Floats:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib import inputs, io
 from fg_calib.io import NOISE_UNITS, Units
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Measurements, Pairs, Table
-from fg_calib.robot import Robot, yaw_pitch_roll
+from fg_calib.robot import Robot, outside_joints, yaw_pitch_roll
 from fg_calib.simulation.scenario import Placement, Plane, Spot
 from fg_calib.simulation.simulator import Simulation
 
@@ -113,7 +113,8 @@ def table_columns(table: Table, robot: Robot, units: Units) -> dict[str, Columns
     if m.rotation is not None:
         quaternion = Rotation.from_matrix(m.rotation.copy()).as_quat(canonical=True)
         columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
-    columns |= {name: values for name, values in m.context.items() if values.ndim == 1}
+    factors = {name: units.factor(joint.unit) for name, joint in outside_joints(robot).items()}
+    columns |= {name: values / factors.get(name, 1.0) for name, values in m.context.items() if values.ndim == 1}
     sides = {name: values for name, values in m.context.items() if values.ndim == 2 and name != "moves"}
     columns |= {f"{name}{i + 1}": v for name, values in sides.items() for i, v in enumerate(values.T)}
     columns |= {name: values / units.factor(GENERIC_COLUMNS[name].si) for name, values in m.columns.items()}

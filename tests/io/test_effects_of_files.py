@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusals import refusal
 
-from fg_calib.io import Column, read_measurements, read_robot, write_robot
+from fg_calib.io import Column, Units, read_joint_table, read_measurements, read_robot, write_robot
 from fg_calib.robot import Backlash, Compliance, ErrorCurve, Harmonics, Mass
 
 HEAD = """\
@@ -106,39 +106,79 @@ def test_a_temperature_far_from_its_reference_is_asked_for_its_unit(read, tmp_pa
     assert [r.getMessage().split(";")[1] for r in caplog.records] == [" are they in one unit?"]
 
 
+# a fixed joint and axes that are not z; the other arm has a shoulder that turns, and a slide
+COM = {"base": "0 0 0.1", "upper": "0.1 0.02 0.3", "bracket": "0.01 0 0.05", "fore": "0.2 0.1 0", "other": "0 0.3 0.1"}
+COM |= {"rail": "0.1 0 0", "hand": "0 0.1 0.2"}
+MASSES = {"base": 9.0, "upper": 5.0, "bracket": 0.7, "fore": 2.0, "other": 3.0, "rail": 0.5, "hand": 1.5}
+OUTSIDE = ["other_shoulder", "other_slide"]
+JOINTS = [
+    ("shoulder", "revolute", "base", "upper", "0 0 0.4", "0.3 0.2 0.1", "0 1 0"),
+    ("mount", "fixed", "upper", "bracket", "0.1 0.2 0.3", "0.5 0.1 -0.4", "1 0 0"),
+    ("elbow", "revolute", "upper", "fore", "0.5 0 0.1", "-0.2 0.7 0.1", "0.6 0 0.8"),
+    ("other_shoulder", "revolute", "bracket", "other", "0.2 0.1 0.3", "0.1 -0.4 0.3", "0 0.8 0.6"),
+    ("other_slide", "prismatic", "other", "rail", "0.1 0.3 0", "0.2 0.1 0.5", "0.6 0.8 0"),
+    ("wrist", "fixed", "rail", "hand", "0 0.1 0.1", "0.3 0.2 0.1", "1 0 0"),
+]
+
+
+@pytest.fixture
+def two_arms(tmp_path):
+    """What writes and reads the robot between two links."""
+    names = ("name", "kind", "parent", "child", "xyz", "rpy", "axis")
+    text = "".join(LINK.format(name=n, com=COM[n], mass=MASSES[n]) for n in COM)
+    text += "".join(JOINT.format(**dict(zip(names, joint, strict=True))) for joint in JOINTS)
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
+    chain = "urdf: arm.urdf\nbase_link: {}\ntip_link: {}\neffects: {{compliance: true}}\n"
+
+    def read(*ends):
+        (tmp_path / "robot.yaml").write_text(chain.format(*ends))
+        return read_robot(tmp_path / "robot.yaml")
+
+    return read
+
+
 @pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base")])
-def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
-    """A mass behind a fixed joint, and axes that are not z: torques by the potential of all links."""
+def test_masses_of_a_urdf_are_where_its_links_are(ends, two_arms, tmp_path):
+    """Torques by the potential of all links, those of the other arm where its joints stand."""
     from yourdfpy import URDF
 
-    com = {"base": "0 0 0.1", "upper": "0.1 0.02 0.3", "bracket": "0.01 0 0.05", "fore": "0.2 0.1 0"}
-    mass = {"base": 9.0, "upper": 5.0, "bracket": 0.7, "fore": 2.0}
-    joints = [
-        ("shoulder", "revolute", "base", "upper", "0 0 0.4", "0.3 0.2 0.1", "0 1 0"),
-        ("mount", "fixed", "upper", "bracket", "0.1 0.2 0.3", "0.5 0.1 -0.4", "1 0 0"),
-        ("elbow", "revolute", "upper", "fore", "0.5 0 0.1", "-0.2 0.7 0.1", "0.6 0 0.8"),
-    ]
-    names = ("name", "kind", "parent", "child", "xyz", "rpy", "axis")
-    text = "".join(LINK.format(name=n, com=com[n], mass=mass[n]) for n in com)
-    text += "".join(JOINT.format(**dict(zip(names, joint, strict=True))) for joint in joints)
-    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
-    (tmp_path / "robot.yaml").write_text(
-        "urdf: arm.urdf\nbase_link: {}\ntip_link: {}\neffects: {{compliance: true}}\n".format(*ends)
-    )
-    robot, q = read_robot(tmp_path / "robot.yaml"), np.array([[0.4, -0.9], [1.0, 0.3]])
+    robot, q = two_arms(*ends), np.array([[0.4, -0.9, 0.7, 0.2], [1.0, 0.3, -1.1, 0.4]])
     turning = ["shoulder", "elbow"] if ends[0] == "base" else ["elbow", "shoulder"]
     assert [p.name for p in robot.parameters if p.kind == "compliance"] == [f"{name}.compliance" for name in turning]
     urdf = URDF.load(str(tmp_path / "arm.urdf"), load_meshes=False, build_scene_graph=True)
 
     def potential(readings):
-        urdf.update_cfg(dict(zip(turning, readings, strict=True)))
-        points = {n: urdf.get_transform(n, ends[0]) @ [*map(float, com[n].split()), 1.0] for n in com}
-        return -9.81 * sum(mass[n] * points[n][2] for n in com)
+        urdf.update_cfg(dict(zip(turning + OUTSIDE, readings, strict=True)))
+        points = {n: urdf.get_transform(n, ends[0]) @ [*map(float, COM[n].split()), 1.0] for n in COM}
+        return -9.81 * sum(MASSES[n] * points[n][2] for n in COM)
 
-    found = robot.effects[0].values(robot.geometry, q, {}, np.zeros(2))[:, :, 0]
-    for row, torque in zip(q, found, strict=True):
-        expected = [(potential(row + h) - potential(row - h)) / 2e-5 for h in 1e-5 * np.eye(2)]
-        assert torque == pytest.approx(expected, abs=1e-7)
+    outside = dict(zip(OUTSIDE, q.T[2:], strict=True))
+    for context, at in ((outside, q), ({}, q * [1, 1, 0, 0])):
+        found = robot.effects[0].values(robot.geometry, q[:, :2], context, np.zeros(2))[:, :, 0]
+        for row, torque in zip(at, found, strict=True):
+            expected = [(potential(row + h) - potential(row - h)) / 2e-5 for h in 1e-5 * np.eye(2, 4)]
+            assert torque == pytest.approx(expected, abs=1e-7)
+
+
+def test_joints_outside_the_chain_are_columns_that_a_table_may_have(two_arms, tmp_path):
+    robot, table = two_arms("base", "fore"), tmp_path / "t.csv"
+    table.write_text("shoulder,elbow,x,y,z,other_shoulder\n10,20,1,2,3,30\n")
+    found = read_measurements(table, robot, units=Units("mm", "deg")).context
+    assert {name: values.tolist() for name, values in found.items()} == {
+        "other_shoulder": pytest.approx([np.pi / 6]), "other_slide": [0.0],
+    }  # fmt: skip
+    configurations = tmp_path / "q.csv"
+    configurations.write_text("shoulder,elbow,other_slide\n10,20,300\n")
+    assert read_joint_table(configurations, robot, Units("mm", "deg"))[2] == {"other_slide": pytest.approx([0.3])}
+
+
+def test_masses_of_the_other_arm_are_written_and_read_back(two_arms, tmp_path):
+    robot = two_arms("base", "fore")
+    write_robot(tmp_path / "again.yaml", robot, urdf_name="arm.urdf")
+    again, q = read_robot(tmp_path / "again.yaml"), np.array([[0.4, -0.9]])
+    context = {"other_shoulder": np.array([0.7]), "other_slide": np.array([0.2])}
+    loads = [r.effects[0].values(r.geometry, q, context, np.zeros(2)) for r in (robot, again)]
+    assert loads[1] == pytest.approx(loads[0], abs=1e-12)
 
 
 @pytest.mark.parametrize(
