@@ -12,7 +12,7 @@ readings that its geometry has at the target: effects change slowly with these, 
 derivatives are a fixed point that gains some two digits each.
 """
 
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,16 @@ from numpy.typing import ArrayLike
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations, optimize
 from fg_calib.measurements import check_readings
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
-from fg_calib.robot import Context, Robot, build_chain, context_at, forward, rotation_vector, solve_inverse
+from fg_calib.robot import (
+    Context,
+    Robot,
+    build_chain,
+    context_at,
+    forward,
+    inverse_right_jacobian,
+    rotation_vector,
+    solve_inverse,
+)
 from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse
 from fg_calib.statistics import TangentCovariance
 
@@ -237,13 +246,23 @@ def misses(
 
 def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context: Context | None = None) -> Floats:
     """The configuration nearest in orientation with the tool point in place, from one whose point is there."""
-    chain = build_chain(robot)
+    chain = build_chain(robot).with_joint_columns()
 
-    def misses(q: Floats) -> Floats:
-        at = forward(chain, robot.trig(q[None], context))
+    @cache
+    def look(*q: float) -> tuple[Floats, Floats]:
+        """Misses of the point and of the orientation, shape (6,), and their derivative in the joints."""
+        at = forward(chain, robot.trig(np.array([q]), context))
         turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
-        return np.concatenate([(at.position - position)[0] * _WEIGHT, turn[0]])
+        of_turn = -inverse_right_jacobian(turn)[0] @ at.jacobian[0, :3]
+        miss = np.concatenate([(at.position - position)[0] * _WEIGHT, turn[0]])
+        return miss, np.concatenate([at.jacobian[0, 3:] * _WEIGHT, of_turn])
 
-    best = optimize.least_squares(misses, q, "3-point", tuple(robot.limits.T), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+    def miss(q: Floats) -> Floats:
+        return look(*q)[0]
+
+    def derivative(q: Floats) -> Floats:
+        return look(*q)[1]
+
+    best = optimize.least_squares(miss, q, derivative, tuple(robot.limits.T), xtol=1e-10, ftol=1e-10, gtol=1e-10).x
     found = solve_inverse(robot, position, None, context, near=best, n_starts=1)
     return found.readings[0] if found.reached[0] else q
