@@ -225,6 +225,7 @@ SETS: dict[str, tuple[float, list[Effect]]] = {
     "curve, prior / 10": (0.1, [CURVE]),
     "curve, prior x 10": (10.0, [CURVE]),
     "curve and compliance, prior x 10": (10.0, [CURVE, Compliance(LOADS)]),
+    "curve and harmonics, prior x 10": (10.0, [CURVE, Harmonics()]),
 }
 VIEWS: dict[str, Literal["known", "unknown"]] = {"pose": "unknown", "position": "unknown", "distance-rotation": "known"}
 ROWS = (
