@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from fg_calib.cli.export import show_export
 from fg_calib.cli.output import Json, argument, option
 
-Description = Literal["dh", "mdh", "mdh-hayati", "dh-hayati", "poe", "urdf"]
+Description = Literal["dh", "mdh", "mdh-hayati", "dh-hayati", "poe", "cpc", "urdf"]
 
 
 def convert(

@@ -11,7 +11,7 @@ from fg_calib import exports, io
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, say, show, show_json
 from fg_calib.inputs import InputError, escaped
 
-Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "zeros", "yaml"]
+Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "cpc", "zeros", "yaml"]
 At = Literal["workspace", "measured"]
 Tool = Literal["nominal", "calibrated"]
 UrBase = Literal["base", "base_link"]

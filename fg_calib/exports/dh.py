@@ -383,6 +383,11 @@ class PoseErrors(Record):
     rotation_max: float
     n: int
 
+    def __str__(self) -> str:
+        position = f"{1e3 * self.position_rms:.4g} mm RMS, {1e3 * self.position_max:.4g} at most"
+        rotation = f"{np.rad2deg(self.rotation_rms):.4g} deg RMS, {np.rad2deg(self.rotation_max):.4g} at most"
+        return f"position {position}; orientation {rotation}"
+
 
 def drawn(robot: Robot, n: int, seed: int) -> Floats:
     """Configurations within the joint limits, shape (n, n_joints), [rad] (prismatic: [m])."""

@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike
 from fg_calib import __version__
 from fg_calib.calibration import Calibration
 from fg_calib.exports import dh
-from fg_calib.exports.poe import screw_content
+from fg_calib.exports.poe import link_content, screw_content
 from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
 from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, expect, printable, shown
 from fg_calib.io import Units, effects_mapping, joint_origins, require_absent, robot_text, urdf_text, write_text
 from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, build_chain, frame_values, spline
 
-ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "zeros", "yaml"]
+ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "cpc", "zeros", "yaml"]
 ToolOfZeros = Literal["nominal", "calibrated"]
 
 EXACT = 1e-9
@@ -116,8 +116,8 @@ def export(
 
     Args:
         arm: A calibration, or a robot.
-        to: `urdf`, `ur` (ROS' ur_description), `tesseract` (joint origins), `dh`, `mdh`, `mdh-hayati`, `hayati` (tables
-            in mm and deg), `poe` (axes at zero readings), `zeros` (joint zeros alone), `yaml` (a robot file).
+        to: `urdf`, `ur` (ROS' ur_description), `tesseract` (joint origins), `dh`, `mdh`, `mdh-hayati`, `hayati`, `cpc`
+            (tables in mm and deg), `poe` (axes at zero readings), `zeros` (joint zeros alone), `yaml` (a robot file).
         nominal: The nominal robot, for `zeros` and the axis report of `poe`; a calibration has it.
         configurations: Of `zeros`: where the fit is wanted, shape (n, n_joints), [rad] (prismatic: [m]); all over the
             joint limits if None.
@@ -154,6 +154,7 @@ def export(
         "ur": lambda: _ur(robot, ur_base, ur_hash),
         "tesseract": lambda: _tesseract(robot),
         "poe": lambda: screw_content(arm, nominal),
+        "cpc": lambda: link_content(robot),
         "zeros": lambda: _zeros(arm, nominal, tool, configurations),
         "yaml": lambda: _yaml(robot),
     }
@@ -168,7 +169,7 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
     mapping, where = effects_mapping(robot), "over the joint limits" if measured is None else "where it was measured"
     values = {name: value for name, value in mapping.pop("values", {}).items() if not name.endswith(".curve")}
     error = dh.errors(robot.geometry, robot, dh.drawn(robot, dh.N_JUDGED, 1) if measured is None else measured)
-    note = f"it cannot hold {', '.join(mapping)}, without which the tool is off {where}: {_error_words(error)}"
+    note = f"it cannot hold {', '.join(mapping)}, without which the tool is off {where}: {error}"
     assumed = ", ".join(effect.assumed for effect in robot.effects if effect.assumed)
     note += f" (at {assumed}; more otherwise)" * bool(assumed)
     if to == "zeros":  # which are fitted to the arm with them
@@ -248,13 +249,6 @@ def _tesseract(robot: Robot) -> _Content:
     return text, [*notes, 'named in the SRDF: <calibration_config filename="..."/>'], {"joints": joints}
 
 
-def _error_words(found: dh.PoseErrors) -> str:
-    """Errors in mm and deg."""
-    position = f"{1e3 * found.position_rms:.4g} mm RMS, {1e3 * found.position_max:.4g} at most"
-    rotation = f"{np.rad2deg(found.rotation_rms):.4g} deg RMS, {np.rad2deg(found.rotation_max):.4g} at most"
-    return f"position {position}; orientation {rotation}"
-
-
 def _table(robot: Robot, to: str, far: bool) -> _Content:
     convention, words = _TABLES[to]
     table = dh.in_table(robot, convention, np.inf) if far else dh.in_table(robot, convention)
@@ -267,11 +261,11 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
     order = " ".join(f"{PARAMETER_KINDS[kind].axis.name.capitalize()}({kind})" for kind in CONVENTIONS[convention])
     notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
     if exact:
-        over = f"over {error.n} configurations {_error_words(error)}"
+        over = f"over {error.n} configurations {error}"
         notes.append(f"the same arm, base and tool hold what rows do not; {over}")
     else:
         notes += [f"NOT EXACT: {reason}" for reason in reasons]
-        notes.append(f"the best fit over the joint limits, base and tool included: {_error_words(error)}")
+        notes.append(f"the best fit over the joint limits, base and tool included: {error}")
     details = {"convention": convention, "exact": exact, "reasons": reasons, "error": asdict(error)}
     return robot_text(found, units=_MM_DEG), notes, details
 
@@ -316,7 +310,7 @@ def _zeros(arm: Robot | Calibration, start: Robot | None, tool: ToolOfZeros, at:
         for when, offsets in (("before", None), ("after", zeros)):
             error = dh.errors(nominal, robot, q, offsets)
             details[when][name] = asdict(error)
-            notes.append(f"{when}, {where}: {_error_words(error)}")
+            notes.append(f"{when}, {where}: {error}")
     rows = {}
     for name, zero in told.items():
         sigma = "not determined" if not zero.determined else zero.sigma and _MM_DEG.from_si(zero.sigma, zero.unit)

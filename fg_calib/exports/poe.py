@@ -1,4 +1,4 @@
-"""An arm by its screw axes (a product of exponentials), and an axis report: how far each is from nominal.
+"""An arm by its screw axes (a product of exponentials, CPC), and an axis report: how far each is from nominal.
 
 The point of an axis is that nearest to the base's origin, p - z (z . p) with any point p on it. From a frame there with
 the axis as its z, another axis crosses the plane across z at (x, y), and its direction is
@@ -14,6 +14,7 @@ References:
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import accumulate
 from typing import Any
 
@@ -22,7 +23,7 @@ import numpy as np
 from fg_calib.calibration import Calibration
 from fg_calib.exports.dh import N_JUDGED, SAME, drawn, errors, inverse, links_of, tidy
 from fg_calib.inputs import Floats
-from fg_calib.io import robot_text
+from fg_calib.io import Units, cpc_text, robot_text
 from fg_calib.robot import POE, SCREW_KINDS, Robot, RobotBuilder, frame_values
 
 KEYS = (*SCREW_KINDS, "offset", "tilt")
@@ -90,3 +91,12 @@ def screw_content(arm: Robot | Calibration, nominal: Robot | None) -> tuple[str,
     rows = [{kind: s for kind, s in axis["sigma"].items() if kind in SCREW_KINDS} for axis in axes.values()]
     text = robot_text(found, sigmas=rows if isinstance(arm, Calibration) else ())
     return text, notes, {"convention": POE, "axes": axes}
+
+
+def link_content(robot: Robot) -> tuple[str, list[str], dict[str, Any]]:
+    """Text of an arm in links of CPC (see `io.robot_file`), notes, and details as in `Export`."""
+    text, back = cpc_text(robot, axis_frames(robot), Units("mm", "deg"))
+    error = errors(back, robot, drawn(robot, N_JUDGED, 1))
+    notes = ["CPC: Rz or Tz(sign q) R(b) Rz(beta) Txyz(l) a joint, link0 before them; mm and deg"]
+    notes += [f"the same arm; over {error.n} configurations {error}"]
+    return text, notes, {"convention": "cpc", "error": asdict(error)}

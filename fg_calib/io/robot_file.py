@@ -11,10 +11,23 @@ joints:                                units: {length: mm, angle: deg}
 Rows of `convention: poe` are axes at zero readings, `{axis: [0, 0, 1], point: [0, 0, 340]}`, and `tool` the tool's pose
 there; x, y, pitch and roll are how far a calibrated axis is from there, and `sigma` is for people alone.
 
+`convention: cpc` (complete and parametrically continuous) is read as `poe`: parameters, effects and priors are those of
+
+    base_T_tool(q) = base V0 Q1 V1 ... Qn Vn tool,   Q = Rz or Tz(sign q + offset),   V = R(b) Rz(beta) Txyz(l)
+
+V0 is `link0`, and a row `{b: [0, 0, 1], l: [0, 0, 0], beta: 0, sign: 1, offset: 0}` is Q and the V behind it. R(b), the
+least rotation, takes z to the next axis, b, drawn so that bz >= 0; `sign` is -1 if that is against the reading. Of a
+link to an axis beta and lz are written as 0, of one to a slide l too; Vn has all six. Where R(b) is singular, bz = -1,
+no file may be. The point of an axis is the origin of its frame.
+
 Both take `name`, `base`, `tool`, `fixed`, `estimate` and `tolerance` too. Rows without `name` are called q1 to qn.
 
 A URDF's chain is that between any two links. Of each joint its type, parent, child, origin, axis, limit and mimic are
 read. Calibrated origins are written into the same XML, so that everything else stays as it was.
+
+References:
+    Zhuang, Roth, Hamano (1992), A complete and parametrically continuous kinematic model for robot manipulators. IEEE
+    Trans. Robotics and Automation 8(4).
 """
 
 from __future__ import annotations
@@ -41,6 +54,9 @@ from fg_calib.robot import Hinge, Joint, Mass, Parameter, Robot, RobotBuilder, U
 
 _ORIGIN = {"xyz": ("x", "y", "z"), "rpy": ("roll", "pitch", "yaw")}
 """The attributes of `<origin>` and the kinds of parameters that they hold."""
+
+UNIT = 1e-6
+"""How far from 1 the length of an axis of `cpc` may be, and how near to -1 its z may not."""
 
 ROUNDING = 1e-13
 """Change of an origin's figure, [m] and [rad], that is rounding of the solution: parameters that nothing moves."""
@@ -528,8 +544,40 @@ class _ScrewRow(_JointRow):
     sigma: dict[str, Any] = Field(default_factory=dict)
 
 
+class _Link(Schema):
+    b: tuple[Number, Number, Number]
+    l: tuple[Number, Number, Number]  # noqa: E741 - the figures of CPC are b, l and beta
+    beta: Number = 0.0
+
+    def matrix(self, units: Units, place: str) -> inputs.Floats:
+        """R(b) Rz(beta) Txyz(l), shape (4, 4), [m].
+
+        Raises:
+            InputError: b is no unit vector, or too near to -z.
+        """
+        if abs((length := math.hypot(*self.b)) - 1.0) > UNIT:
+            raise InputError(f"{place}: b", f"length {length:.9g}", f"1 within {UNIT:g}")
+        if self.b[2] < UNIT - 1.0:
+            hint = "take the next axis the other way, bz >= 0 with `sign: -1`; behind the last joint turn `tool`"
+            raise InputError(f"{place}: b", f"found {list(self.b)}, for which R(b) is any", "bz above -1", hint)
+        beta = rotations.rotation_of(_si("beta", self.beta, units, place), 0.0, 0.0)
+        R = rotations.least_rotation(np.array(self.b) / length) @ beta
+        return np.vstack([np.column_stack([R, R @ self.l * units.factor("m")]), np.eye(4)[3]])
+
+
+class _CpcRow(_JointRow, _Link):
+    sign: Literal[-1, 1] = 1
+    offset: Number = 0.0
+
+
+class _CpcRobot(_Robot):
+    convention: Literal["cpc"]
+    link0: _Link = _Link(b=(0.0, 0.0, 1.0), l=(0.0, 0.0, 0.0))
+    joints: Annotated[list[_CpcRow], Field(min_length=1)]
+
+
 class _DhRobot(_Robot):
-    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati", "poe"]
+    convention: Literal["dh", "mdh", "mdh-hayati", "dh-hayati", "poe", "cpc"]
     joints: Annotated[list[_Row], Field(min_length=1)]
 
 
@@ -584,6 +632,7 @@ def robot_from_mapping(mapping: Mapping[str, Any], place: str, folder: Path, est
         InputError: The mapping does not describe a robot.
     """
     if "urdf" not in mapping:
+        mapping = _in_screws(mapping, place) if mapping.get("convention") == "cpc" else mapping
         of: type[_DhRobot | _PoeRobot] = _PoeRobot if mapping.get("convention") == model.POE else _DhRobot
         return _build_rows(validate(of, dict(mapping), place), place, estimate)
     file = validate(_UrdfRobot, dict(mapping), place)
@@ -644,6 +693,54 @@ def _add_screw(builder: RobotBuilder, joint: Joint, row: _ScrewRow, units: Units
     values = {kind: _si(kind, getattr(row, kind), units, place) for kind in model.SCREW_KINDS}
     with inputs.within(place):
         builder.add_screw_joint(joint, row.axis, point, values)
+
+
+def _in_screws(mapping: Mapping[str, Any], place: str) -> dict[str, Any]:
+    """The mapping of an arm of `cpc` as one of `poe`."""
+    file = validate(_CpcRobot, dict(mapping), place)
+    units, rows, T = file.units, list[dict[str, Any]](), file.link0.matrix(file.units, f"{place}: link0")
+    for i, row in enumerate(file.joints, start=1):
+        here, moving = f"{place}: joint {i}", "z" if row.type == "prismatic" else "yaw"
+        point = [units.from_si(one, "m") for one in T[:3, 3].tolist()]
+        own = row.model_dump(include={"type", "name", "limits"})
+        rows.append({"axis": (row.sign * T[:3, 2]).tolist(), "point": point, **own})
+        T = (
+            T
+            @ model.matrix_of_frame({moving: _si(moving, row.offset, units, f"{here}: offset")})
+            @ row.matrix(units, here)
+        )
+    T = T @ model.matrix_of_frame(file.tool.si(units, f"{place}: tool"))
+    tool = {kind: units.from_si(value, model.unit_of(kind)) for kind, value in model.frame_of_matrix(T).items()}
+    others = {key: value for key, value in mapping.items() if key != "link0"}
+    return others | {"convention": model.POE, "joints": rows, "tool": tool}
+
+
+def cpc_text(robot: Robot, frames: Sequence[inputs.Floats], units: Units) -> tuple[str, Robot]:
+    """The text of an arm in links of `cpc`, and the robot that it reads back as.
+
+    Args:
+        robot: The arm, whose name, joints and limits are taken.
+        frames: At zero readings in the base frame, shape (4, 4) each: the joints' axes as their z, then the tool's.
+        units: Of the text.
+    """
+    links, at, sign = list[_Flow](), np.eye(4), 1
+    for i, frame in enumerate(frames):
+        M, own = np.linalg.inv(at) @ frame, _row(robot, i - 1, units) if i else {}
+        row = {key: own[key] for key in _JointRow.model_fields if key in own} | {"sign": sign}
+        sign = -1 if M[2, 2] < -model.STRAIGHT else 1
+        b = np.round(sign * M[:3, 2], 15) + 0.0
+        M = rotations.least_rotation(b).T @ M[:3] @ np.diag([1.0, sign, sign, 1.0])  # Rz(beta) Txyz(l)
+        beta = float(np.arctan2(M[1, 0], M[0, 0])) if i == robot.n_joints else 0.0
+        shift = np.round(rotations.rotation_of(-beta, 0.0, 0.0) @ M[:, 3], 15) + 0.0
+        if i < robot.n_joints:
+            shift[0 if robot.joints[i].prismatic else 2 :] = 0.0
+        row |= {"b": b.tolist(), "l": [units.from_si(one, "m") for one in shift.tolist()]}
+        link = validate(_CpcRow, row | {"beta": units.from_si(beta, "rad")}, robot.name)
+        links.append(_Flow(link.model_dump(exclude_defaults=True)))
+        at = at @ link.matrix(units, robot.name)
+    mapping = {"name": robot.name, "units": asdict(units), "convention": "cpc", "link0": links[0], "joints": links[1:]}
+    mapping |= {"tool": {"roll": units.from_si(np.pi, "rad")}} if sign < 0 else {}
+    return _dumped(mapping), robot_from_mapping(mapping, robot.name, Path())
 
 
 @checked
@@ -711,6 +808,10 @@ def robot_text(
     if robot.urdf is None:
         place = place or robot.name
         require_same_chain(robot, robot_from_mapping(mapping, place, Path()), place)
+    return _dumped(mapping)
+
+
+def _dumped(mapping: Mapping[str, Any]) -> str:
     style: dict[str, Any] = {"sort_keys": False, "default_flow_style": None, "allow_unicode": True, "width": math.inf}
     return str(yaml.dump(mapping, Dumper=_Dumper, **style))
 

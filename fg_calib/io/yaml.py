@@ -127,7 +127,7 @@ def _place(place: str, path: tuple[int | str, ...] | list[int | str]) -> str:
 
 
 def _options(misfit: ErrorDetails) -> list[str]:
-    return re.findall("'([^']*)'", misfit.get("ctx", {})["expected"])
+    return re.split(", | or ", misfit.get("ctx", {})["expected"].replace("'", ""))
 
 
 def _expected(misfit: ErrorDetails) -> str:

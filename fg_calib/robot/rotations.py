@@ -56,6 +56,24 @@ def rotation_of(yaw: float, pitch: float, roll: float) -> Floats:
     return Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
 
 
+def least_rotation(direction: Floats) -> Floats:
+    """The rotation of the least angle that takes z to a unit vector b, shape (3, 3): about an axis square to both.
+
+        1 - bx^2 / (1 + bz)    -bx by / (1 + bz)      bx
+        -bx by / (1 + bz)      1 - by^2 / (1 + bz)    by
+        -bx                    -by                    bz
+
+    Of b = -z there are many: it is singular there alone.
+
+    Args:
+        direction: b, shape (3,).
+    """
+    x, y, z = direction
+    R = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [-x, -y, z]])
+    R[:2, :2] -= np.outer((x, y), (x, y)) / (1.0 + z)
+    return R
+
+
 def nearest_rotation(M: Floats) -> Floats:
     """The rotations R nearest to matrices M, shape (..., 3, 3): they maximise trace(R^T M)."""
     U, _, Vt = np.linalg.svd(M)

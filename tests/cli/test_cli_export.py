@@ -64,7 +64,7 @@ def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     assert found["findings"] == found["not_accepted"] == []
 
 
-@pytest.mark.parametrize("to", ["dh", as_case("mdh", is_slow=True), "mdh-hayati", "dh-hayati", "poe", "urdf"])
+@pytest.mark.parametrize("to", ["dh", as_case("mdh", is_slow=True), "mdh-hayati", "dh-hayati", "poe", "cpc", "urdf"])
 def test_a_robot_is_converted_and_what_the_other_convention_cannot_hold_is_said(to, fg_calib, tmp_path):
     robot, out = off(ur10()), tmp_path / ("out.urdf" if to == "urdf" else "out.yaml")
     write_robot(tmp_path / "arm.yaml", robot)

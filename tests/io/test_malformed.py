@@ -18,6 +18,7 @@ HEAD = "convention: dh\njoints:\n"
 ROW = "  - {a: 0, alpha: 0, d: 0, theta: 0}\n"
 R = HEAD + ROW
 P = "convention: poe\njoints:\n"
+C = "convention: cpc\njoints:\n"
 
 
 def row(text):
@@ -39,13 +40,17 @@ ROBOTS = [
     ('a: 1\nb: \x01\n', 'robot.yaml: not YAML: unacceptable character #x0001 ...'),
     ('name: a\nname: b\n', "robot.yaml:2: key 'name' stands here twice"),
     ('convention: dh\njoints:\n  - {a: 0, alpha: 0, d: 0, theta: 0, beta: 0.1}\n', 'robot.yaml: joint 1: beta: found 0.1, expected none: the convention dh has no beta; dh-hayati has'),
-    ("convention: [dh]\njoints: []\n", "robot.yaml: convention: found ['dh'], expected one of dh, mdh, mdh-hayati, dh-hayati, poe (and 1 more)"),
+    ("convention: [dh]\njoints: []\n", "robot.yaml: convention: found ['dh'], expected one of dh, mdh, mdh-hayati, dh-hayati, poe, cpc (and 1 more)"),
     (P+"  - {axis: [0, 0, 1]}\n", "robot.yaml: joint 1: missing key 'point'"),
     (P+"  - {axis: [0, 0, 0], point: [0, 0, 0]}\n", "robot.yaml: joint 1: axis: found (0.0, 0.0, 0.0), expected a direction of three numbers"),
     (P+"  - {axis: [0, 0, 1], type: prismatic, y: 0.1}\n", "robot.yaml: joint 1: x or y of a slide, expected pitch and roll: it has a direction alone"),
     (P+"  - {axis: [0, 0, 1], point: [0, 0, 0], pitch: 30}\n", "robot.yaml: joint 1: pitch: found 30, expected angles in rad, two turns at most; units: {angle: deg} are deg"),
     (P+"  - {axis: [0, 0, 1], point: [0, 0, 0], d: 1}\n", "robot.yaml: joint 1: unknown key 'd', expected one of type, name, limits, axis, point, x, y, pitch, roll, sigma"),
     (P+"  - {axis: [0, 0, 1], point: [0, 0, 0]}\nestimate: zeros\n", "robot.yaml: estimate: zeros, expected parameters; poe has no joint zeros"),
+    (C+"  - {b: [0, 0, 1.00001], l: [0, 0, 0]}\n", "robot.yaml: joint 1: b: length 1.00001, expected 1 within 1e-06"),
+    (C+"  - {b: [0, 0.0001, -1], l: [0, 0, 0]}\n", "robot.yaml: joint 1: b: found [0.0, 0.0001, -1.0], for which R(b) is any, expected bz above -1; take the next axis the other way, bz >= 0 with `sign: -1`; behind the last joint turn `tool`"),
+    (C+"  - {b: [0, 0, 1], l: [0, 0, 0], sign: 2}\n", "robot.yaml: joint 1: sign: found 2, expected one of -1, 1"),
+    (C+"  - {b: [0, 0, 1], l: [0, 0, 0], point: [0, 0, 0]}\n", "robot.yaml: joint 1: unknown key 'point', expected one of b, l, beta, type, name, limits, sign, offset"),
 ]
 
 L = '<link name="a"/><link name="b"/>'
