@@ -9,21 +9,18 @@ import typer
 import fg_calib
 from fg_calib import exports, io
 from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, say, show, show_json
-from fg_calib.inputs import InputError, escaped
+from fg_calib.inputs import ExportFormat, InputError, ToolOfZeros, UrBase, escaped
 
-Format = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "cpc", "zeros", "yaml"]
 At = Literal["workspace", "measured"]
-Tool = Literal["nominal", "calibrated"]
-UrBase = Literal["base", "base_link"]
 
 
 def export(
     arm: Annotated[Path, argument("RESULT|ROBOT", "What `calibrate --out` wrote, or robot.yaml or a URDF.")],
-    to: Annotated[Format, option("--to", None, "What is to read it: see the documentation of export.")],
+    to: Annotated[ExportFormat, option("--to", None, "What is to read it: see the documentation of export.")],
     out: Annotated[Path | None, option("--out", "FILE", "A new file; on stdout if not given.")] = None,
     nominal: Annotated[Path | None, option("--nominal", "ROBOT", "The nominal robot; a RESULT has its own.")] = None,
     at: Annotated[At, option("--at", None, "Of zeros: fitted over the limits, or where measured.")] = "workspace",
-    tool: Annotated[Tool, option("--tool", None, "Of zeros: the controller's tool.")] = "calibrated",
+    tool: Annotated[ToolOfZeros, option("--tool", None, "Of zeros: the controller's tool.")] = "calibrated",
     far: Annotated[bool, option("--far", None, "Of dh and mdh: be exact, however far frames are.")] = False,
     ur_base: Annotated[UrBase | None, option("--ur-base", None, "Of ur: ur_description's name of the base.")] = None,
     ur_hash: Annotated[str | None, option("--ur-hash", "HASH", "Of ur: the controller's own hash.")] = None,

@@ -349,11 +349,6 @@ def transform(**values: float) -> Floats:
     return T
 
 
-def row_transform(convention: str, row: dict[str, float]) -> Floats:
-    """One row of a table at reading 0, in the order of its convention, shape (4, 4)."""
-    return transform(**{kind: row.get(kind, 0.0) for kind in model.CONVENTIONS[convention]})
-
-
 # --- the nearest arm of fewer values ----------------------------------------------------------------------------------
 
 

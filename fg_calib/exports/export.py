@@ -6,23 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, field, fields
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import __version__
+from fg_calib import __version__, inputs
 from fg_calib.calibration import Calibration
 from fg_calib.exports import dh
 from fg_calib.exports.poe import link_content, screw_content
-from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, UrBase, dumped, new_urdf, tesseract_text, ur_kinematics
+from fg_calib.exports.urdf import BASE_LINK, TOOL_LINK, dumped, new_urdf, tesseract_text, ur_kinematics
 from fg_calib.exports.zeros import Zero, tell_zeros
 from fg_calib.inputs import Floats, InputError, Record, as_floats, checked, expect, printable, shown
-from fg_calib.io import Units, effects_mapping, joint_origins, require_absent, robot_text, urdf_text, write_text
-from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, build_chain, frame_values, spline
-
-ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "cpc", "zeros", "yaml"]
-ToolOfZeros = Literal["nominal", "calibrated"]
+from fg_calib.io import Units, effects_mapping, require_absent, robot_text, urdf_text, write_text
+from fg_calib.robot import CONVENTIONS, PARAMETER_KINDS, Robot, UrdfSource, build_chain, frame_values, spline
 
 EXACT = 1e-9
 """A table is exact if its tool is that of the arm within, [m] and [rad]."""
@@ -103,13 +100,13 @@ def with_names(text: str, stem: str) -> str:
 @checked
 def export(
     arm: Robot | Calibration,
-    to: ExportFormat,
+    to: inputs.ExportFormat,
     *,
     nominal: Robot | None = None,
     configurations: ArrayLike | None = None,
-    tool: ToolOfZeros = "calibrated",
+    tool: inputs.ToolOfZeros = "calibrated",
     far: bool = False,
-    ur_base: UrBase | None = None,
+    ur_base: inputs.UrBase | None = None,
     ur_hash: str | None = None,
 ) -> Export:
     """An arm in a format of others: `print(export(result, "ur"))`, `export(result, "urdf").write("arm.urdf")`.
@@ -124,8 +121,7 @@ def export(
         tool: Of `zeros`: the tool that the controller works with: as calibrated, as it is set there on its own and the
             tool of a calibration is often an instrument's target; or nominal, so that zeros make up for it.
         far: Of `dh` and `mdh`: take common normals of nearly parallel axes however far away they are, and be exact.
-        ur_base: Of `ur`: which frame of ur_description the arm's base is; `base_link` if that is its name in a URDF,
-            else `base`, the controller's.
+        ur_base: Of `ur`: the frame that the arm's base is; if None `base_link` if a URDF calls it so, else `base`.
         ur_hash: Of `ur`: the controller's own hash, for which the driver asks.
 
     Raises:
@@ -201,9 +197,10 @@ def _frame_words(robot: Robot, owner: int) -> str:
     return ", ".join(f"{p.kind} {_MM_DEG.from_si(p.nominal, p.unit):.9g}" for p in own if p.nominal != 0.0)
 
 
-def _frames_outside(robot: Robot, start: str, end: str) -> list[str]:
-    """Notes that a format has no place for the arm's base and tool, if any."""
-    owners = {f"base, which is before {start}": 0, f"tool, which is behind {end}": robot.n_joints + 1}
+def _frames_outside(robot: Robot, urdf: UrdfSource) -> list[str]:
+    """Notes that a URDF has no place for the arm's base and tool, if any."""
+    start, end = f"base, which is before link {urdf.base_link}", f"tool, which is behind link {urdf.tip_link}"
+    owners = {start: 0, end: robot.n_joints + 1}
     found = {name: [robot.parameters[i].nominal for i in robot.owned_by(owner)] for name, owner in owners.items()}
     form = 'it has no place for the frame {0}: <origin xyz="{1:.9g} {2:.9g} {3:.9g}" rpy="{6:.9g} {5:.9g} {4:.9g}"/>'
     return [form.format(name, *values) for name, values in found.items() if any(values)]
@@ -211,8 +208,7 @@ def _frames_outside(robot: Robot, start: str, end: str) -> list[str]:
 
 def _urdf(robot: Robot, comments: Sequence[str]) -> _Content:
     if robot.urdf is not None:
-        notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
-        return urdf_text(robot.urdf.text, joint_origins(robot)), notes, {}
+        return urdf_text(robot), _frames_outside(robot, robot.urdf), {}
     notes = [
         f"the same arm to rounding: link {BASE_LINK} is the base frame, {TOOL_LINK} the tool; joints turn about z",
         "URDF knows no slide without limits, which has 1000 m here, and no turn with one limit, which has none",
@@ -221,10 +217,8 @@ def _urdf(robot: Robot, comments: Sequence[str]) -> _Content:
     return new_urdf(robot, [printable(c) for c in (*comments, *notes)]), notes, {}
 
 
-def _ur(robot: Robot, base: UrBase | None, word: str | None) -> _Content:
-    urdf = robot.urdf
-    drawn_base: UrBase = "base_link" if urdf is not None and urdf.base_link.endswith("base_link") else "base"
-    base = base or drawn_base
+def _ur(robot: Robot, base: inputs.UrBase | None, word: str | None) -> _Content:
+    base = base or ("base_link" if robot.urdf and robot.urdf.base_link.endswith("base_link") else "base")
     if word is not None and (not word.isprintable() or " " in word or not word):
         raise InputError("ur_hash", f"found {shown(word)}", "a word such as calib_12788084448423163542")
     kinematics, tool = ur_kinematics(robot, base)
@@ -242,10 +236,8 @@ def _ur(robot: Robot, base: UrBase | None, word: str | None) -> _Content:
 
 def _tesseract(robot: Robot) -> _Content:
     text, joints = tesseract_text(robot)
-    if robot.urdf is not None:
-        notes = _frames_outside(robot, f"link {robot.urdf.base_link}", f"link {robot.urdf.tip_link}")
-    else:
-        notes = [f"joints of the URDF that `export --to urdf` makes; {joints[0]} and {joints[-1]} are base and tool"]
+    notes = [f"joints of the URDF that `export --to urdf` makes; {joints[0]} and {joints[-1]} are base and tool"]
+    notes = notes if robot.urdf is None else _frames_outside(robot, robot.urdf)
     return text, [*notes, 'named in the SRDF: <calibration_config filename="..."/>'], {"joints": joints}
 
 
@@ -277,7 +269,7 @@ def _yaml(robot: Robot) -> _Content:
     return robot_text(dh.in_table(robot, "dh-hayati").robot), [note], {}
 
 
-def _zeros(arm: Robot | Calibration, start: Robot | None, tool: ToolOfZeros, at: ArrayLike | None) -> _Content:
+def _zeros(arm: Robot | Calibration, start: Robot | None, tool: inputs.ToolOfZeros, at: ArrayLike | None) -> _Content:
     if start is None:
         raise InputError("zeros", "an arm without its nominal robot", "a RESULT of calibrate, or a nominal robot")
     robot = arm.robot if isinstance(arm, Calibration) else arm

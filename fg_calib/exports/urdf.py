@@ -23,14 +23,14 @@ References:
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 
-from fg_calib.exports.dh import Links, in_table, links_of, row_transform, transform
-from fg_calib.inputs import Floats, InputError, Record, etree
+from fg_calib.exports.dh import Links, in_table, links_of, transform
+from fg_calib.inputs import Floats, InputError, Record, UrBase, etree
 from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_values
 
 FARTHEST_SLIDE = 1000.0
@@ -79,10 +79,6 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
     Raises:
         InputError: A name has letters that XML cannot hold.
     """
-
-    def numbers(figures: Sequence[float]) -> str:
-        return " ".join(repr(float(figure)) for figure in figures)
-
     try:
         root = etree.Element("robot", name=robot.name)
         etree.SubElement(root, "link", name=BASE_LINK)
@@ -92,7 +88,7 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
             kind, limit = _type_and_limit(joint.moving)
             element = etree.SubElement(root, "joint", name=joint.name, type=kind)
             origin = frame_values("origin", joint.origin)
-            xyz, rpy = (numbers([origin[kind] for kind in kinds]) for kinds in ("xyz", ("roll", "pitch", "yaw")))
+            xyz, rpy = (" ".join(repr(origin[kind]) for kind in kinds) for kinds in ("xyz", ("roll", "pitch", "yaw")))
             etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
             etree.SubElement(element, "parent", link=parent)
             etree.SubElement(element, "child", link=joint.child)
@@ -123,8 +119,6 @@ def _type_and_limit(joint: Joint | None) -> tuple[str, dict[str, str]]:
 
 # --- ROS and Tesseract ------------------------------------------------------------------------------------------------
 
-UrBase = Literal["base", "base_link"]
-
 UR_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 
 
@@ -147,9 +141,8 @@ def ur_kinematics(robot: Robot, base: UrBase) -> tuple[dict[str, dict[str, float
     before = transform(theta=-np.pi if base == "base_link" else 0.0) @ _frame_of(arm, "base")
     for i, name in enumerate(UR_LINKS):
         row = {arm.parameters[k].kind: arm.parameters[k].nominal for k in arm.owned_by(i + 1)}
-        origin = frame_values(name, before @ transform(theta=row["theta"], d=row["d"]))
-        kinematics[name] = {kind: float(origin[kind]) for kind in ("x", "y", "z", "roll", "pitch", "yaw")}
-        before = row_transform("dh-hayati", row | {"theta": 0.0, "d": 0.0})
+        kinematics[name] = frame_values(name, before @ transform(theta=row["theta"], d=row["d"]))
+        before = transform(a=row["a"], alpha=row["alpha"], beta=row["beta"])
     return kinematics, before @ _frame_of(arm, "tool")
 
 

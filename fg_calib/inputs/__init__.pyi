@@ -53,6 +53,7 @@ from .options import (
     POSE_MODELS,
     AngleUnit,
     EncoderNoise,
+    ExportFormat,
     FrameKnowledge,
     Gauge,
     LengthUnit,
@@ -63,6 +64,8 @@ from .options import (
     PairErrors,
     Pairing,
     Strategy,
+    ToolOfZeros,
+    UrBase,
 )
 
 __all__ = [
@@ -82,6 +85,7 @@ __all__ = [
     "Brief",
     "CalibrationError",
     "EncoderNoise",
+    "ExportFormat",
     "Figure",
     "Floats",
     "FrameKnowledge",
@@ -103,6 +107,8 @@ __all__ = [
     "Sigma",
     "SolverError",
     "Strategy",
+    "ToolOfZeros",
+    "UrBase",
     "as_array",
     "as_figures",
     "as_floats",

@@ -49,6 +49,15 @@ EncoderNoise = Literal["propagated", "estimated"]
 Loss = Literal["none", "huber", "cauchy", "geman-mcclure", "gnc"]
 """Treatment of large residuals: least squares, or a robust loss."""
 
+ExportFormat = Literal["urdf", "ur", "tesseract", "dh", "mdh", "mdh-hayati", "hayati", "poe", "cpc", "zeros", "yaml"]
+"""What may read an exported arm: see `exports.export`."""
+
+ToolOfZeros = Literal["nominal", "calibrated"]
+"""The tool that a controller works with whose joint zeros are set."""
+
+UrBase = Literal["base", "base_link"]
+"""Frame of ur_description that the base of an arm is."""
+
 LengthUnit = Literal["m", "cm", "mm", "um", "in"]
 AngleUnit = Literal["rad", "deg", "mrad"]
 

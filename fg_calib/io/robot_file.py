@@ -231,15 +231,7 @@ def write_urdf(path: Path | str, robot: Robot) -> None:
         InputError: The folder does not exist or may not be written to.
         ValueError: The robot was not read from a URDF.
     """
-    if robot.urdf is None:
-        raise ValueError("the robot was not read from a URDF")
-    write_text(Path(path), urdf_text(robot.urdf.text, joint_origins(robot)))
-
-
-def joint_origins(robot: Robot) -> dict[str, dict[str, float]]:
-    """Nominal origins of the joints of a robot from a URDF, zeros in them, by joint and kind, [m] and [rad]."""
-    values = {p.name: p.nominal for p in as_read(robot).parameters}
-    return {j.name: {kind: values[f"{j.name}.{kind}"] for kind in model.FRAME_KINDS} for j in robot.joints}
+    write_text(Path(path), urdf_text(robot))
 
 
 def has_own_zeros(robot: Robot) -> bool:
@@ -261,20 +253,21 @@ def as_read(robot: Robot) -> Robot:
     return robot.with_values(list(values.values()))
 
 
-def urdf_text(text: str, origins: Mapping[str, Mapping[str, float]]) -> str:
-    """A URDF with other origins of some joints; comments and other elements stay.
+def urdf_text(robot: Robot) -> str:
+    """The URDF that a robot was read from with the origins of its joints; comments and other elements stay.
 
     A number of `<origin>` that is the one wanted but for `ROUNDING` stays, an attribute of such numbers as written.
 
-    Args:
-        text: The URDF, as it was read.
-        origins: By joint x, y, z, roll, pitch and yaw, [m] and [rad].
+    Raises:
+        ValueError: The robot was not read from a URDF.
     """
-    root = etree.fromstring(text, etree.XMLParser(**_SAFE))
+    if robot.urdf is None:
+        raise ValueError("the robot was not read from a URDF")
+    values, names = {p.name: p.nominal for p in as_read(robot).parameters}, {joint.name for joint in robot.joints}
+    root = etree.fromstring(robot.urdf.text, etree.XMLParser(**_SAFE))
     for joint in root.findall("joint"):
-        name = joint.get("name", "")
-        if name in origins:
-            _set_origin(joint, origins[name])
+        if (name := joint.get("name", "")) in names:
+            _set_origin(joint, {kind: values[f"{name}.{kind}"] for kind in model.FRAME_KINDS})
     return f'<?xml version="1.0"?>\n{etree.tostring(root.getroottree(), encoding="unicode")}\n'
 
 
@@ -701,14 +694,10 @@ def _in_screws(mapping: Mapping[str, Any], place: str) -> dict[str, Any]:
     units, rows, T = file.units, list[dict[str, Any]](), file.link0.matrix(file.units, f"{place}: link0")
     for i, row in enumerate(file.joints, start=1):
         here, moving = f"{place}: joint {i}", "z" if row.type == "prismatic" else "yaw"
-        point = [units.from_si(one, "m") for one in T[:3, 3].tolist()]
-        own = row.model_dump(include={"type", "name", "limits"})
-        rows.append({"axis": (row.sign * T[:3, 2]).tolist(), "point": point, **own})
-        T = (
-            T
-            @ model.matrix_of_frame({moving: _si(moving, row.offset, units, f"{here}: offset")})
-            @ row.matrix(units, here)
-        )
+        axis, point = (row.sign * T[:3, 2]).tolist(), [units.from_si(one, "m") for one in T[:3, 3].tolist()]
+        rows.append(row.model_dump(include={"type", "name", "limits"}) | {"axis": axis, "point": point})
+        moved = model.matrix_of_frame({moving: _si(moving, row.offset, units, f"{here}: offset")})
+        T = T @ moved @ row.matrix(units, here)
     T = T @ model.matrix_of_frame(file.tool.si(units, f"{place}: tool"))
     tool = {kind: units.from_si(value, model.unit_of(kind)) for kind, value in model.frame_of_matrix(T).items()}
     others = {key: value for key, value in mapping.items() if key != "link0"}

@@ -40,7 +40,7 @@ def test_hayatis_row_ends_on_the_next_axis_within_the_plane_of_the_frame(seed):
     R = Rotation.from_rotvec([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-3, 3)]).as_matrix()
     M = matrix(R @ np.diag([1, -1, -1]) if seed % 2 else R, rng.uniform(-1, 1, 3))
     row = dh.plane_crossing(M)
-    at = dh.row_transform("dh-hayati", row)
+    at = dh.transform(**{kind: row.get(kind, 0.0) for kind in CONVENTIONS["dh-hayati"]})
     assert at[2, 3] == 0.0
     assert np.cross(at[:3, 3] - M[:3, 3], M[:3, 2]) == pytest.approx(np.zeros(3), abs=1e-12)
     assert at[:3, 2] == pytest.approx(M[:3, 2], abs=1e-12)
