@@ -548,11 +548,10 @@ class _Link(Schema):
         Raises:
             InputError: b is no unit vector, or too near to -z.
         """
-        if abs((length := math.hypot(*self.b)) - 1.0) > UNIT:
-            raise InputError(f"{place}: b", f"length {length:.9g}", f"1 within {UNIT:g}")
-        if self.b[2] < UNIT - 1.0:
-            hint = "take the next axis the other way, bz >= 0 with `sign: -1`; behind the last joint turn `tool`"
-            raise InputError(f"{place}: b", f"found {list(self.b)}, for which R(b) is any", "bz above -1", hint)
+        length, found = math.hypot(*self.b), f"found {list(self.b)}, for which R(b) is any"
+        inputs.expect(abs(length - 1.0) <= UNIT, f"{place}: b", f"length {length:.9g}", f"1 within {UNIT:g}")
+        hint = "take the next axis the other way, bz >= 0 with `sign: -1`; behind the last joint turn `tool`"
+        inputs.expect(self.b[2] >= UNIT - 1.0, f"{place}: b", found, "bz above -1", hint)
         beta = rotations.rotation_of(_si("beta", self.beta, units, place), 0.0, 0.0)
         R = rotations.least_rotation(np.array(self.b) / length) @ beta
         return np.vstack([np.column_stack([R, R @ self.l * units.factor("m")]), np.eye(4)[3]])

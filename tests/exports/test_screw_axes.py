@@ -106,6 +106,7 @@ def test_an_arm_in_links_is_the_same_and_reads_back_by_its_axes(name, tmp_path):
         links = [file["link0"], *file["joints"]]
         assert min(one["b"][2] for one in links) >= 0.0
         assert {(one["l"][2], one.get("beta", 0.0)) for one in links[:-1]} == {(0.0, 0.0)}
+        assert all(one["l"] == [0.0] * 3 for one, j in zip(links, arm.joints, strict=False) if j.prismatic)
         for one in q:
             expected = tool_pose(arm, one)
             assert product(file, one) == pytest.approx(expected, abs=1e-12)
