@@ -173,10 +173,9 @@ def _read_job(path: Path) -> Job:
     _, estimate_noise = _noise(file.noise, file.units, robot, f"{path.name}: noise")
     with inputs.within(path.name):
         options = file.options(robot, tables[0].model or "", estimate_noise=estimate_noise)
-    alone = tables[0].measurements if isinstance(file.measurements, str) and tables[0].is_plain else tuple(tables)
     truth = None if file.truth is None else _truth(folder / file.truth, robot)
     boxes = tuple(_box(one, file.units, f"{path.name}: keep_out") for one in file.keep_out)
-    return Job(path, robot, alone, options, truth, document=document, keep_out=boxes)
+    return Job(path, robot, tuple(tables), options, truth, document=document, keep_out=boxes)
 
 
 def _box(given: _KeepOut, units: Units, place: str) -> Floats:

@@ -237,11 +237,6 @@ class Table(Brief):
             raise InputError("table: frame", "unknown, without a model", expected)
 
     @property
-    def is_plain(self) -> bool:
-        """Whether model, pairing and frame are all there is to say of it."""
-        return not (self.own or self.known or self.offset or self.camera is not None)
-
-    @property
     def uses_pairs(self) -> bool:
         """Whether its model is one of pairs."""
         return self.model in inputs.PAIR_MODELS

@@ -234,7 +234,8 @@ def test_comparing_a_simulated_job_from_files_tells_real_errors(fg_calib, exampl
     assert list(written) == list(document)
     assert [e["name"] for e in document["estimates"]] == list(ESTIMATORS)
     given = read_job(job)
-    q = given.measurements.readings[given.measurements.test]
+    m = given.tables[0].measurements
+    q = m.readings[m.test]
     for e in document["estimates"]:
         values = given.robot.nominal
         for p in e["parameters"]:

@@ -106,7 +106,7 @@ def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, mistake):
     m = measured(ur5e(tmp_path))
     angles = ANGLES[mistake](Rotation.from_matrix(m.rotation.copy()))
     job = read_job(write_job(tmp_path, m, angles=angles, model="pose"))
-    assert f"if {mistake}" in str(check_setup(job.robot, job.measurements, "pose"))
+    assert f"if {mistake}" in str(check_setup(job.robot, job.tables[0].measurements, "pose"))
 
 
 def scaled(robot, unit, factor):

@@ -66,9 +66,10 @@ def test_a_short_job_has_the_defaults(folder):
     job = read(folder, JOB)
     assert job.path == folder / "calibration.yaml"
     assert (job.robot.name, job.robot.n_joints) == ("robot", 2)
-    assert job.measurements.position[1].tolist() == [1000, 0, 0]
+    (table,) = job.tables
+    assert table.measurements.position[1].tolist() == [1000, 0, 0]
     assert job.options == Options("pose")
-    assert job.measurements.sigma_position is None
+    assert table.measurements.sigma_position is None
     names = ("calibration.yaml", "robots/robot.yaml", "poses.csv")
     assert job.inputs == {name: sha256(folder / name) for name in names}
 
@@ -79,7 +80,7 @@ def test_a_full_job_is_converted_to_si(folder):
         JOB + "pairs: pairs.csv\npairing: {random: 30, seed: 4}\nframe: unknown\nunits: {length: mm, angle: deg}\n"
         "noise: {position: 1, orientation: 2, joint: 3, distance: 4, angle: 5}\nprior: false\nloss: none\n",
     )
-    m = job.measurements
+    m = job.tables[0].measurements
     assert m.readings[1] == pytest.approx([math.radians(10), 0.02])
     assert m.sigma_position == pytest.approx(np.full((2, 3), 1e-3))
     assert m.sigma_joint == pytest.approx([math.radians(3), 3e-3])  # the second joint slides
@@ -104,7 +105,7 @@ def test_tables_have_columns_of_their_own_names(folder):
     own = "{q1: {name: C1, scale: 0.5, zero: 160}, q2: C2, x: X, y: Y, z: Z}"
     units = "units: {length: mm, angle: deg}\n"
     job = JOB.replace("model: pose", "model: position").replace("poses.csv", "counts.csv") + units
-    data = read(folder, f"{job}columns: {own}\n").measurements
+    data = read(folder, f"{job}columns: {own}\n").tables[0].measurements
     assert data.readings[0].tolist() == pytest.approx([np.deg2rad(10.0), 0.02], rel=1e-15)
     assert data.position[0].tolist() == [1.0005, 0.0, 0.0]
     entry = f"\n  - {{table: counts.csv, columns: {own}}}"
@@ -138,8 +139,10 @@ def test_noise_may_be_left_to_the_data(folder):
     (folder / "poses.csv").write_text(poses)
     given = read(folder, JOB + "noise: {position: 0.5, estimate: true}\n")
     assert given.options.estimate_noise
-    assert (given.measurements.sigma_position[0, 0], given.measurements.sigma_orientation[0, 0]) == (0.5, 1e-3)
+    m = given.tables[0].measurements
+    assert (m.sigma_position[0, 0], m.sigma_orientation[0, 0]) == (0.5, 1e-3)
     start = read(folder, JOB + "noise: estimate\n")
     assert start.options.estimate_noise
-    assert (start.measurements.sigma_position[0, 0], start.measurements.sigma_orientation[0, 0]) == (1e-3, 1e-3)
+    m = start.tables[0].measurements
+    assert (m.sigma_position[0, 0], m.sigma_orientation[0, 0]) == (1e-3, 1e-3)
     assert not read(folder, JOB + "noise: {position: 0.5}\n").options.estimate_noise

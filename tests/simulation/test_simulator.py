@@ -205,7 +205,7 @@ def test_a_urdf_robot_is_written_with_its_urdf_and_given_errors_reach_fixed_para
     assert names == (*FILES[:2], "robot_nominal.urdf", "robot_nominal.yaml", "robot_true.urdf", "robot_true.yaml")
     job = read_job(tmp_path / "job" / "calibration.yaml")
     assert job.truth.nominal == pytest.approx(s.true_robot.nominal, abs=rounding(10.0))
-    assert job.measurements.sigma_joint == pytest.approx([0.01, 0.002, 0, 0, 0])
+    assert job.tables[0].measurements.sigma_joint == pytest.approx([0.01, 0.002, 0, 0, 0])
     errors = s.true_robot.nominal - s.robot.nominal
     assert [errors[s.robot.index(name)] for name in ("tool.z", "base.x")] == pytest.approx([0.01, 0.02])
 
