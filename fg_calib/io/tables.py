@@ -469,17 +469,10 @@ def measurements_of(
         between, of_groups = _read_pairs(pairs, (ids, test, groups), units, noise)
     if not groups.names:
         measured["sigmas"].pop("point", None)
-    sigma_joint = _joint_sigma(noise.joint, readings.shape[1])
+    sigma_joint = noise.of_joints(readings.shape[1])
     touched = Groups(groups.names, groups.index, of_groups) if groups.names else None
     more: dict[str, Any] = {"pairs": between, "source": table.name, "groups": touched, "named": "id" in table.columns}
     return Measurements(readings, ids, test, sigma_joint=sigma_joint, labels=labels, **more, **measured)
-
-
-def _joint_sigma(given: float | tuple[float, ...], n_joints: int) -> Floats:
-    """Sigma of the readings of each joint, shape (n_joints,), from one for all or one a joint."""
-    if isinstance(given, tuple) and len(given) not in {1, n_joints}:
-        raise InputError("noise: joint", f"{len(given)} sigmas", f"one value, or {n_joints}")
-    return np.broadcast_to(np.array(given, dtype=np.float64), n_joints).copy()
 
 
 def read_table(

@@ -61,6 +61,16 @@ class Noise(inputs.Record):
         others = {kind: value for kind, value in values.items() if kind not in _NOISE and value is not None}
         return replace(self, **named, more={**self.more, **others})
 
+    def of_joints(self, n_joints: int) -> Floats:
+        """Sigma of the reading of each joint, shape (n_joints,), [rad] (prismatic: [m]).
+
+        Raises:
+            InputError: It is specified for more or fewer joints.
+        """
+        sigma = np.atleast_1d(np.array(self.joint, dtype=np.float64))
+        inputs.expect(len(sigma) in {1, n_joints}, "noise: joint", f"{len(sigma)} sigmas", f"one value, or {n_joints}")
+        return np.broadcast_to(sigma, n_joints).copy()
+
     def __post_init__(self) -> None:
         if isinstance(self.joint, list | np.ndarray):
             object.__setattr__(self, "joint", tuple(np.atleast_1d(np.array(self.joint, dtype=object)).tolist()))

@@ -15,7 +15,7 @@ import numpy as np
 
 from fg_calib import measurements, statistics
 from fg_calib.graph import Knowledge, Problem, Solution, kept_of, solve
-from fg_calib.inputs import NEAR, Floats, InputError, ProblemError, did_you_mean, known_names
+from fg_calib.inputs import Floats, InputError, ProblemError, check_names
 from fg_calib.monitoring.hypotheses import named_changes
 from fg_calib.monitoring.new_data import Rows, place_new_data, started
 from fg_calib.monitoring.prior_information import Calibrated
@@ -100,10 +100,7 @@ def _with_change(known: Knowledge, growth: Mapping[str, float], changed: Sequenc
     of_kinds = sorted({kinds[name] for name in names if kinds[name]})
     changes = list(named_changes(known.variables))
     for key, given, possible in (("growth", growth, [*names, *of_kinds]), ("changed", free, changes)):
-        for name in given:
-            if name not in possible:
-                hint = did_you_mean(name, possible, NEAR)
-                raise InputError(key, f"unknown parameter {name!r}", known_names(possible), hint)
+        check_names(key, given, possible)
     sigma = {name: growth.get(name, growth.get(kinds[name], 0.0)) for name in names}
     wandered = _columns(known, {name: size for name, size in sigma.items() if size > 0.0})
     columns = np.hstack([wandered, _columns(known, free)])

@@ -3,7 +3,7 @@
 import re
 import shlex
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from fg_calib import inputs, io
@@ -52,12 +52,8 @@ def _environment() -> Any:
         finalize=lambda value: inputs.escaped(value) if type(value) is str else value,
     )
     environment.filters |= {"figure": lambda chart: Markup(chart.svg), "resource": lambda name: Markup(resource(name))}
-    environment.filters |= {
-        "without_code": lambda text: CODE.sub("", text),
-        "digits": tables.figure,
-        "in_words": in_words,
-    }
-    environment.filters["shown_in"] = tables.shown_in
+    environment.filters |= {"digits": tables.figure, "in_words": in_words, "shown_in": tables.shown_in}
+    environment.filters["without_code"] = partial(CODE.sub, "")
     return environment
 
 

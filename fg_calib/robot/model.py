@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fg_calib import inputs
-from fg_calib.inputs import NEAR, Floats, InputError, as_floats, check_names, checked, escaped, listed, shape_of, shown
+from fg_calib.inputs import Floats, InputError, as_floats, check_names, checked, escaped, listed, shape_of, shown
 from fg_calib.robot.rotations import rotation_of, yaw_pitch_roll
 
 MOST_JOINTS = 200
@@ -564,9 +564,7 @@ class Robot(inputs.Record):
             InputError: There is no such parameter.
         """
         names = names_of(self.parameters)
-        if not isinstance(name, str) or name not in names:
-            hint = inputs.did_you_mean(name, names, NEAR)
-            raise InputError(self.name, f"no parameter {shown(name)}", inputs.known_names(names), hint)
+        check_names(self.name, [name], names)
         return names.index(name)
 
     def end_of(self, owner: int) -> int:
@@ -805,12 +803,8 @@ def _checked_tolerance(tolerance: Mapping[str, float], parameters: Sequence[Para
     """1-sigma priors by name or kind, of parameters that there are."""
     for key, figure in dict(tolerance).items():
         inputs.check_number(f"tolerance: {key}", figure, above=True)
-    names, kinds = names_of(parameters), {tolerance_kind(p) for p in parameters} - {None}
-    for name in tolerance:
-        if name not in names and name not in kinds:
-            named = sorted(str(k) for k in kinds)
-            found, hint = f"unknown parameter or kind {name!r}", inputs.did_you_mean(name, [*named, *names], NEAR)
-            raise InputError(f"{place}: tolerance", found, inputs.known_names(named), hint)
+    kinds = sorted({kind for p in parameters if (kind := tolerance_kind(p))})
+    check_names(f"{place}: tolerance", tolerance, [*kinds, *names_of(parameters)], "parameter or kind")
     return dict(tolerance)
 
 

@@ -62,11 +62,6 @@ def override_noise(noise: Noise, more: Noise | None) -> Noise:
     return noise.updated(**{kind: value for kind, value in values.items() if value is not None})
 
 
-def joint_sigma(noise: Noise, robot: Robot) -> Floats:
-    """Sigma of the readings, shape (n_joints,), [rad] (prismatic: [m])."""
-    return np.broadcast_to(np.asarray(noise.joint, dtype=np.float64), robot.n_joints).copy()
-
-
 class Visits(NamedTuple):
     """Configurations that the arm was sent to.
 
@@ -193,7 +188,7 @@ class Measuring:
         """Measurements at the configurations, or at those that rows are of."""
         visits = self.visits if k is None else self.visits.select(k)
         noise, source = self.scenario.specified_noise or self.scenario.noise, f"{self.name}.csv"
-        measured |= {"sigma_joint": joint_sigma(noise, self.scenario.robot), "source": source, "named": True}
+        measured |= {"sigma_joint": noise.of_joints(self.scenario.robot.n_joints), "source": source, "named": True}
         context = {name: values if k is None else values[k] for name, values in self.context.items()}
         return Measurements(visits.readings, visits.ids, visits.test, context=context, **measured)
 
@@ -537,7 +532,6 @@ class Simulation(Brief):
         return found
 
 
-@inputs.checked
 @parallel.single_threaded
 def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simulation:
     """Run a scenario.
@@ -594,7 +588,7 @@ def _visit(scenario: Scenario, of: Configurations, seed: int, what: str, exact: 
     place = f"{scenario.source}: {what}" + ": configurations" * (name != what)
     readings = find_readings(robot, of, generator_of(seed, name, "configurations"), place)
     noise = generator_of(seed, name, "joint noise").normal(size=readings.shape)
-    stood = readings + (0.0 if exact else joint_sigma(scenario.noise, robot)) * noise
+    stood = readings + (0.0 if exact else scenario.noise.of_joints(robot.n_joints)) * noise
     ids = np.array([f"p{first + k}" for k in range(len(readings))])
     return Visits(readings, stood, ids, np.full(len(readings), what == "validation"))
 

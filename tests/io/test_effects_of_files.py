@@ -191,7 +191,7 @@ def test_masses_of_the_other_arm_are_written_and_read_back(two_arms, tmp_path):
         ("{harmonics: {joints: [4]}}", "harmonics: joints: found 4, expected joints that turn, of 1, 2, 3"),
         ("{harmonics: {order: [1]}}", "effects: harmonics: unknown key 'order', expected one of orders, joints"),
         ("{error_curve: {knots: 2}}", "effects: error_curve: knots: found 2"),
-        ("{gain: true, values: {theta9.gain: 1}}", "effects: values: arm: no parameter 'theta9.gain'"),
+        ("{gain: true, values: {theta9.gain: 1}}", "effects: values: arm: unknown parameter 'theta9.gain'"),
         ("{gain: true, values: {theta1.gain: [1, 2]}}", "effects: values: theta1.gain: 2 figures, expected one"),
         ("gain", "robot.yaml: effects: found 'gain', expected a mapping or one of select"),
         ("Select", "one of select; did you mean select?"),
