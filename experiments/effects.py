@@ -23,7 +23,8 @@ one draw in five.
 
 In `honesty` coefficients are drawn by their priors, in 90 configurations with 0.1 mm and 0.2 mrad; the prior sigma of
 error curves starts ten times too small, or too large, and is estimated. Draws that chi-square refuses, at another
-optimum, are counted apart.
+optimum, are counted apart. The uncertainty of the estimated sigma is part of no other: where pairs alone tell curves
+from harmonics NEES is above 1, and 0.98 with the sigma known.
 
 Takes two minutes with two workers.
 """
