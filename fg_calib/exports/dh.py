@@ -120,8 +120,7 @@ def in_table(robot: Robot, convention: TableConvention, farthest: float = FARTHE
     links = links_of(robot)
     if robot.convention == convention != "dh-hayati":
         return TableRobot(robot, ())
-    farthest = farthest * robot.reach
-    rows, base, tool, nearly = _rows(links, convention, farthest)
+    rows, base, tool, nearly = _rows(links, convention, farthest * robot.reach)
     builder = RobotBuilder(robot.name, convention)
     builder.add_frame("base", model.frame_values("base", tidy(base)), 0, False)
     for joint, row in zip(robot.joints, rows, strict=True):

@@ -253,8 +253,7 @@ def _table(robot: Robot, to: str, far: bool) -> _Content:
     order = " ".join(f"{PARAMETER_KINDS[kind].axis.name.capitalize()}({kind})" for kind in CONVENTIONS[convention])
     notes = [f"{words}: {order} a joint; readings are added to theta, of slides to d; mm and deg"]
     if exact:
-        over = f"over {error.n} configurations {error}"
-        notes.append(f"the same arm, base and tool hold what rows do not; {over}")
+        notes.append(f"the same arm, base and tool hold what rows do not; over {error.n} configurations {error}")
     else:
         notes += [f"NOT EXACT: {reason}" for reason in reasons]
         notes.append(f"the best fit over the joint limits, base and tool included: {error}")

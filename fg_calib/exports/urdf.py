@@ -159,10 +159,8 @@ def tesseract_text(robot: Robot) -> tuple[str, tuple[str, ...]]:
     Raises:
         InputError: A joint's value is more than its reading plus a constant.
     """
-    if robot.urdf is not None:
-        origins = {joint.name: _frame_of(robot, joint.name) for joint in robot.joints}
-    else:
-        origins = {joint.name: joint.origin for joint in urdf_joints(robot)}
+    own = {joint.name: _frame_of(robot, joint.name) for joint in robot.joints} if robot.urdf is not None else {}
+    origins = own or {joint.name: joint.origin for joint in urdf_joints(robot)}
     joints = {}
     for name, T in origins.items():
         x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True).tolist()

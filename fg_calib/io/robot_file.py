@@ -677,8 +677,7 @@ def _values(row: _Row, convention: str, units: Units, place: str) -> dict[str, f
 
 
 def _add_screw(builder: RobotBuilder, joint: Joint, row: _ScrewRow, units: Units, place: str) -> None:
-    if row.point is None and not joint.prismatic:
-        raise InputError(place, "missing key 'point'")
+    inputs.expect(row.point or joint.prismatic, place, "missing key 'point'")
     point = [one * units.factor("m") for one in row.point or (0.0, 0.0, 0.0)]
     if joint.prismatic and (row.x or row.y):
         raise InputError(place, "x or y of a slide", "pitch and roll: it has a direction alone")

@@ -16,13 +16,8 @@ from fg_calib import Calibration, Robot, calibrate, export, read_robot
 from fg_calib.exports.dh import drawn, errors
 from fg_calib.io import read_urdf, write_robot
 
+DH, MDH = (as_case(one, is_slow=True) for one in ("dh", "mdh"))
 TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 5e-4, "theta": 5e-4, "beta": 5e-4}
-
-
-def calibrated(nominal, true, folder, sigma=(1e-5, 1e-5)):
-    rng = np.random.default_rng(0)
-    data = measure(true, 40, rng, readings=drawn(true, 40, 0), sigma=sigma)
-    calibrate(nominal, data, model="pose").save(folder)
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +25,14 @@ def result(tmp_path_factory):
     """A UR10 calibrated from poses, and the true one."""
     folder = tmp_path_factory.mktemp("export") / "result"
     nominal = Robot.from_dh(UR10, "dh-hayati", name="ur10", tool=[0, 0, 0.1], tolerance=TOLERANCE)
-    calibrated(nominal, off(nominal), folder)
+    true = off(nominal)
+    data = measure(true, 40, np.random.default_rng(0), readings=drawn(true, 40, 0), sigma=(1e-5, 1e-5))
+    calibrate(nominal, data, model="pose").save(folder)
     return folder
 
 
 @pytest.mark.sampled(2)
-@pytest.mark.parametrize(
-    "to", ["urdf", as_case("dh", is_slow=True), as_case("mdh", is_slow=True), "hayati", "poe", "yaml"]
-)
+@pytest.mark.parametrize("to", ["urdf", DH, MDH, "hayati", "poe", "yaml"])
 def test_a_file_is_the_calibrated_arm(result, to, fg_calib, tmp_path):
     out = tmp_path / ("arm.urdf" if to == "urdf" else "arm.yaml")
     ended = fg_calib("export", result, "--to", to, "--out", out)
@@ -50,9 +45,7 @@ def test_a_file_is_the_calibrated_arm(result, to, fg_calib, tmp_path):
 
 
 @pytest.mark.sampled(1)
-@pytest.mark.parametrize(
-    "to", ["urdf", "ur", "tesseract", as_case("dh", is_slow=True), "hayati", "poe", "zeros", "yaml"]
-)
+@pytest.mark.parametrize("to", ["urdf", "ur", "tesseract", DH, "hayati", "poe", "cpc", "zeros", "yaml"])
 def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     text = fg_calib("export", result, "--to", to)
     document = fg_calib("export", result, "--to", to, "--json")
@@ -64,7 +57,7 @@ def test_stdout_is_the_file_or_the_document(result, to, fg_calib):
     assert found["findings"] == found["not_accepted"] == []
 
 
-@pytest.mark.parametrize("to", ["dh", as_case("mdh", is_slow=True), "mdh-hayati", "dh-hayati", "poe", "cpc", "urdf"])
+@pytest.mark.parametrize("to", ["dh", MDH, "mdh-hayati", "dh-hayati", "poe", "cpc", "urdf"])
 def test_a_robot_is_converted_and_what_the_other_convention_cannot_hold_is_said(to, fg_calib, tmp_path):
     robot, out = off(ur10()), tmp_path / ("out.urdf" if to == "urdf" else "out.yaml")
     write_robot(tmp_path / "arm.yaml", robot)
@@ -106,16 +99,10 @@ def test_zeros_that_cannot_be_told_stay_0_and_what_takes_them_up_is_named(form, 
 FINDING = "reduced chi-square 7 -- far too large"
 
 
-@pytest.fixture
-def doubtful(result, tmp_path):
-    """The same result with a finding."""
-    folder = Path(shutil.copytree(result, tmp_path / "doubtful"))
-    document = json.loads((folder / "result.json").read_text())
-    (folder / "result.json").write_text(json.dumps(document | {"findings": [FINDING], "trustworthy": False}))
-    return folder
-
-
-def test_a_result_that_is_not_to_be_trusted_says_so_and_ends_with_3(doubtful, fg_calib, tmp_path):
+def test_a_result_that_is_not_to_be_trusted_says_so_and_ends_with_3(result, fg_calib, tmp_path):
+    doubtful = Path(shutil.copytree(result, tmp_path / "doubtful"))
+    document = json.loads((doubtful / "result.json").read_text())
+    (doubtful / "result.json").write_text(json.dumps(document | {"findings": [FINDING], "trustworthy": False}))
     for to in ("hayati", "tesseract"):
         ended = fg_calib("export", doubtful, "--to", to)
         assert ended.code == 3

@@ -50,7 +50,6 @@ ROBOTS = [
     (C+"  - {b: [0, 0, 1.00001], l: [0, 0, 0]}\n", "robot.yaml: joint 1: b: length 1.00001, expected 1 within 1e-06"),
     (C+"  - {b: [0, 0.0001, -1], l: [0, 0, 0]}\n", "robot.yaml: joint 1: b: found [0.0, 0.0001, -1.0], for which R(b) is any, expected bz above -1; take the next axis the other way, bz >= 0 with `sign: -1`; behind the last joint turn `tool`"),
     (C+"  - {b: [0, 0, 1], l: [0, 0, 0], sign: 2}\n", "robot.yaml: joint 1: sign: found 2, expected one of -1, 1"),
-    (C+"  - {b: [0, 0, 1], l: [0, 0, 0], point: [0, 0, 0]}\n", "robot.yaml: joint 1: unknown key 'point', expected one of b, l, beta, type, name, limits, sign, offset"),
 ]
 
 L = '<link name="a"/><link name="b"/>'
