@@ -362,9 +362,8 @@ class Calibration(Record, repr=False, eq=False):
         if isinstance(given, Path | str) and Path(given).suffix.lower() not in (".yaml", ".yml"):
             path, of_pairs = Path(given), None if pairs is None else Path(pairs)
             job = self.result.carried.job
-            if not job:
-                found = "the calibration does not say how its tables were read"
-                raise InputError(path.name, found, "a job that names the table")
+            found = "the calibration does not say how its tables were read"
+            inputs.expect(job, path.name, found, "a job that names the table")
             with io.noting_reads() as files:
                 table = io.read_table_like(job, robot, path, pairs=of_pairs, like=like)
             digests = {file.name: digest for file, digest in files.items()}

@@ -20,7 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
-from fg_calib.inputs import CalibrationError, InputError, Record, check_number, checked, printable, shown
+from fg_calib.inputs import CalibrationError, InputError, Record, check_number, checked, expect, printable, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -145,9 +145,8 @@ def require_polars(place: str) -> None:
         InputError: Polars does not work here, or `POLARS_THREADS` is no number from 1 to `MOST`.
     """
     _threads_in(POLARS_THREADS)
-    if _forked_from_polars:
-        found = "polars does not work in a fork of a process that has loaded it"
-        raise InputError(place, found, hint='use multiprocessing.get_context("spawn") or "forkserver"')
+    found = "polars does not work in a fork of a process that has loaded it"
+    expect(not _forked_from_polars, place, found, hint='use multiprocessing.get_context("spawn") or "forkserver"')
 
 
 class Failure(Record):

@@ -236,9 +236,8 @@ def _train_rows(robot: Robot, data: Dataset, weighted: bool) -> list[_Rows]:
         covariance = sigma[:, :, None] ** 2 * np.eye(h) if specified is None else specified
         private = covariance[train] if weighted else np.broadcast_to(np.eye(h), (len(train), h, h))
         found.append(_Rows(s.table, block, s.nuisances[train], s.used[train], private))
-    if not found:
-        models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
-        raise InputError(data.source, "no row left to fit", f"train rows for model {models}")
+    models = ", ".join(dict.fromkeys(str(table.model) for table in data.tables))
+    expect(found, data.source, "no row left to fit", f"train rows for model {models}")
     return found
 
 

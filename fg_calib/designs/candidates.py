@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fg_calib import simulation
 from fg_calib.designs.information import PoseRows, Posterior, count_measurements, gather_rows
 from fg_calib.graph import Problem, Variables, coordinates_of, square_root, unknown_prior_rows
-from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing
+from fg_calib.inputs import PAIR_MODELS, Brief, Floats, Gauge, InputError, Integers, Model, Options, Pairing, expect
 from fg_calib.measurements import INSTRUMENTS, Landmarks, Table
 from fg_calib.observability import places_of, true_problem
 from fg_calib.robot import Robot
@@ -261,9 +261,8 @@ def _measure_all(scenario: Scenario, found: Mapping[str, Candidates], given: Flo
     """
     readings = {name: one.readings for name, one in found.items()}
     if given is not None:
-        if "" not in readings:
-            reason = "where every instrument has configurations of its own"
-            raise InputError("given", reason, "a job with what was measured")
+        reason = "where every instrument has configurations of its own"
+        expect("" in readings, "given", reason, "a job with what was measured")
         readings[""] = np.vstack([given, readings[""]])
     return simulation.simulate(_nominal(scenario, readings), exact=True).tables
 

@@ -266,9 +266,8 @@ def average_stops(
     stops, reasons = _centre(joints, poses, np.array(spans), applied)
     skipped = tuple(Skipped(f"stop{k + 1}", spans[k][0] - float(joints.time[0]), reasons[k]) for k in sorted(reasons))
     good = [k for k in stops if k not in reasons]
-    if not good:
-        hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
-        raise InputError(f"topic {poses.source.topic}", f"no stop of {len(spans)} can be used", hint=hint)
+    hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
+    inputs.expect(good, f"topic {poses.source.topic}", f"no stop of {len(spans)} can be used", hint=hint)
     means, residuals = ({kind: [stops[k][kind][part] for k in good] for kind in stops[good[0]]} for part in (0, 1))
     scatter, sigmas = _scatter(residuals)
     ids, interval = tuple(f"stop{k + 1}" for k in good), np.array([spans[k] for k in good])

@@ -494,9 +494,8 @@ def read_calibration_board(path: Path) -> CalibrationBoard:
     if file.type == "charuco":
         for key in ("marker", "dictionary"):
             expect(getattr(file, key), place, f"missing key {key!r}")
-        if board.marker >= board.square:
-            expected = f"a side shorter than a square's, {io.shown(file.square)}"
-            raise InputError(f"{place}: marker", f"found {io.shown(file.marker)}", expected)
+        expected = f"a side shorter than a square's, {io.shown(file.square)}"
+        expect(board.marker < board.square, f"{place}: marker", f"found {io.shown(file.marker)}", expected)
         known = [name for name in dir(load_opencv().aruco) if name.startswith("DICT_")]
         check(f"{place}: dictionary", board.dictionary, known)
         charuco_board(board, place)

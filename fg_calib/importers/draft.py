@@ -272,9 +272,8 @@ def _sort(files: Sequence[Path]) -> dict[str, list[Path]]:
         if kind == "yaml":
             keys = read_yaml(file).keys()
             kind = "camera" if "fx" in keys else "robot" if {"joints", "urdf"} & keys else ""
-        if not kind:
-            expected = "robot.yaml (joints, or urdf), a .urdf, camera.yaml (fx), or a table: .csv, .parquet"
-            raise InputError(file.name, "neither robot, camera nor table", expected)
+        expected = "robot.yaml (joints, or urdf), a .urdf, camera.yaml (fx), or a table: .csv, .parquet"
+        expect(kind, file.name, "neither robot, camera nor table", expected)
         found[kind].append(file)
     for kind, example in (("robot", "robot.yaml or a URDF"), ("table", "poses.csv")):
         expect(found[kind], "init", f"no {kind} among the files", f"one, such as {example}")

@@ -274,9 +274,8 @@ def check_different(name: str, columns: Iterable[object], hint: str = "") -> Non
         InputError: Two are the same.
     """
     for column, n in Counter(str(column).strip() for column in columns).items():
-        if n > 1:
-            found = f"two columns called {column!r}" if column else "two columns without a name"
-            raise InputError(name, found, "different names", hint)
+        found = f"two columns called {column!r}" if column else "two columns without a name"
+        expect(n == 1, name, found, "different names", hint)
 
 
 NOTHING = ("na", "n/a", "<na>", "nan", "none", "null", "-", "--")

@@ -426,9 +426,8 @@ class _Tree:
         links = [link]
         while links[-1] in self._above:
             links.append(self._above[links[-1]].parent)
-            if links[-1] in links[:-1]:
-                circle = " below ".join(links[links.index(links[-1]) :])
-                raise InputError(self._place, f"links in a circle: {circle}", "a tree of links")
+            circle = " below ".join(links[links.index(links[-1]) :])
+            inputs.expect(links[-1] not in links[:-1], self._place, f"links in a circle: {circle}", "a tree of links")
         return links
 
     def _only(self, found: list[str], what: str, key: str) -> str:
@@ -602,9 +601,8 @@ def read_robot(
     path = Path(path)
     if path.suffix.lower() == ".urdf":
         return read_urdf(path, base_link=base_link, tip_link=tip_link, estimate=estimate)
-    if path.suffix.lower() == ".xacro":
-        hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
-        raise InputError(path.name, "a file of xacro", "a URDF", hint)
+    hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
+    inputs.expect(path.suffix.lower() != ".xacro", path.name, "a file of xacro", "a URDF", hint)
     mapping, links = read_yaml(path), {"base_link": base_link, "tip_link": tip_link}
     name = {} if "urdf" in mapping else {"name": path.stem}
     given = name | mapping | {key: link for key, link in links.items() if link is not None}
@@ -668,9 +666,8 @@ def _build_rows(file: _DhRobot | _PoeRobot, place: str, estimate: Sequence[str])
 def _values(row: _Row, convention: str, units: Units, place: str) -> dict[str, float]:
     """The values of a row by kind, [m] and [rad]."""
     kinds = model.CONVENTIONS[convention]
-    if row.beta and "beta" not in kinds:
-        found, expected = f"found {row.beta!r}", f"none: the convention {convention} has no beta"
-        raise InputError(f"{place}: beta", found, expected, f"{convention}-hayati has")
+    found, expected = f"found {row.beta!r}", f"none: the convention {convention} has no beta"
+    inputs.expect("beta" in kinds or not row.beta, f"{place}: beta", found, expected, f"{convention}-hayati has")
     if missing := [kind for kind in kinds if getattr(row, kind) is None]:
         raise InputError(place, f"missing key {missing[0]!r}")
     return {kind: _si(kind, getattr(row, kind), units, place) for kind in kinds}
@@ -812,9 +809,8 @@ def require_same_chain(robot: Robot, written: Robot, place: str) -> None:
     same = names_of(robot.parameters) == names_of(written.parameters) and len(robot.elements) == len(written.elements)
     for one, other in zip(robot.elements, written.elements, strict=same):
         same &= replace(one, constant=other.constant) == other and abs(one.constant - other.constant) <= ROUNDING
-    if not same:
-        expected = "base, joints of one convention or a URDF's, tool: all that a robot file can say"
-        raise InputError(place, "the robot has elements or parameters of its own", expected)
+    expected = "base, joints of one convention or a URDF's, tool: all that a robot file can say"
+    inputs.expect(same, place, "the robot has elements or parameters of its own", expected)
 
 
 def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:

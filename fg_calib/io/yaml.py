@@ -297,9 +297,8 @@ def quantity(given: object, unit: str, units: Units | None, place: str) -> float
     if isinstance(given, str) and (read := _QUANTITY.fullmatch(given)):
         number, name = read["number"], read["unit"] or name
         inputs.expect(name, place, number, hint=f"give a unit, such as {number}{SCALES[unit].unit}")
-    if name not in known:
-        expected = f"a number with one of {', '.join(known)}"
-        raise InputError(place, f"found {shown(given)}", expected, did_you_mean(name, known))
+    expected = f"a number with one of {', '.join(known)}"
+    inputs.expect(name in known, place, f"found {shown(given)}", expected, did_you_mean(name, known))
     try:
         figure = float(number) if isinstance(number, str) and "_" not in number else number
         return validate(_Figure, {"figure": figure}, "").figure * known[name]

@@ -357,9 +357,8 @@ def _choose(rows: Integers, pairing: Pairing, generator: np.random.Generator) ->
         return np.empty((0, 2), dtype=np.int64)
     possible = n * (n - 1) // 2
     wanted = {"all": possible, "random": min(pairing.count, possible)}.get(pairing.strategy, n - 1)
-    if wanted > MOST_PAIRS:
-        hint = "a random part will do, such as {random: 100000}"
-        raise InputError("pairing", f"{pairing} forms {wanted} pairs", f"at most {MOST_PAIRS}", hint)
+    hint = "a random part will do, such as {random: 100000}"
+    inputs.expect(wanted <= MOST_PAIRS, "pairing", f"{pairing} forms {wanted} pairs", f"at most {MOST_PAIRS}", hint)
     second = np.arange(1, n)
     first = second - 1 if pairing.strategy == "chain" else np.zeros_like(second)
     if pairing.strategy == "all":

@@ -15,7 +15,7 @@ import numpy as np
 
 from fg_calib import measurements, statistics
 from fg_calib.graph import Knowledge, Problem, Solution, kept_of, solve
-from fg_calib.inputs import Floats, InputError, ProblemError, check_names
+from fg_calib.inputs import Floats, InputError, ProblemError, check_names, expect
 from fg_calib.monitoring.hypotheses import named_changes
 from fg_calib.monitoring.new_data import Rows, place_new_data, started
 from fg_calib.monitoring.prior_information import Calibrated
@@ -84,9 +84,8 @@ def _problem(calibrated: Calibrated, robot: Robot, known: Knowledge, rows: Rows,
     # What nothing determines is nonlinear in what it does, and the old rows stand as they were linearised: new rows
     # would contradict them, and a miss of one sigma would move an arm by metres.
     lost = [p.name for p in robot.parameters if p.estimated and p.name not in kept]
-    if lost:
-        found = f"gauge none, and rows that do not determine {', '.join(lost)} given the others"
-        raise InputError("update", found, "a calibration with gauge keep or prior")
+    found = f"gauge none, and rows that do not determine {', '.join(lost)} given the others"
+    expect(not lost, "update", found, "a calibration with gauge keep or prior")
     return whole
 
 

@@ -173,9 +173,8 @@ class Measuring:
             InputError: The sigma is 0.
         """
         sigma = self._value(self.sigmas, kind)
-        if sigma == 0.0:
-            hint = f"a calibration takes nothing for exact: specify what to assume under job: noise: {kind}"
-            raise InputError(f"{self.place}: noise: {kind}", "found 0", "a number above 0", hint)
+        hint = f"a calibration takes nothing for exact: specify what to assume under job: noise: {kind}"
+        inputs.expect(sigma != 0.0, f"{self.place}: noise: {kind}", "found 0", "a number above 0", hint)
         return np.full(shape, sigma)
 
     def _value(self, noise: Noise, kind: str) -> float:
@@ -248,9 +247,8 @@ class Measuring:
             raise InputError(self.place, f"contact, with effects by {', '.join(self.context)}", "none of these effects")
         v, generator = self.visits, self.generator("touch")
         found = solve_inverse(self.true_robot, points, near=v.true_readings, generator=generator, n_starts=n_starts)
-        if not found.reached[~v.test].any():
-            missed = f"nothing is reached from {np.sum(~v.test)} configurations"
-            raise InputError(self.place, missed, "points within the joint limits")
+        missed = f"nothing is reached from {np.sum(~v.test)} configurations"
+        inputs.expect(found.reached[~v.test].any(), self.place, missed, "points within the joint limits")
         readings = np.clip(found.readings - (v.true_readings - v.readings), *self.scenario.robot.limits.T)
         ids = np.array([f"{self.name} {i}" for i in v.ids])
         self.visits = Visits(readings, found.readings, ids, v.test).select(found.reached)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, as_floats
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, as_floats, expect
 from fg_calib.measurements import outside_limits
 from fg_calib.robot import Inverse, Robot, build_chain, forward, random_readings, solve_inverse
 from fg_calib.simulation.obstacles import enters
@@ -246,9 +246,8 @@ def find_readings(robot: Robot, of: Configurations, generator: np.random.Generat
         return np.asarray(of.readings, dtype=np.float64)
     n = number_of(of)
     found = draw_candidates(robot, of, generator, n, place)
-    if len(found.readings) < n:
-        hint = "ask for fewer, or relax their conditions"
-        raise InputError(place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
+    hint = "ask for fewer, or relax their conditions"
+    expect(len(found.readings) >= n, place, f"{len(found.readings)} of {n} found in {found.reasons()}", hint=hint)
     return found.readings
 
 
