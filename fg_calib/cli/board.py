@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Group
 
-from fg_calib import importers, io, report
+from fg_calib import importers, inputs, io, report
 from fg_calib.cli.output import Angle, Json, Length, argument, end, option, say, show_result
 
 _READINGS = "Joint readings; id is an image's name without its ending."
@@ -85,7 +85,7 @@ def _notes(tables: "importers.BoardTables") -> Iterator[str]:
         ("Rows of joint readings without an image of the board:", tables.without_image),
     ):
         if names:
-            yield f"{words} {report.shortened(list(names), 20)}."
+            yield f"{words} {inputs.shorten(list(names), 20)}."
     if fit.camera_sigma is not None:
         yield "The covariances of poses assume an exact camera; its error moves all boards together."
     if tables.readings is None:

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fg_calib.diagnostics.setup_check import MOTION_M, MOTION_RAD, SetupCheck, check_tables, reporting
-from fg_calib.diagnostics.verdict import Severity, Statement, check_excitation, listed, texts
+from fg_calib.diagnostics.verdict import Severity, Statement, check_excitation, texts
 from fg_calib.graph import Problem, problem_of, solve, tables_of, unsolved
-from fg_calib.inputs import Brief, CalibrationError, Record
+from fg_calib.inputs import Brief, CalibrationError, Record, shorten
 from fg_calib.job import Job
 from fg_calib.measurements import Measurements, Table, find_copies, outside_limits
 from fg_calib.observability import Identifiability, identifiability_of
@@ -255,7 +255,7 @@ def _check_setups(found: Inspection, job: Job) -> Iterator[Statement]:
         severity: Severity = "error" if check.explanations or has_priors else "note"
         yield Statement(severity, str(check), check.explanations or not found.disagreements)  # else these are why
     wrong, loss, tested = found.disagreements, job.options.loss, sum(one.test for one in found.disagreements)
-    text = f"measurements that disagree with the others: {len(wrong)} ({listed([one.name for one in wrong])})"
+    text = f"measurements that disagree with the others: {len(wrong)} ({shorten([one.name for one in wrong])})"
     text += ": look at them" * bool(tested or loss == "none")
     text += ", or let a robust loss do so (loss: gnc)" * (loss == "none" and tested < len(wrong))
     text += f"; no loss acts on test rows, of which these are {tested}" * bool(tested)
@@ -285,7 +285,7 @@ def _check_result(found: Inspection, job: Job) -> Iterator[Statement]:
         yield Statement("note", str(motion))
     still = [joint.name for joint in found.joints if joint.still]
     what = "moves: its zero is" if len(still) == 1 else "move: their zeros are"
-    yield Statement("note", f"{listed(still)} hardly {what} not distinguishable from the link before", still)
+    yield Statement("note", f"{shorten(still)} hardly {what} not distinguishable from the link before", still)
     yield from check_excitation(found.identifiability)
     text = "no test rows: nothing would check how well the calibration predicts (column split)"
     yield Statement("note", text, not held_out)

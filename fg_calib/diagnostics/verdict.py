@@ -17,7 +17,7 @@ from fg_calib.diagnostics import unmodelled_effects as effects
 from fg_calib.diagnostics.linearity import NONLINEAR, AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.diagnostics.setup_check import SetupCheck, check_problem
 from fg_calib.graph import JOINT_NOISE, Problem, Solution, mahalanobis_distances, solve, with_factors
-from fg_calib.inputs import CalibrationError, Floats, Record
+from fg_calib.inputs import CalibrationError, Floats, Record, shorten
 from fg_calib.measurements import missing_values
 from fg_calib.observability import NOT_EXCITED, Identifiability
 from fg_calib.robot import SCALES, pose
@@ -54,9 +54,6 @@ MOST_ESTIMATED = 2.0
 
 MAX_NOISE_FACTOR = 5.0
 """Estimated over specified noise above which one asks why."""
-
-NAMED = 3
-"""Configurations, rows or parameters that a statement names."""
 
 
 class Statement(Record):
@@ -264,7 +261,9 @@ def check_chi_square(
     if evaluated:
         cause = "the arm does not predict these test rows, noise specified too small, or outliers"
     elif gross is not None:
-        cause = f"outliers: {gross.n} ({listed(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
+        cause = (
+            f"outliers: {gross.n} ({shorten(gross.names)}), {gross.ratio:.3g} without: look at them, or let a robust"
+        )
         cause += " loss do so (`loss: gnc`)"
     elif updated:
         cause = "new rows contradict the earlier calibration: has the arm changed (see `fg-calib check`)?"
@@ -317,7 +316,7 @@ def check_test_outliers(case: Case) -> Iterator[Statement]:
 
 def _suspicious(fit: statistics.PredictedFit) -> str:
     names = [configuration.id for configuration in fit.configurations]
-    return f"; suspicious: {listed(names)}" if names else ""
+    return f"; suspicious: {shorten(names)}" if names else ""
 
 
 def check_gain(case: Case) -> Iterator[Statement]:
@@ -360,10 +359,10 @@ def check_priors(case: Case) -> Iterator[Statement]:
         text = f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}"
         yield Statement("error", text, one.is_place)
     worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
-    text = f"corrections beyond their prior sigmas (in sigma of these: {listed(worst)}): {causes}"
+    text = f"corrections beyond their prior sigmas (in sigma of these: {shorten(worst)}): {causes}"
     yield Statement("error", text, worst)
     largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
-    text = f"corrections are too large for their prior sigmas (in sigma of these: {listed(largest)}; sum of squares"
+    text = f"corrections are too large for their prior sigmas (in sigma of these: {shorten(largest)}; sum of squares"
     text += f" {fit.chi2:.3g} where {fit.expected:.3g} is expected): {causes}"
     p_value = 1.0 if fit.beyond or fit.p_value is None else fit.p_value
     certain = fit.chi2 > FACTOR * fit.expected and p_value < PRIOR_P_VALUE
@@ -393,7 +392,7 @@ def check_linear(rows: AmbiguousRows, nonlinear: Nonlinearity, high: bool = Fals
     names, what = (rows.names, "sign") if sign else (rows.turned, "direction")
     share = f"; {100.0 * rows.share:.0f} % of the information rests on them" * sign
     text = f"the {what} of {len(names)} of {rows.n_rows} lengths and angles is ambiguous within the prior sigmas"
-    text += f" ({listed(names)} near 0 or 180 deg{share}): there may be a better optimum far away, and sigmas"
+    text += f" ({shorten(names)} near 0 or 180 deg{share}): there may be a better optimum far away, and sigmas"
     text += " may be too small; leave these out, or measure longer and wider motions, in which more joints move"
     ambiguous = sign or (bool(rows.turned) and not curved)
     yield Statement("error" if rows.share > MAX_AMBIGUOUS_SHARE else "warning", text, ambiguous)
@@ -411,7 +410,7 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
     if not estimated:
         return
     if gross is not None:
-        text = f"outliers: {gross.n} ({listed(gross.names)}) make the estimated noise {gross.ratio**-0.5:.3g} times as"
+        text = f"outliers: {gross.n} ({shorten(gross.names)}) make the estimated noise {gross.ratio**-0.5:.3g} times as"
         text += " large: look at them, or let a robust loss do so (`loss: gnc`)"
         yield Statement("error" if case.effect else "warning", text)
     readings = case.problem.data.readings[:MOST_READINGS]
@@ -521,9 +520,3 @@ def predicted_in_words(fit: statistics.PredictedFit) -> str:
 def probability(p: float) -> str:
     """A probability with two digits, none beyond a thousandth from 0 and 1."""
     return "< 0.001" if p < 1e-3 else "> 0.999" if p > 0.999 else f"{p:.2g}" if p < 0.1 else f"{p:.2f}"
-
-
-def listed(names: Sequence[str]) -> str:
-    """The first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -44,7 +44,18 @@ from .arrays import (
     require,
     shape_of,
 )
-from .errors import CalibrationError, InputError, ProblemError, SolverError, escaped, expect, printable, shown, within
+from .errors import (
+    CalibrationError,
+    InputError,
+    ProblemError,
+    SolverError,
+    escaped,
+    expect,
+    printable,
+    shorten,
+    shown,
+    within,
+)
 from .libraries import etree, optimize, pl
 from .options import (
     LIMITED,
@@ -140,6 +151,7 @@ __all__ = [
     "printable",
     "require",
     "shape_of",
+    "shorten",
     "shown",
     "within",
 ]

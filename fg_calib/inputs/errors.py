@@ -1,6 +1,6 @@
 """The exceptions of the package: each message is one line that a user can act on."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from reprlib import Repr
 
@@ -85,6 +85,11 @@ def shown(value: object) -> str:
         return f"{type(value).__name__} of shape {shape}"
     text = " ".join(_REPR.repr(plain).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def shorten(names: Sequence[str], most: int = 3) -> str:
+    """`a, b, c and 4 more`."""
+    return ", ".join(names[:most]) + f" and {len(names) - most} more" * (len(names) > most)
 
 
 _REPR = Repr()

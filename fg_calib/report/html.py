@@ -11,7 +11,7 @@ from fg_calib.report import tables, text
 from fg_calib.report.charts import RAMP, resource, standalone
 from fg_calib.report.figures import arm_scene, figures_of
 from fg_calib.report.predict import FRAMES, percentages, size_table
-from fg_calib.report.tables import Section, in_words, section, shortened
+from fg_calib.report.tables import Section, in_words, section
 
 WORKSPACE = "Expected error over the workspace"
 
@@ -102,7 +102,7 @@ def _not_determined(result: io.Result) -> Iterator[str]:
     for one in result.observability.lost:
         members = [name for name, factor in one.relation.items() if abs(factor) >= 0.01]  # the largest is 1
         found.setdefault(one.reason, []).append(" with ".join(members[:3]) + " ..." * (len(members) > 3))
-    yield from (f"{shortened(combinations, 3)}: {reason}" for reason, combinations in found.items())
+    yield from (f"{inputs.shorten(combinations, 3)}: {reason}" for reason, combinations in found.items())
 
 
 def _command(result: io.Result) -> str:

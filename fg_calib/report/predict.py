@@ -10,7 +10,7 @@ from rich.console import Group
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Floats, shorten
 from fg_calib.io import Result, Units, fill_folder, joint_columns, require_absent, write_csv
 from fg_calib.prediction import Correction, PredictedErrors, ToolErrors, summed_up
 from fg_calib.report import tables
@@ -310,7 +310,7 @@ def _correction_notes(ids: Sequence[str], correction: Correction, robot: Robot) 
     }
     for words, rows in doubts.items():
         if rows.any():
-            yield f"{words}: {tables.shortened([ids[i] for i in np.flatnonzero(rows).tolist()], 5)}."
+            yield f"{words}: {shorten([ids[i] for i in np.flatnonzero(rows).tolist()], 5)}."
     if np.isnan(correction.expected).any():
         yield "The expected error is unknown where it depends on what the calibration did not determine."
 

@@ -199,11 +199,6 @@ def in_words(value: float | None, unit: str, form: str = ".3g") -> str:
     return shown if shown == "unknown" else f"{shown} {shown_in(unit).unit}"
 
 
-def shortened(names: list[str], most: int) -> str:
-    """`a, b, c and 4 more`."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def lost_directions(lost: Sequence[LostDirection]) -> Table:
     """Each reason once, after the directions that have it."""
     by_reason: dict[str, list[str]] = {}

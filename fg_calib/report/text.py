@@ -17,7 +17,7 @@ from fg_calib.diagnostics import chi2_in_words, predicted_in_words, probability
 from fg_calib.inputs import pl
 from fg_calib.io import Result, key_of
 from fg_calib.report import tables
-from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, shortened, table_of
+from fg_calib.report.tables import Content, Section, figure, in_order, in_words, line, section, table_of
 from fg_calib.robot import Robot, kind_of
 
 UNMOVED = 1e-9
@@ -237,7 +237,7 @@ def _cross_validation(result: Result) -> list[Section]:
         median = f"{np.median(list(ratio.values())):.2f}" + " (pairs: expect 1.4 to 1.7)" * found.of_pairs
         lines.append(f"spread of a parameter between folds over its sigma: median {median}, below 1 where priors act")
     if wide:
-        named = shortened([f"{name} {ratio[name]:.1f}" for name in wide], 5)
+        named = inputs.shorten([f"{name} {ratio[name]:.1f}" for name in wide], 5)
         lines.append(f"spread significantly larger than sigma: {named}; the model lacks an effect, or rows are wrong")
     if found.not_converged:
         lines.append(f"{found.not_converged} of {found.n} calibrations did not converge")
@@ -462,4 +462,4 @@ def _undetermined(solution: graph.Solution, assessed: assessment.Assessment) -> 
                 what = "fixed by nothing, moved from nominal by steps of minimum norm"
             fixed.setdefault(what, []).append(p.name)
     for what, names in fixed.items():
-        yield f"{what}: {shortened(names, 12)}"
+        yield f"{what}: {inputs.shorten(names, 12)}"
