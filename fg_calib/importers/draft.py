@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from jinja2 import Template
 
 from fg_calib import io
 from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, InputError, Model, Record, expect, printable
@@ -52,43 +53,11 @@ _MODELS: dict[str, Model] = {
 _UNITS = {"length": (LENGTHS, "m", "mm", 30.0), "angle": (ANGLES, "rad", "deg", 13.0)}
 """Units of each kind, the guessed one, and the one that is guessed if a value exceeds the number."""
 
+_TEMPLATE = Path(__file__).with_name("job.yaml.jinja")
+"""The text of a job."""
+
 _GUESSES = {"orientation": ("angle", 2e-4), "angle": ("angle", 2e-4), "pixel": ("", 0.2)}
 """Noise to start from by kind, [rad] or [px]; 1e-4 m of others."""
-
-_TEMPLATE = """\
-# A calibration job by fg-calib init. Lines with DECIDE are yours to look at; `fg-calib inspect` looks for mistakes.
-robot: {robot}
-{notes}measurements:
-{entries}
-# Models of pairs need no frame: distance for position, rotation for orientation, distance-rotation for pose.
-# camera_T_board, seen by a camera that is the tool, is of model board, without frame.
-units: {units}  # DECIDE where headers do not say: they are guessed from the values' sizes
-# DECIDE the noise, 1 sigma in the units above: the values are guesses, so it is estimated from residuals;
-# put your instrument's in their place and leave estimate out. joint: repeatability of the joint readings.
-noise: {noise}
-
-# pairing: star   # of models of pairs: star | chain | all | {{random: 3000, seed: 0}}
-# loss: none      # huber | cauchy | geman-mcclure | gnc where there are gross errors
-# gauge: prior    # what data do not determine: priors fix it; keep: it stays at nominal; none
-# folds: 5        # checks the prediction where no column split has `test` rows; a limit: accept: {{position: 0.5 mm}}
-"""
-
-_NO_TOLERANCE = """\
-# DECIDE how far off the nominal model may be: the robot file does not say it of all that is estimated, such as
-# {example}.
-# These are 1 sigma. Without, nothing fixes what data do not determine.
-"""
-
-_TOLERANCES = {
-    False: "tolerance: {a: 0.001, alpha: 0.1}, in its units",
-    True: "robot: {urdf: NAME, tolerance: {x: 1, y: 1, z: 1, roll: 0.1, pitch: 0.1, yaw: 0.1}}, in this job's units",
-}
-"""Where prior sigmas stand: in a robot file, in the job of a URDF."""
-
-_NO_TOOL = """\
-# DECIDE whether exactly the robot file's tool was measured; if not: estimate: [tool.x, tool.y, tool.z]
-# next to it (and tool.roll, tool.pitch, tool.yaw where orientations were measured).
-"""
 
 
 class _Recognised(Record):
@@ -253,11 +222,18 @@ def draft_job(files: Sequence[Path], out: Path) -> str:
     joint = float(f"{1e-4 / factors['angle']:.2g}") if any(table.repeats for table in tables) else 0.0
     arm = [p for p in robot.parameters if p.estimated and 1 <= p.owner <= robot.n_joints]
     tool = [robot.parameters[i] for i in robot.owned_by(robot.n_joints + 1)]
-    place, noises = _path(found["robot"][0], out.parent), _flow({**noise, "joint": joint, "estimate": True})
-    wide = _NO_TOLERANCE.format(example=_TOLERANCES[place.endswith(".urdf")].replace("NAME", place))
-    notes = wide * any(p.tolerance is None for p in arm) + _NO_TOOL * (not any(p.estimated for p in tool))
-    entries = "\n".join(line for table in tables for line in _entry(table, found["camera"], units, out.parent))
-    return _TEMPLATE.format(robot=place, notes=notes, entries=entries, units=_flow(units), noise=noises)
+    template = Template(_TEMPLATE.read_text("utf-8"), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    return template.render(
+        robot=_path(found["robot"][0], out.parent),
+        without_tolerance=any(p.tolerance is None for p in arm),
+        without_tool=not any(p.estimated for p in tool),
+        tables=tables,
+        path=lambda file: _path(file, out.parent),
+        camera=next(iter(found["camera"]), None),
+        units=units,
+        noise={**noise, "joint": joint, "estimate": True},
+        **{"INSTRUMENTS": INSTRUMENTS, "POSE_MODELS": POSE_MODELS, "flow": _flow, "printable": printable},
+    )
 
 
 def _sort(files: Sequence[Path]) -> dict[str, list[Path]]:
@@ -299,29 +275,6 @@ def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
     model = {of: model for model, of in PAIR_MODELS.items()}.get(measured, "distance")
     present, units = (*first.present, *pairs[0].present), {**pairs[0].units, **first.units}
     return [replace(first, model=model, pairs=pairs[0].path, present=present, units=units), *others]
-
-
-def _entry(table: _Recognised, cameras: Sequence[Path], units: Mapping[str, str], folder: Path) -> list[str]:
-    """Lines of a table in the job's list of measurements."""
-    lines = [f"table: {_path(table.path, folder)}", f"model: {table.model}"]
-    if table.pairs is not None:
-        lines.append(f"pairs: {_path(table.pairs, folder)}")
-    if table.model in POSE_MODELS:
-        lines.append("frame: unknown  # DECIDE: known only if the measurement frame is the robot's base frame")
-    if "camera" in INSTRUMENTS[str(table.model)].options:
-        room = "DECIDE: if it stands in the room, {file: ..., fixed: true}, and frame: unknown"
-        lines.append(f"camera: {_path(cameras[0], folder)}  # {room}")
-    if "offset" in INSTRUMENTS[str(table.model)].options:
-        lines.append("# offset: estimate  # DECIDE whether the instrument adds a constant to every length")
-    if table.skip_lines:
-        lines.append(f"skip_lines: {table.skip_lines}")
-    if table.columns:
-        lines.append(f"columns: {_flow(dict(table.columns))}  # DECIDE whether these are what the names mean")
-    if dict(table.units).items() - units.items():
-        lines.append(f"units: {_flow(dict(table.units))}")
-    if table.unused:
-        lines.append(f"# not used: {printable(', '.join(table.unused))[:90]}")
-    return [("  - " if k == 0 else "    ") + line for k, line in enumerate(lines)]
 
 
 def _path(file: Path, folder: Path) -> str:
