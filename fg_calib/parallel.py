@@ -12,6 +12,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import field
 from functools import cache, wraps
@@ -195,11 +196,8 @@ def map_jobs(
         except Exception as error:  # of the executor, or of what cannot be pickled
             results.append(Failure(named[k], _reason(error)))
     for k in [k for k, result in enumerate(results) if isinstance(result, Failure) and result.reason == DIED]:
-        try:
-            with local_processes(1) as fresh:
-                results[k] = fresh.submit(_call, function, given[k], named[k]).result()
-        except (BrokenExecutor, InputError):
-            pass
+        with suppress(BrokenExecutor, InputError), local_processes(1) as fresh:
+            results[k] = fresh.submit(_call, function, given[k], named[k]).result()
     return results
 
 

@@ -20,17 +20,9 @@ from numpy.typing import ArrayLike
 from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, as_floats, as_rotations, optimize
 from fg_calib.measurements import check_readings
 from fg_calib.prediction.tool_pose import errors_at, predict_poses
-from fg_calib.robot import (
-    Context,
-    Robot,
-    build_chain,
-    context_at,
-    forward,
-    inverse_right_jacobian,
-    rotation_vector,
-    solve_inverse,
-)
-from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse
+from fg_calib.robot import Context, Robot, build_chain, context_at, forward
+from fg_calib.robot.inverse import N_STARTS, REACHED, Inverse, solve_inverse
+from fg_calib.robot.rotations import inverse_right_jacobian, rotation_vector
 from fg_calib.statistics import TangentCovariance
 
 LARGE_CHANGE = 0.1
