@@ -217,10 +217,9 @@ def _call(function: Callable[[T], R], job: T, name: str) -> R | Failure:
     """Call the function on a worker; an exception, which may be impossible to pickle, becomes a failure."""
     try:
         return function(job)
-    except (CalibrationError, MemoryError) as error:
-        return Failure(name, _reason(error))
     except (Exception, SystemExit) as error:
-        return Failure(name, _reason(error), traceback.format_exc())
+        ours = isinstance(error, CalibrationError | MemoryError)
+        return Failure(name, _reason(error), "" if ours else traceback.format_exc())
 
 
 def _reason(error: BaseException) -> str:

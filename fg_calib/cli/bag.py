@@ -51,8 +51,7 @@ def _document(name: str, topics: dict[str, Any], stops: "importers.Stops") -> di
     """The content of the recording for programs: [m], [rad], [s]."""
     found = {"n_found": len(stops.ids) + len(stops.skipped), "n_written": len(stops.ids)}
     offsets = {"offset": stops.offset, "applied_offset": stops.applied}
-    skipped = [s._asdict() for s in stops.skipped]
-    more = {"topics": topics, **offsets, **found, "skipped": skipped, "scatter": stops.scatter}
+    more = {"topics": topics, **offsets, **found, "skipped": stops.skipped, "scatter": stops.scatter}
     return report.plain({"schema": "fg-calib/bag/1", "bag": name, **more})
 
 

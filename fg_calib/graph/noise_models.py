@@ -299,8 +299,7 @@ def whitening_of(covariance: Floats, used: Booleans) -> Floats:
 
 def _over_rows(run: Callable[[slice], None], n: int) -> None:
     """Work on n rows in spans, so that intermediate results stay in the processor's cache."""
-    for _ in over_spans(lambda start, stop: run(slice(start, stop)), n):
-        pass
+    over_spans(lambda start, stop: run(slice(start, stop)), n)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -32,7 +32,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -176,7 +176,7 @@ WINDOW = 4.0
 """Correlation times at which the sum over the lags ends (Sokal)."""
 
 
-class Skipped(NamedTuple):
+class Skipped(inputs.Record):
     """A standstill that gave no row: its name, when it began, [s] from the first joint reading, and why not."""
 
     id: str

@@ -302,9 +302,7 @@ class Result(Section):
         inputs: Mapping[str, str] | None = None,
         job: Mapping[str, Any] | None = None,
         date: str | None = None,
-        history: tuple[Run, ...] = (),
-        notes: tuple[str, ...] = (),
-        effects: tuple[EffectTest, ...] = (),
+        **more: Any,
     ) -> "Result":
         """The result of a solution and its assessment.
 
@@ -314,9 +312,8 @@ class Result(Section):
             inputs: SHA-256 of the files that it was read from, by path.
             job: The document of the job, to read tables like its own.
             date: When its rows were measured; now if None.
-            history: The runs before it.
-            notes: Notes for a reader, a sentence each.
-            effects: What was found of the arm's effects, where it was to be chosen among them.
+            more: Fields as they are: the runs before it (`history`), notes for a reader, a sentence each, and what was
+                found of the arm's `effects`, where it was to be chosen among them.
         """
         problem = solution.problem
         data, urdf, frames = problem.data, problem.robot.urdf, problem.variables.frames
@@ -341,11 +338,8 @@ class Result(Section):
             inputs=dict(inputs or {}),
             date=date or datetime.now(UTC).isoformat(timespec="seconds"),
             about={key: str(text) for key, text in ((job or {}).get("about") or {}).items() if text is not None},
-            history=history,
-            notes=notes,
-            effects=effects,
             carried=_carried(solution, job or {}),
-            **_noise_factors(solution, goodness.kinds),
+            **_noise_factors(solution, goodness.kinds) | more,
         )
         return cls.model_validate(computed)
 

@@ -114,7 +114,7 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
         for first, last, panel in _panels(block, chain, start, stop):
             out[first:last] = panel[:, :, : last - first].transpose(2, 1, 0)
 
-    list(over_spans(run, block.n))
+    over_spans(run, block.n)
     return out[:, :, -1], out[:, :, :-1]
 
 
@@ -152,7 +152,7 @@ def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
             out[first:last] = np.einsum("kn,kn->n", found, found).reshape(panel.shape[1:])[:, : last - first].T
 
     with one_blas_thread:
-        list(over_spans(run, block.n))
+        over_spans(run, block.n)
     return out
 
 

@@ -281,8 +281,7 @@ def forward(chain: Chain, trig: Floats, rows: Integers | None = None) -> Poses:
     def run(start: int, stop: int) -> None:
         walk_all(arrays, trig, rows, start, stop, rotation, position, jacobian)
 
-    for _ in over_spans(run, n):
-        pass
+    over_spans(run, n)
     return Poses(rotation, position, jacobian)
 
 
@@ -357,12 +356,12 @@ SPAN = 8192
 """Rows of one task of the thread pool; a multiple of `LANES`."""
 
 
-def over_spans(run: Callable[[int, int], T], n: int) -> Iterator[T]:
+def over_spans(run: Callable[[int, int], T], n: int) -> list[T]:
     """Results of `run(start, stop)` over fixed spans of `n` rows, in order, on all processors.
 
     The spans do not depend on the number of processors, so neither do sums over them.
     """
-    return over_processors(lambda k: run(k * SPAN, min((k + 1) * SPAN, n)), -(-n // SPAN))
+    return list(over_processors(lambda k: run(k * SPAN, min((k + 1) * SPAN, n)), -(-n // SPAN)))
 
 
 def over_processors(run: Callable[[int], T], n: int) -> Iterator[T]:

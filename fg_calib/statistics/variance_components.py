@@ -161,12 +161,11 @@ def _square_roots(covariance: Floats) -> Floats:
 
 
 @parallel.single_threaded
-def estimate_noise(problem: graph.Problem, options: graph.SolverOptions | None = None) -> graph.Solution:
+def estimate_noise(problem: graph.Problem) -> graph.Solution:
     """Estimate the parameters and, with them, a factor on the specified noise of each kind.
 
     Args:
         problem: The problem; its specified noise is where the factors start from.
-        options: Of the solver.
 
     Returns:
         The solution with the noise it ends with: the factors are in its problem's `state`, the kinds that they
@@ -177,7 +176,7 @@ def estimate_noise(problem: graph.Problem, options: graph.SolverOptions | None =
     """
     kept, seconds, asked = frozenset[graph.NoiseName](), 0.0, set[graph.NoiseName]()
     while True:
-        solution, degrees = _settle(problem, options, kept)
+        solution, degrees = _settle(problem, kept)
         seconds += solution.seconds
         weak = {name: n for name, n in degrees.items() if n < LEAST_REDUNDANCY and name not in asked}
         if not weak:
@@ -185,7 +184,7 @@ def estimate_noise(problem: graph.Problem, options: graph.SolverOptions | None =
         name = min(weak, key=lambda name: weak[name])
         asked.add(name)
         as_specified = _scaled(problem, {**solution.problem.state.factors, name: 1.0})
-        if _is_indeterminate(noise_components(graph.solve(as_specified, options)), name, tuple(degrees)):
+        if _is_indeterminate(noise_components(graph.solve(as_specified)), name, tuple(degrees)):
             problem, kept = as_specified, kept | {name}
             asked = set(kept)
 
@@ -199,7 +198,7 @@ def _is_indeterminate(found: NoiseComponents, name: graph.NoiseName, estimated: 
 
 
 def _settle(
-    problem: graph.Problem, options: graph.SolverOptions | None, kept: frozenset[graph.NoiseName]
+    problem: graph.Problem, kept: frozenset[graph.NoiseName]
 ) -> tuple[graph.Solution, dict[graph.NoiseName, float]]:
     """Solve and scale the noise until its components are as expected.
 
@@ -214,7 +213,7 @@ def _settle(
         now = {name: factors.get(name, 1.0) * factor for name, factor in moved.items()}
         start, weights = (known[-1].parameters, known[-1].problem.state.weights) if known else (None, None)
         begun = replace(problem, state=replace(problem.state, weights=weights)) if weights else problem
-        known.append(graph.solve(_scaled(begun, now), options, start=start))
+        known.append(graph.solve(_scaled(begun, now), start=start))
         found = noise_components(known[-1])
         return known[-1], _steps(found, kept), found
 
