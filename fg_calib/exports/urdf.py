@@ -23,10 +23,13 @@ References:
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
+from jinja2 import Template
 from scipy.spatial.transform import Rotation
 
 from fg_calib.exports.dh import Links, in_table, links_of, transform
@@ -52,6 +55,8 @@ class UrdfJoint(Record):
     child: str
     origin: Floats
 
+
+_TEMPLATE = Path(__file__).with_name("arm.urdf.jinja")
 
 BASE_LINK, FIRST_LINK, TOOL_LINK = "base_link", "link_0", "tool"
 """Links of a new URDF: the base frame, frame 0 and the tool frame; between them stand link_1 to link_n."""
@@ -79,42 +84,26 @@ def new_urdf(robot: Robot, comments: Sequence[str]) -> str:
     Raises:
         InputError: A name has letters that XML cannot hold.
     """
+    template = Template(_TEMPLATE.read_text("utf-8"), trim_blocks=True, keep_trailing_newline=True)
+    functions = {"frame_values": frame_values, "type_and_limit": _type_and_limit, "quoted": quoteattr}
+    text = template.render(robot=robot, joints=urdf_joints(robot), comments=comments, **functions)
     try:
-        root = etree.Element("robot", name=robot.name)
-        etree.SubElement(root, "link", name=BASE_LINK)
-        parent = BASE_LINK
-        for joint in urdf_joints(robot):
-            etree.SubElement(root, "link", name=joint.child)
-            kind, limit = _type_and_limit(joint.moving)
-            element = etree.SubElement(root, "joint", name=joint.name, type=kind)
-            origin = frame_values("origin", joint.origin)
-            xyz, rpy = (" ".join(repr(origin[kind]) for kind in kinds) for kinds in ("xyz", ("roll", "pitch", "yaw")))
-            etree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
-            etree.SubElement(element, "parent", link=parent)
-            etree.SubElement(element, "child", link=joint.child)
-            if joint.moving is not None:
-                etree.SubElement(element, "axis", xyz="0 0 1")
-            if limit:
-                etree.SubElement(element, "limit", limit)
-            parent = joint.child
-    except ValueError:
+        etree.fromstring(text.encode(errors="surrogatepass"))
+    except etree.XMLSyntaxError:
         hint = "rename robot or joint"
         raise InputError(robot.name, "a name with letters that XML cannot hold", "printable names", hint) from None
-    etree.indent(root)
-    lines = [f"<!-- {comment.replace('--', '- -')} -->" for comment in comments]
-    return "\n".join(['<?xml version="1.0"?>', *lines, etree.tostring(root, encoding="unicode"), ""])
+    return text
 
 
-def _type_and_limit(joint: Joint | None) -> tuple[str, dict[str, str]]:
-    """A joint's type, and the attributes of its `<limit>`; nobody has said what effort and velocity it allows."""
+def _type_and_limit(joint: Joint | None) -> tuple[str, tuple[float, ...]]:
+    """A joint's type and its limits if it has any; nobody has said what effort and velocity it allows."""
     if joint is None:
-        return "fixed", {}
+        return "fixed", ()
     if not joint.prismatic and not np.isfinite([joint.lower, joint.upper]).all():
-        return "continuous", {}
+        return "continuous", ()
     farthest = FARTHEST_SLIDE if joint.prismatic else np.inf
-    lower, upper = (repr(float(np.clip(end, -farthest, farthest))) for end in (joint.lower, joint.upper))
-    limit = {"lower": lower, "upper": upper, "effort": "0", "velocity": "0"}
-    return "prismatic" if joint.prismatic else "revolute", limit
+    limits = np.clip([joint.lower, joint.upper], -farthest, farthest).tolist()
+    return "prismatic" if joint.prismatic else "revolute", tuple(limits)
 
 
 # --- ROS and Tesseract ------------------------------------------------------------------------------------------------
