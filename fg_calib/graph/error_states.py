@@ -31,7 +31,7 @@ from scipy.sparse.linalg import splu
 from fg_calib.graph.noise_models import RowNoise, reach, whitening_of
 from fg_calib.inputs import Booleans, Brief, Floats, Integers, Record, SolverError
 from fg_calib.measurements import Block, pack, residuals, unpack
-from fg_calib.robot import SPAN, Chain, over_spans
+from fg_calib.robot import SPAN, Chain, Splines, add_gram, over_spans
 
 Sparse = scipy.sparse.csr_array
 
@@ -166,6 +166,12 @@ class Curves(NamedTuple):
     values: Floats
     sigma: Floats
 
+    def at(self, each: Splines) -> "CurveSplines":
+        """Their splines at configurations, from `Chain.splines`."""
+        knots = np.stack([first + each[joint][0] for joint, first in self.first.items()], axis=1)
+        weights: Floats = np.stack([each[joint][1] for joint in self.first], axis=1)
+        return CurveSplines(np.array(list(self.first)), knots, weights, len(self.sigma))
+
 
 class State(Brief):
     """The arm and the nuisance coordinates at some parameters.
@@ -258,20 +264,26 @@ class WhitenedBlock(Brief):
 
     def linearise(self, at: State) -> Iterator[Floats]:
         """[J r] by all columns, nuisances' among them, chunk by chunk, shape (rows, n_columns + n_nuisance + 1)."""
-        chain, block, n = at.chains[self.table], self.at(at), at.n_columns
-        for start in range(0, block.n, SPAN):
-            chunk = slice(start, start + SPAN)
-            r, J = residuals.linearise(residuals.rows_of(block, chunk), chain)
-            out = np.zeros((*r.shape, n + at.n_nuisance + 1))
-            out[:, :, :n], out[:, :, -1] = J[:, :, :n], r
-            for k, places in enumerate(self.nuisances[chunk].T if at.n_nuisance else ()):
-                rows = np.flatnonzero(at.columns[places] >= 0)
-                out[rows, :, at.columns[places[rows]]] = J[rows, :, n + k]
-            flat = out.reshape(r.size, -1)
-            if at.curves is not None:
-                of_curves = curve_columns(residuals.rows_of(block, chunk), chain, at.curves).sparse()
-                flat[:, n : n + of_curves.shape[1]] = of_curves.toarray()
-            yield flat
+        for rows, turns in self.apart(at):
+            n = at.n_columns
+            yield rows if turns is None else np.hstack([rows[:, :n], turns.loadings.toarray(), rows[:, n:]])
+
+    def apart(self, at: State) -> "Iterator[tuple[Floats, CurveTurns | None]]":
+        """[J r] by all columns but those of error curves, and what joints turn by these, chunk by chunk."""
+        chain, block, plain, n = at.chains[self.table], self.at(at), at.without_curves(), at.n_columns
+        splines = chain.splines(block.trig)
+        of_curves = at.curves and at.curves.at(splines)
+        chain, trig = chain.with_curves_in(block.trig, splines)
+        chain, block = chain if at.curves is None else chain.with_turn_columns(), replace(block, trig=trig)
+        for first, last, panel in residuals.panels(block, chain, 0, block.n):
+            J = panel[:, :, : last - first].transpose(2, 1, 0)  # and, last, r
+            out = np.zeros((*J.shape[:2], n + plain.n_nuisance + 1))
+            out[:, :, :n], out[:, :, -1] = J[:, :, :n], J[:, :, -1]
+            for k, places in enumerate(self.nuisances[first:last].T if plain.n_nuisance else ()):
+                rows = np.flatnonzero(plain.columns[places] >= 0)
+                out[rows, :, plain.columns[places[rows]]] = J[rows, :, k - 1 - block.kind.n_nuisances]
+            turns = of_curves and of_curves.turns(J[:, :, n:], block.ends[first:last], chain.n_joints)
+            yield out.reshape(-1, out.shape[2]), turns
 
     def reduce(self, at: State) -> Iterator[Floats]:
         """Rows with the Gram matrix of [J r], few at a time."""
@@ -284,50 +296,75 @@ class WhitenedBlock(Brief):
         yield out
 
 
-class CurveColumns(NamedTuple):
-    """Derivatives of measurements in the few coefficients of error curves that each depends on.
+class CurveTurns(Brief):
+    """Derivatives of measurements in what joints turn, and of these turns in coefficients of error curves.
 
     Attributes:
-        values: Shape (n, residual_dim, k).
-        columns: Numbers of the coefficients, shape (n, k).
-        n_curves: How many there are.
+        turns: Derivatives in the turns of joints that have a curve, end by end, shape (n, residual_dim, k).
+        knots: Numbers of the coefficients that turns depend on, four each, shape (n, 4 k).
+        weights: Derivatives of the turns in these, shape (n, 4 k).
+        n_curves: Number of coefficients.
     """
 
-    values: Floats
-    columns: Integers
+    turns: Floats
+    knots: Integers
+    weights: Floats
     n_curves: int
 
-    def sparse(self) -> Sparse:
-        """The derivatives row by row, shape (n residual_dim, n_curves)."""
-        n, h, k = self.values.shape
-        places = np.repeat(self.columns, h, axis=0).ravel()
-        out = Sparse((self.values.flatten(), places, np.arange(n * h + 1) * k), shape=(n * h, self.n_curves))
-        out.sum_duplicates()  # in place
-        return out
+    @cached_property
+    def splines(self) -> Sparse:
+        """Derivatives of the turns in the coefficients, shape (n k, n_curves)."""
+        starts = np.arange(0, self.knots.size + 1, 4)
+        return Sparse((self.weights.ravel(), self.knots.ravel(), starts), shape=(len(starts) - 1, self.n_curves))
 
-    def gram(self) -> Floats:
-        """Their Gram matrix, shape (n_curves, n_curves): rows of a measurement depend on the same few coefficients."""
-        n = self.n_curves
-        total = np.zeros(n * n)
-        for some in (slice(start, start + BATCH) for start in range(0, len(self.columns), BATCH)):
-            values, columns = self.values[some], self.columns[some]
-            places = columns[:, :, None] * n + columns[:, None]
-            total += np.bincount(places.ravel(), (values.transpose(0, 2, 1) @ values).ravel(), n * n)
-        return total.reshape(n, n)
+    @property
+    def loadings(self) -> Sparse:
+        """L, derivatives of the rows in the coefficients, shape (n residual_dim, n_curves)."""
+        return Sparse(block_diagonal(self.turns) @ self.splines)
+
+    def times(self, x: Floats) -> Floats:
+        """L x, shape (n residual_dim, m)."""
+        n, h, k = self.turns.shape
+        return (self.turns @ (self.splines @ x).reshape(n, k, x.shape[1])).reshape(n * h, x.shape[1])
+
+    def transposed_times(self, y: Floats) -> Floats:
+        """L^T y, shape (n_curves, m)."""
+        n, h, k = self.turns.shape
+        of_turns = np.swapaxes(self.turns, 1, 2) @ y.reshape(n, h, y.shape[1])
+        return np.asarray(self.splines.T @ of_turns.reshape(n * k, y.shape[1]))
+
+    def among(self, place: Integers, scale: Floats) -> "CurveTurns":
+        """The same in coefficients that are numbered, and measured, in another way."""
+        n = int(place[-1]) + 1
+        return replace(self, knots=place[self.knots], weights=self.weights * scale[self.knots], n_curves=n)
 
 
-def curve_columns(block: Block, chain: Chain, curves: Curves) -> CurveColumns:
-    """Derivatives of a block in the coefficients of error curves: those in joints, times splines."""
-    chain = chain.without_columns().with_turn_columns()
-    J = residuals.linearise(block, chain)[1]
-    columns, values = [np.zeros((block.n, 0), dtype=np.int64)], [J[:, :, :0]]
-    for end, rows in enumerate(block.ends.T):
-        found = chain.splines(block.trig[rows])
-        for joint, first in curves.first.items():
-            knots, weights = found[joint]
-            columns.append(first + knots)
-            values.append(J[:, :, [end * chain.n_joints + joint]] * weights[:, None])
-    return CurveColumns(np.concatenate(values, axis=2), np.hstack(columns), len(curves.sigma))
+class CurveSplines(NamedTuple):
+    """How far joints turn by error curves at some configurations.
+
+    Attributes:
+        joints: The joints that have a curve, shape (k,).
+        knots: Numbers of the coefficients that each turn depends on, shape (n_configurations, k, 4).
+        weights: Its derivatives in these, shape (n_configurations, k, 4).
+        n_curves: Number of coefficients.
+    """
+
+    joints: Integers
+    knots: Integers
+    weights: Floats
+    n_curves: int
+
+    def turns(self, J: Floats, ends: Integers, n_joints: int) -> CurveTurns:
+        """What measurements depend on by error curves.
+
+        Args:
+            J: Derivatives in what each joint turns, end by end, and whatever follows, shape (n, residual_dim, m).
+            ends: Configuration of each end, shape (n, n_ends).
+            n_joints: Number of joints.
+        """
+        places = (np.arange(ends.shape[1])[:, None] * n_joints + self.joints).ravel()
+        knots, weights, shape = self.knots[ends], self.weights[ends], (len(ends), 4 * len(places))
+        return CurveTurns(np.take(J, places, axis=2), knots.reshape(shape), weights.reshape(shape), self.n_curves)
 
 
 class WhitenedRows(Brief):
@@ -356,6 +393,11 @@ class WhitenedRows(Brief):
         """How many degrees of freedom the rows have by `spare` alone: its trace over the rows' covariance."""
         return self.states.trace(self.spare) if self.spare.nnz else 0.0
 
+    def with_readings(self, trigs: Sequence[Floats]) -> "WhitenedRows":
+        """Copy with other readings for the kernels, those of each table."""
+        parts = (replace(part, block=replace(part.block, trig=trigs[part.table])) for part in self.parts)
+        return replace(self, parts=tuple(parts))
+
     def private(self, at: State) -> Floats:
         """[J r] before shared errors are dealt with, shape (n_rows, n_columns + n_nuisance + 1)."""
         empty = np.zeros((0, at.n_columns + at.n_nuisance + 1))
@@ -377,33 +419,44 @@ class WhitenedRows(Brief):
         """Change of each row per 1 sigma of each coefficient of error curves, shape (n_rows, n_curves)."""
         if at.curves is None:
             return Sparse((sum(part.n_rows for part in self.parts), 0))
-        return Sparse(_stacked([of.sparse() for of in self._of_curves(at)]) * at.curves.sigma)
-
-    def _of_curves(self, at: State) -> list[CurveColumns]:
-        assert at.curves is not None
-        return [curve_columns(part.at(at), at.chains[part.table], at.curves) for part in self.parts]
+        each = [turns.loadings for part in self.parts for _, turns in part.apart(at) if turns]
+        return Sparse(_stacked(each) * at.curves.sigma)
 
     def without_curves(self, at: State, variance: float = 1.0) -> Eliminated:
         """The rows with error curves eliminated, where no errors are shared.
 
-        A curve's coefficients, in units of their sigma, are states like others, but with values to linearise at.
+        A curve's coefficients, in units of their sigma, are states like others, but with values to linearise at. Those
+        on which no row depends keep their prior.
 
         Args:
             at: The state.
             variance: Of the rows, in units of that by which they were whitened.
         """
-        curves, y = at.curves, self.private(at.without_curves()) / np.sqrt(variance)
-        assert curves is not None
-        each, scale = self._of_curves(at), curves.sigma / np.sqrt(variance)
-        L, before = Sparse(_stacked([of.sparse() for of in each]) * scale), curves.values / curves.sigma
-        y[:, -1] -= L @ before
-        S = np.eye(len(scale)) + scale[:, None] * sum(of.gram() for of in each) * scale
-        U = scipy.linalg.cholesky(S, overwrite_a=True, check_finite=False)
-        Z = scipy.linalg.cho_solve((U, False), L.T @ y, check_finite=False)
-        rows = _reduced(y.shape[1], [np.concatenate([y - L @ Z, Z])])
-        sigma = curves.sigma[:, None]
-        spread = lambda y: (sigma * scipy.linalg.solve_triangular(U, y.reshape(len(U), -1))).reshape(y.shape)  # noqa: E731
-        own, follow = -U @ (Z[:, -1] + before), -sigma * Z[:, :-1]
+        assert at.curves is not None
+        sigma, before = at.curves.sigma, at.curves.values / at.curves.sigma
+        found = [(y, of) for part in self.parts for y, of in part.apart(at) if of]
+        counts = sum((np.bincount(of.knots.ravel(), None, len(sigma)) for _, of in found), np.zeros(len(sigma)))
+        seen, place, scale = np.flatnonzero(counts), np.cumsum(counts > 0) - 1, sigma / np.sqrt(variance)
+        found = [(y, of.among(place, scale)) for y, of in found]
+        S, b = np.eye(len(seen)), np.zeros((len(seen), at.n_columns + at.n_nuisance + 1 - len(sigma)))
+        for y, of in found:
+            np.divide(y, np.sqrt(variance), out=y)
+            add_gram(np.swapaxes(of.turns, 1, 2) @ of.turns, of.knots, of.weights, S)
+            b += of.transposed_times(y)
+        b[:, -1] += before[seen]
+        C = scipy.linalg.cholesky(S.T, lower=True, overwrite_a=True, check_finite=False)  # in Fortran's order
+        Z = scipy.linalg.cho_solve((C, True), b, check_finite=False)  # last, minus the step
+        own, follow = -before, np.zeros((len(sigma), b.shape[1] - 1))
+        own[seen], follow[seen] = -(Z[:, -1] @ C), -sigma[seen, None] * Z[:, :-1]
+        left = [np.subtract(y, of.times(Z), out=y) for y, of in found]
+        Z[:, -1] -= before[seen]
+        rows = _reduced(b.shape[1], [*left, Z])
+
+        def spread(y: Floats) -> Floats:
+            out = y.reshape(len(sigma), -1).copy()
+            out[seen] = scipy.linalg.solve_triangular(C, out[seen], trans="T", lower=True)
+            return (sigma[:, None] * out).reshape(y.shape)
+
         return Eliminated(own, rows[:, :-1], -rows[:, -1], follow, spread, np.zeros(len(own), dtype=np.bool_))
 
     def posterior_mean(self, at: State) -> Floats:
@@ -454,12 +507,11 @@ def whitened_rows(
 
 
 def _reduced(n: int, chunks: Iterable[Floats]) -> Floats:
-    """Rows with the Gram matrix of those of some chunks, of n columns, at most as many as these."""
-    R = np.zeros((0, n))
+    """Rows with the Gram matrix of those of some chunks, as many as their n columns."""
+    R = np.zeros((n, n), order="F")
     for chunk in chunks:
-        for start in range(0, len(chunk), 4 * SPAN):
-            R = np.vstack([R, chunk[start : start + 4 * SPAN]])
-            R = R if len(R) <= R.shape[1] else np.linalg.qr(R, mode="r")  # type: ignore[assignment]
+        for start in range(0, len(chunk), SPAN):
+            R = residuals.with_rows(R, np.array(chunk[start : start + SPAN], order="F"))
     return R
 
 

@@ -23,11 +23,12 @@ from fg_calib.measurements.kind import Frames, Kind, checked_rows
 from fg_calib.parallel import one_blas_thread
 from fg_calib.robot import LANES, Chain, fill, forward, over_spans, turning_of_base
 
-CHUNK = 512
-"""Measurements in one panel; a multiple of `LANES`."""
+CHUNK = 352
+"""Measurements in one panel; a multiple of `LANES`, but not of 256: its rows would share places in the cache."""
 
-QR_COLUMNS = 8
-"""Columns that are reduced together: of so narrow a panel the fastest, a quarter of the time of `numpy.linalg.qr`."""
+QR_COLUMNS, QR_SHARE = 8, 30
+"""Columns that are reduced together, and of how many more: of narrow panels a quarter of the time of `numpy.linalg.qr`.
+"""
 
 _NOTHING = np.zeros((0, 0)), np.zeros((0, 0, 0, 0)), np.zeros((0, 0, 0))
 """Arrays that `_given` gives for a kind that has a twin."""
@@ -111,7 +112,7 @@ def linearise(block: Block, chain: Chain) -> tuple[Floats, Floats]:
     out = np.empty((block.n, block.residual_dim, n_all))
 
     def run(start: int, stop: int) -> None:
-        for first, last, panel in _panels(block, chain, start, stop):
+        for first, last, panel in panels(block, chain, start, stop):
             out[first:last] = panel[:, :, : last - first].transpose(2, 1, 0)
 
     over_spans(run, block.n)
@@ -125,14 +126,20 @@ def triangle(block: Block, chain: Chain) -> Floats:
 
     def run(start: int, stop: int) -> Floats:
         running = np.zeros((n_all, n_all), order="F")
-        for _, _, panel in _panels(block, chain, start, stop):
+        for _, _, panel in panels(block, chain, start, stop):
             rows = panel.reshape(n_all, -1).T
-            running = lapack.dtpqrt(0, min(QR_COLUMNS, n_all), running, rows, overwrite_a=1, overwrite_b=1)[0]
+            running = with_rows(running, rows)
         return running
 
     with one_blas_thread:
         R: Floats = np.linalg.qr(np.vstack([*over_spans(run, block.n), np.zeros((n_all, n_all))]), mode="r")  # type: ignore[assignment]
     return R
+
+
+def with_rows(R: Floats, rows: Floats) -> Floats:
+    """R of a QR of the rows of R and some more; both, in Fortran's order, are overwritten."""
+    width = min(max(QR_COLUMNS, len(R) // QR_SHARE), len(R))
+    return np.asarray(lapack.dtpqrt(0, width, R, rows, overwrite_a=1, overwrite_b=1)[0])
 
 
 def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
@@ -147,7 +154,7 @@ def squares_along(block: Block, chain: Chain, directions: Floats) -> Floats:
     out, along = np.empty((block.n, block.residual_dim)), np.ascontiguousarray(directions.T)
 
     def run(start: int, stop: int) -> None:
-        for first, last, panel in _panels(block, chain, start, stop):
+        for first, last, panel in panels(block, chain, start, stop):
             found = along @ panel[:-1].reshape(len(panel) - 1, panel[0].size)
             out[first:last] = np.einsum("kn,kn->n", found, found).reshape(panel.shape[1:])[:, : last - first].T
 
@@ -168,10 +175,10 @@ def _n_columns(block: Block, chain: Chain) -> int:
     return chain.n_columns + (kind.ends * chain.n_joints if chain.joint_columns else 0) + kind.n_nuisances
 
 
-def _panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple[int, int, Floats]]:
+def panels(block: Block, chain: Chain, start: int, stop: int) -> Iterator[tuple[int, int, Floats]]:
     """First and last measurement and the panel of each chunk; lanes without a measurement are zero."""
     arrays, twins = chain.arrays, block.kind.twins()
-    size = min(CHUNK, -(-(stop - start) // LANES) * LANES)
+    size = min(CHUNK, -(-max(stop - start, 1) // LANES) * LANES)
     whole = np.zeros((_n_columns(block, chain) + 1, block.residual_dim, size))
     for first in range(start, stop, size):
         last = min(first + size, stop)

@@ -13,12 +13,13 @@ from .effects import (
     outside_joints,
 )
 from .inverse import N_STARTS, REACHED, Inverse, random_readings, solve_inverse
-from .kernels import LANES, fill, whiten_small
+from .kernels import LANES, add_gram, fill, whiten_small
 from .kinematics import (
     SPAN,
     Chain,
     Curve,
     Poses,
+    Splines,
     build_chain,
     forward,
     over_processors,
@@ -106,8 +107,10 @@ __all__ = [
     "Robot",
     "RobotBuilder",
     "Scale",
+    "Splines",
     "Thermal",
     "UrdfSource",
+    "add_gram",
     "build_chain",
     "context_at",
     "cross_matrix",

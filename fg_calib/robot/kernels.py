@@ -328,6 +328,24 @@ def whiten_small(covariances, used, start, stop, out):  # type: ignore[no-untype
     return True
 
 
+@compiled
+def add_gram(products, knots, weights, total):  # type: ignore[no-untyped-def]
+    """Add the Gram matrix of turns times splines, its upper triangle alone.
+
+    Args:
+        products: Gram matrix of each measurement's derivatives in its turns, shape (n, k, k).
+        knots: Numbers of the splines that its turns depend on, four each, shape (n, 4 k).
+        weights: Values of these, shape (n, 4 k).
+        total: What it is added to, shape (n_splines, n_splines).
+    """
+    for i in range(knots.shape[0]):
+        for a in range(knots.shape[1]):
+            for b in range(knots.shape[1]):
+                if knots[i, a] <= knots[i, b]:
+                    product = products[i, a // 4, b // 4] * weights[i, a] * weights[i, b]
+                    total[knots[i, a], knots[i, b]] += product
+
+
 @inlined
 def _gather_whitening(whitening, first, weight):  # type: ignore[no-untyped-def]
     """Whitening of each lane, zero where there is no measurement, once for each component of a wrench."""

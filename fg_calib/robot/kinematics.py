@@ -48,6 +48,10 @@ class Curve(NamedTuple):
     values: Floats
 
 
+Splines = Mapping[int, tuple[Integers, Floats]]
+"""Of each joint that has an error curve what `spline` gives at some readings."""
+
+
 def spline(angle: Floats, n_knots: int) -> tuple[Integers, Floats]:
     """Numbers of the four periodic cubic B-splines that are not zero at angles, and their values, shape (n, 4) each.
 
@@ -58,7 +62,8 @@ def spline(angle: Floats, n_knots: int) -> tuple[Integers, Floats]:
     u = angle * (n_knots / (2.0 * np.pi))
     k = np.floor(u)
     t = u - k
-    pieces = [(1.0 - t) ** 3, 3.0 * t**3 - 6.0 * t**2 + 4.0, -3.0 * t**3 + 3.0 * t**2 + 3.0 * t + 1.0, t**3]
+    s, square = 1.0 - t, t * t
+    pieces = [s * s * s, (3.0 * t - 6.0) * square + 4.0, ((3.0 - 3.0 * t) * t + 3.0) * t + 1.0, t * square]
     return (k.astype(np.int64)[:, None] + np.arange(-1, 3)) % n_knots, np.stack(pieces, axis=1) / 6.0
 
 
@@ -119,11 +124,11 @@ class Chain(Brief):
         """Copy with derivatives in what each joint turns alone: joint columns without slopes of effects."""
         return replace(self, joint_columns=True, joint=np.where(self.basis >= 0, -1, self.joint))
 
-    def with_curves_in(self, trig: Floats) -> "tuple[Chain, Floats]":
-        """The chain without error curves, and readings with them: q + curve(q)."""
-        if not self.curves:
-            return self, trig
-        trig, found = trig.copy(), self.splines(trig)
+    def with_curves_in(self, trig: Floats, splines: "Splines | None" = None) -> "tuple[Chain, Floats]":
+        """The chain without error curves, and readings with them: q + curve(q); `splines` of these if there already."""
+        if not any(curve.values.any() for curve in self.curves):
+            return replace(self, curves=()) if self.curves else self, trig
+        trig, found = trig.copy(), splines or self.splines(trig)
         for curve in self.curves:
             c, s = trig[:, curve.joint].T
             knots, weights = found[curve.joint]
@@ -132,7 +137,7 @@ class Chain(Brief):
             trig[:, curve.joint] = np.stack([cos * c - sin * s, sin * c + cos * s], axis=1)
         return replace(self, curves=()), trig
 
-    def splines(self, trig: Floats) -> dict[int, tuple[Integers, Floats]]:
+    def splines(self, trig: Floats) -> "Splines":
         """Coefficients of each error curve that readings depend on, by joint, and derivatives in them: see `spline`."""
         return {c.joint: spline(np.arctan2(*trig[:, c.joint].T[::-1]), len(c.values)) for c in self.curves}
 
