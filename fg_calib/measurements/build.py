@@ -54,7 +54,7 @@ class Dataset(Brief):
             values: Values of its parameters first, by which loads are found; nominal if None.
         """
         at = robot.nominal if values is None else values[: len(robot.parameters)]
-        key = (tuple(joint.prismatic for joint in robot.joints), robot.effects, at.tobytes() if robot.loads else b"")
+        key = (tuple(joint.prismatic for joint in robot.joints), robot.effects, at[robot.loads].tobytes())
         if key not in self._trigs:
             if robot.loads:
                 self._trigs.clear()

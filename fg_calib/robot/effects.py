@@ -231,45 +231,52 @@ class _Moments:
     def __init__(
         self, robot: Robot, readings: Floats, context: Context, gravity: Floats, masses: Sequence[Mass]
     ) -> None:
-        self.robot, self.readings, self.gravity = robot, readings, gravity
+        self.robot, self.readings = robot, readings
+        self._cross = np.cross(np.eye(3), -gravity)  # times x it is x cross gravity
         ends = [robot.end_of(m.link) for m in masses]
         of_joints = (_moving(robot, j)[0] + k for j in range(robot.n_joints) for k in (0, 1))
         self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
-        each = [np.reshape(context.get(m.column, m.mass), (-1, 1)) for m in masses]
         frames = zip(masses, map(self._frames.__getitem__, ends), strict=True)
-        at = [p + np.einsum("nij,nj->ni", R, np.broadcast_to(m.at(context), p.shape)) for m, (R, p) in frames]
-        self._masses = list(zip(ends, each, at, strict=True))
+        at = [p + sum(x * axis for x, axis in zip(m.at(context).T, axes, strict=True)) for m, (axes, p) in frames]
+        each = [context.get(m.column, m.mass) for m in masses]
+        self._masses = [(end, mass, mass * x) for end, mass, x in zip(ends, each, at, strict=True)]
 
     def of_masses(self, place: int) -> Floats:
         """Of the masses beyond an element, about the origin of the frame before it, shape (n, 3), [N m]."""
-        R, p = self._frames[place]
-        total = sum((mass * (at - p) for end, mass, at in self._masses if end > place), np.zeros(p.shape))
-        return np.einsum("nji,nj->ni", R, np.cross(total, self.gravity), dtype=np.float64)
+        axes, p = self._frames[place]
+        beyond = [(mass, first) for end, mass, first in self._masses if end > place]
+        return self._along(axes, sum(first for _, first in beyond) - sum(mass for mass, _ in beyond) * p)
 
     def of_unit(self, place: int, joint: int, axis: int) -> Floats:
         """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2].
 
         Along the axis of a slide it is that of a unit mass, in proportion to the reading.
         """
-        R, (i, e) = self._frames[place][0], _moving(self.robot, joint)
-        u = self._frames[i + 1][0][:, :, axis] * (self.readings[:, [joint]] if axis == e.axis else 1.0)
-        return np.einsum("nji,nj->ni", R, np.cross(u, self.gravity), dtype=np.float64)
+        i, e = _moving(self.robot, joint)
+        u = self._frames[i + 1][0][axis] * (self.readings[:, joint] if axis == e.axis else 1.0)
+        return self._along(self._frames[place][0], u)
+
+    def _along(self, axes: Sequence[Floats], first: Floats) -> Floats:
+        """Moments of gravity along axes, shape (n, 3), of first moments, shape (3, n)."""
+        moment = self._cross @ first
+        return np.stack([np.sum(axis * moment, axis=0) for axis in axes], axis=1)
 
 
-def _frames(robot: Robot, readings: Floats, wanted: Collection[int]) -> dict[int, tuple[Floats, Floats]]:
-    """Rotation (n, 3, 3) and origin (n, 3) before some elements of a chain without effects."""
-    R, p, nominal, found = np.tile(np.eye(3), (len(readings), 1, 1)), np.zeros((len(readings), 3)), robot.nominal, {}
+def _frames(robot: Robot, readings: Floats, wanted: Collection[int]) -> dict[int, tuple[list[Floats], Floats]]:
+    """Axes and origin, shape (3, n) each, of the frames before some elements of a chain without effects."""
+    n, nominal, found = len(readings), robot.nominal, {}
+    axes, p = [np.repeat(axis[:, None], n, axis=1) for axis in np.eye(3)], np.zeros((3, n))
     for i, e in enumerate((*robot.elements, Element(Axis.TX))):
         if i in wanted:
-            found[i] = R.copy(), p.copy()
-        value = np.zeros(len(readings)) if e.joint is None else readings[:, e.joint]
-        value = (e.constant + e.sign * (value + (0.0 if e.parameter is None else nominal[e.parameter])))[:, None]
+            found[i] = axes.copy(), p
+        reading = 0.0 if e.joint is None else readings[:, e.joint]
+        value = e.constant + e.sign * (reading + (0.0 if e.parameter is None else nominal[e.parameter]))
         if e.axis < Axis.RX:
-            p += value * R[:, :, e.axis]
+            p = p + value * axes[e.axis]
         else:
             x, y = ((e.axis + k) % 3 for k in (1, 2))
             c, s = np.cos(value), np.sin(value)
-            R[:, :, x], R[:, :, y] = c * R[:, :, x] + s * R[:, :, y], c * R[:, :, y] - s * R[:, :, x]
+            axes[x], axes[y] = c * axes[x] + s * axes[y], c * axes[y] - s * axes[x]
     return found
 
 

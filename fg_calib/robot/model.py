@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from enum import IntEnum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -426,9 +426,10 @@ class Robot(inputs.Record):
         return tuple(tuple(t for t in e.terms(self.geometry) if t.after is not None) for e in self.effects)
 
     @cached_property
-    def loads(self) -> bool:
-        """Whether effects follow loads, which depend on parameters: on lengths, and on how joints give way."""
-        return any(effect.by_loads for effect in self.effects)
+    def loads(self) -> list[int]:
+        """Indices of the parameters that loads depend on: those of the arm, and how joints give way; none without."""
+        each = enumerate(self.parameters) if any(effect.by_loads for effect in self.effects) else ()
+        return [i for i, p in each if p.owner <= self.n_joints and p.kind != "curve"]
 
     def trig(self, readings: Floats, context: Context | None = None, values: Floats | None = None) -> Floats:
         """Joint readings as the kernels take them, shape (n, n_joints + n_terms, 2).
@@ -457,11 +458,11 @@ class Robot(inputs.Record):
         if prismatic.any():
             trig[:, prismatic, 0], trig[:, prismatic, 1] = np.asarray(readings)[:, prismatic], 0.0
         values, parts, readings = self._nominal if values is None else values, [trig], np.asarray(readings)
-        arm = self.geometry
+        arm, names = self.geometry, names_of(self.parameters)
         loaded = arm.with_values(values[: len(arm.parameters)]) if self.loads else arm
         for effect, terms in zip(self.effects, self.terms, strict=True):
             if terms:
-                at = np.array([values[self.index(t.name)] if t.name else 1.0 for t in terms])
+                at = np.array([values[names.index(t.name)] if t.name else 1.0 for t in terms])
                 parts.append(effect.values(loaded if effect.by_loads else arm, readings, context or {}, at))
         return np.concatenate(parts, axis=1) if len(parts) > 1 else trig
 
@@ -898,6 +899,7 @@ def names_of(parameters: Iterable[Parameter]) -> list[str]:
     return [p.name for p in parameters]
 
 
+@lru_cache(4096)
 def kind_of(name: str) -> str:
     """The kind in the name of a parameter: `alpha3`, `elbow.yaw`, `theta2.sin1`, `theta2.curve[17]`, `q2.zero`."""
     kind = re.match("[a-z]+", name.rpartition(".")[2])
