@@ -155,9 +155,8 @@ class Problem(FrozenArrays):
         """The rows with error curves, then landmarks, eliminated."""
         v, variance = self.variables, loss_variance(self) if with_loss else 1.0
         found = self._curve_roots(parameters.tobytes(), variance)
-        r, J = unknown_prior_rows(v, parameters)
-        n, of_curves = v.n_columns, v.n_curves
-        others = np.column_stack([np.delete(J, np.s_[n : n + of_curves], axis=1), r])[of_curves:]
+        (r, J), n = unknown_prior_rows(v, parameters, of_curves=False), v.n_columns
+        others = np.column_stack([np.delete(J, np.s_[n : n + v.n_curves], axis=1), r])
         return eliminate_more(found, others, n)
 
     @cached_property
@@ -395,12 +394,19 @@ def relinearized_at(problem: Problem, parameters: Floats, state: NoiseState | No
         parameters: The parameter vector.
         state: Estimated noise; None for what the problem has.
     """
-    same = not problem.robot.loads and all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
+    same = all(same_everywhere(s, problem.data.sigma_joint) for s in problem.data.blocks)
     if (state is None or state is problem.state) and same:
-        started = replace(problem, start=parameters)
-        vars(started).update(_square_roots=problem._square_roots, _curve_roots=problem._curve_roots)
-        return started
+        return loaded_at(problem, parameters)
     return with_factors(problem, parameters, state)
+
+
+def loaded_at(problem: Problem, parameters: Floats) -> Problem:
+    """Start a problem at other parameters, its rows whitened as they are, with loads as they are there."""
+    started = replace(problem, start=parameters)
+    if problem.robot.loads:
+        return replace(started, rows=problem.rows.with_readings(problem.data.trigs(problem.robot, parameters)))
+    vars(started).update(_square_roots=problem._square_roots, _curve_roots=problem._curve_roots)
+    return started
 
 
 def subsampled(problem: Problem, share: float, parameters: Floats | None = None) -> Problem:
@@ -518,16 +524,13 @@ def correlation(problem: Problem, parameters: Floats) -> Floats | None:
 
 def frames_only(problem: Problem) -> Problem | None:
     """Keep the arm nominal: estimate measurement frame, base and tool alone; None if none is estimated."""
-    robot, n = problem.robot, problem.robot.n_joints
-    frames = [p.name for p in robot.parameters if p.estimated and not 1 <= p.owner <= n]
-    if not frames and not problem.variables.frames:
+    variables = variables_of(problem.robot, problem.data, problem.options, arm=False)
+    if not variables.items:
         return None
-    robot = robot.with_estimated(frames)
-    variables = variables_of(robot, problem.data, problem.options)
     options = replace(problem.options, encoder="propagated", pair_errors="independent")  # good enough for a start
     start = problem.start[: variables.nuisance_span.stop]
     alone = replace(problem, added=(), knowledge=None, whole=None)
-    return with_factors(alone, start, robot=robot, variables=variables, options=options)
+    return with_factors(alone, start, variables=variables, options=options)
 
 
 def with_curves_held(problem: Problem, parameters: Floats) -> Problem:
@@ -538,10 +541,10 @@ def with_curves_held(problem: Problem, parameters: Floats) -> Problem:
     return with_factors(problem, parameters, robot=robot, variables=variables, whole=whole)
 
 
-def variables_of(robot: Robot, data: Dataset, options: Options) -> Variables:
-    """The variables of a robot, its measurement frames and the measurements' unknowns."""
-    frames = [table.unknown_frame for table in data.tables]
-    return build_variables(robot, frames, options.has_priors).with_unknowns(data.landmarks, data.estimated())
+def variables_of(robot: Robot, data: Dataset, options: Options, *, arm: bool = True) -> Variables:
+    """The variables of a robot, its measurement frames and the measurements' unknowns; those of joints if `arm`."""
+    variables = build_variables(robot, [table.unknown_frame for table in data.tables], options.has_priors, arm=arm)
+    return variables.with_unknowns(data.landmarks, data.estimated())
 
 
 def tables_of(measurements: Tables, options: Options) -> tuple[Table, ...]:

@@ -25,6 +25,7 @@ from fg_calib.graph.normal_system import NormalSystem
 from fg_calib.graph.problem import (
     Problem,
     frames_only,
+    loaded_at,
     mahalanobis_distances,
     noises_at,
     relinearized_at,
@@ -272,7 +273,8 @@ class _Point(Record):
 
     def after(self, step: Floats) -> "_Point":
         """The point after a tangent step."""
-        return replace(self, parameters=self.problem.variables.moved(self.parameters, step))
+        parameters = self.problem.variables.moved(self.parameters, step)
+        return _Point(loaded_at(self.problem, parameters), parameters)
 
     def descend(self, damping: float) -> "tuple[_Point, float, float] | None":
         """Take the next step, undamped if that keeps what it promises: the point, its damping, and the next one.
@@ -337,7 +339,7 @@ def _fit(problem: Problem, options: SolverOptions) -> Solution:
     """
     weighted, history, damping, tries = problem.state.weights is not None, list[Iteration](), FIRST_DAMPING, 0
     weighting = Weighting(problem.options.loss, final=weighted)
-    start = problem.variables.parameters(problem.variables.values(problem.start))  # what is held is at nominal
+    start = problem.variables.with_held(problem.start)
     if problem.options.loss != "none" and not weighted:
         problem = relinearized_at(problem, start, _learn(problem, start, weighting)[0])
     here, converged, message, share = _Point(problem, start), False, "", 1.0

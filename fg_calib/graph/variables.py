@@ -180,7 +180,7 @@ class Variables(Brief):
             scales[v.columns][[_ALONG_TANGENT.index(k) if v.is_pose else k for k in with_prior]] = 1.0 / weight
         return scales
 
-    @property
+    @cached_property
     def all_scales(self) -> Floats:
         """`scales`, then those of the nuisance columns, shape (n_columns + n_nuisance,)."""
         return np.concatenate([self.scales, *(v.scales for v in self.nuisance)])
@@ -218,6 +218,13 @@ class Variables(Brief):
             else:
                 parameters[of_v] = values.atVector(v.key)
         return parameters
+
+    def with_held(self, parameters: Floats) -> Floats:
+        """A parameter vector with what is no variable at its nominal value."""
+        held = self.nominal()
+        for v in self.items + self.nuisance:
+            held[v.places] = parameters[v.places]
+        return held
 
     def moved(self, parameters: Floats, step: Floats) -> Floats:
         """The parameter vector after a tangent step of the core, or of all variables; angles of poses stay near."""
@@ -332,13 +339,14 @@ class Variables(Brief):
         return D
 
 
-def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -> Variables:
+def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True, *, arm: bool = True) -> Variables:
     """The variables of a robot's estimated parameters, and of the measurement frames that are unknown.
 
     Args:
         robot: The robot.
         frames: Of each table, whether its measurement frame is unknown.
         priors: Whether the robot's tolerances are priors.
+        arm: Whether those of joints are among them; else base and tool alone.
     """
     items, names, n = list[Variable](), list[str](), len(robot.parameters)
 
@@ -347,7 +355,7 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
         names.extend(of)
         items.append(Variable(gtsam.symbol(letter, number), kind, tuple(places), span))
 
-    for owner in range(robot.n_joints + 2):
+    for owner in range(robot.n_joints + 2) if arm else (0, robot.n_joints + 1):
         chosen = [i for i in robot.owned_by(owner) if robot.parameters[i].estimated]
         of = names_of(robot.parameters[i] for i in chosen)
         if len(chosen) == 6 and owner == 0:
@@ -373,7 +381,8 @@ def build_variables(robot: Robot, frames: Sequence[bool], priors: bool = True) -
         later = poses[frame].parameters[0] - n if there else -n
         source = np.where(chain.source >= n, chain.source + later, chain.source)
         chains.append(replace(chain, source=source, n_columns=len(names)))
-    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors, _curves(robot, len(names)))
+    curves = _curves(robot, len(names)) if arm else ()
+    return Variables(robot, tuple(items), tuple(names), tuple(chains), priors, curves)
 
 
 def _curves(robot: Robot, column: int) -> tuple[Variable, ...]:
@@ -485,9 +494,10 @@ def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
     return np.concatenate([frame[:3] - nominal[:3], turn[::-1]]), D
 
 
-def unknown_prior_rows(variables: Variables, parameters: Floats) -> tuple[Floats, Floats]:
-    """Whitened priors of the measurements' unknowns and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
-    found = [(v, *v.prior) for v in variables.nuisance if v.prior is not None]
+def unknown_prior_rows(variables: Variables, parameters: Floats, *, of_curves: bool = True) -> tuple[Floats, Floats]:
+    """Whitened priors of nuisance variables and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
+    chosen = (v for v in variables.nuisance if of_curves or v.kind != "curve")
+    found = [(v, *v.prior) for v in chosen if v.prior is not None]
     columns = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v, _, _ in found)])
     x = np.concatenate([np.zeros(0), *(parameters[v.places] - mean for v, mean, _ in found)])
     sigma = np.concatenate([np.ones(0), *(s for _, _, s in found)])

@@ -9,40 +9,46 @@ from touches import corners, touch
 from fg_calib import Options, build_problem, solve
 from fg_calib.graph import NormalSystem, prior_rows, unknown_prior_rows
 from fg_calib.graph.normal_system import eliminate_more
-from fg_calib.graph.problem import square_root
+from fg_calib.graph.problem import loaded_at, with_factors
 from fg_calib.robot import Compliance, ErrorCurve, Mass
 
 EFFECTS = (ErrorCurve([2, 3], knots=8, sigma=1e-3), Compliance([Mass(3, 10.0, (0.2, 0.0, 0.1))], [2, 3]))
 
 
-def problem_of(model="position", n=40, seed=0):
-    """An arm with error curves and compliance, measured."""
+def problem_of(model="position", n=40, seed=0, reach=2.5, **options):
+    """An arm with error curves and compliance, measured where joints are within some angle of zero."""
     rng = np.random.default_rng(seed)
     robot = arm_with(*EFFECTS)
     true = within_tolerance(robot, rng)
-    data = measure_points(true, rng.uniform(-2.5, 2.5, (n, 4)), rng)
-    return build_problem(robot, data, Options(model=model, gauge="prior")), true
+    data = measure_points(true, rng.uniform(-reach, reach, (n, 4)), rng)
+    return build_problem(robot, data, Options(model=model, gauge="prior", **options)), true
 
 
-def dense(problem, x):
-    """The normal system without the sparse elimination."""
-    v = problem.variables
-    r, J = prior_rows(v, x)
-    return NormalSystem(square_root(problem, x), v.n_columns, v.prior_scales, np.column_stack([J, r]))
-
-
-def test_sparse_elimination_gives_the_dense_system():
-    problem, _ = problem_of()
-    x = problem.start.copy()
+@pytest.mark.parametrize(
+    ("model", "reach", "variance"), [("position", 2.5, 1.0), ("position", 0.6, 1.7), ("distance", 0.6, 1.7)]
+)
+def test_sparse_elimination_gives_the_dense_system(model, reach, variance):
+    problem, _ = problem_of(model, reach=reach, pair_errors="independent")  # some knots are out of reach
+    v, x = problem.variables, problem.start.copy()
     x[: len(problem.robot.parameters)] += 1e-4 * np.random.default_rng(1).normal(size=len(problem.robot.parameters))
-    found, expected = problem.linearize(x), dense(problem, x)
+    priors, own = (np.column_stack(of(v, x)[::-1]) for of in (prior_rows, unknown_prior_rows))
+    rows = np.vstack([own, problem.rows.square_root(v.at(x)) / np.sqrt(variance)])
+    left = eliminate_more(problem.rows.without_curves(v.at(x), variance), np.zeros((0, v.n_columns + 1)), v.n_columns)
+    found, expected = (NormalSystem(of, v.n_columns, v.prior_scales, priors) for of in (left, rows))
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
     assert found.decrement == pytest.approx(expected.decrement, rel=1e-9)
     sigma = np.linalg.norm(expected.full_root, axis=1)
     assert found.step / sigma == pytest.approx(expected.step / sigma, abs=1e-6)  # [sigma]
     C, D = (s.full_root @ s.full_root.T / np.outer(sigma, sigma) for s in (found, expected))
     assert pytest.approx(D, abs=1e-8) == C
-    assert np.array_equal(found.left.follow.shape, expected.left.follow.shape)
+
+
+def test_a_point_has_the_loads_of_its_parameters():
+    problem, true = problem_of()
+    x = np.concatenate([true.nominal, problem.start[len(true.nominal) :]])
+    cost = with_factors(problem, x).system.cost
+    assert loaded_at(problem, x).system.cost == pytest.approx(cost, rel=1e-12)
+    assert problem.linearize(x).cost != pytest.approx(cost, rel=1e-6)
 
 
 @pytest.mark.parametrize("model", ["position", "distance"])
@@ -70,20 +76,6 @@ def test_curves_and_compliance_are_within_their_sigmas():
         e, root = errors_of_all(solve(problem), true)
         squares.append(e @ np.linalg.pinv(root @ root.T, rcond=1e-12) @ e / root.shape[1])
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (6 * root.shape[1])))  # 4 sigma of the mean
-
-
-def test_rows_of_more_variance_count_for_less():
-    problem, _ = problem_of()
-    v, x = problem.variables, problem.start
-    r, J = prior_rows(v, x)
-    own_r, own_J = unknown_prior_rows(v, x)
-    rows = np.vstack([np.column_stack([own_J, own_r]), problem.rows.square_root(v.at(x)) / np.sqrt(1.7)])
-    expected = NormalSystem(rows, v.n_columns, v.prior_scales, np.column_stack([J, r]))
-    left = eliminate_more(problem.rows.without_curves(v.at(x), 1.7), np.zeros((0, v.n_columns + 1)), v.n_columns)
-    found = NormalSystem(left, v.n_columns, v.prior_scales, np.column_stack([J, r]))
-    sigma = np.linalg.norm(expected.full_root, axis=1)
-    assert found.step / sigma == pytest.approx(expected.step / sigma, abs=1e-6)
-    assert np.linalg.norm(found.full_root, axis=1) == pytest.approx(sigma, rel=1e-8)
 
 
 def test_points_in_contact_and_distances_between_them_tell_curves():
