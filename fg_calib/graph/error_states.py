@@ -258,6 +258,10 @@ class WhitenedBlock(Brief):
         one = slice(k, k + 1)
         return replace(self, block=residuals.rows_of(self.block, one), nuisances=self.nuisances[one])
 
+    def weighed(self, weight: float) -> "WhitenedBlock":
+        """Copy whose measurements count for so many times as much."""
+        return replace(self, block=replace(self.block, whitening=self.block.whitening * np.sqrt(weight)))
+
     def at(self, at: State) -> Block:
         """The block with its nuisances' values."""
         return replace(self.block, nuisances=at.coordinates[self.nuisances]) if self.nuisances.size else self.block
@@ -434,13 +438,12 @@ class WhitenedRows(Brief):
         """
         assert at.curves is not None
         sigma, before = at.curves.sigma, at.curves.values / at.curves.sigma
-        found = [(y, of) for part in self.parts for y, of in part.apart(at) if of]
+        found = [(y, of) for part in self.parts for y, of in part.weighed(1.0 / variance).apart(at) if of]
         counts = sum((np.bincount(of.knots.ravel(), None, len(sigma)) for _, of in found), np.zeros(len(sigma)))
-        seen, place, scale = np.flatnonzero(counts), np.cumsum(counts > 0) - 1, sigma / np.sqrt(variance)
-        found = [(y, of.among(place, scale)) for y, of in found]
+        seen, place = np.flatnonzero(counts), np.cumsum(counts > 0) - 1
+        found = [(y, of.among(place, sigma)) for y, of in found]
         S, b = np.eye(len(seen)), np.zeros((len(seen), at.n_columns + at.n_nuisance + 1 - len(sigma)))
         for y, of in found:
-            np.divide(y, np.sqrt(variance), out=y)
             add_gram(np.swapaxes(of.turns, 1, 2) @ of.turns, of.knots, of.weights, S)
             b += of.transposed_times(y)
         b[:, -1] += before[seen]

@@ -225,6 +225,10 @@ def outside_joints(robot: Robot) -> dict[str, Joint]:
     return {hinge.joint.name: hinge.joint for m in masses for hinge in m.hinges}
 
 
+ACROSS = slice(2)
+"""The axes of a joint's frame across its own, which is z."""
+
+
 class _Moments:
     """Moments of gravity about the origins of some joints' frames, in these frames just before they turn."""
 
@@ -241,23 +245,23 @@ class _Moments:
         each = [context.get(m.column, m.mass) for m in masses]
         self._masses = [(end, mass, mass * x) for end, mass, x in zip(ends, each, at, strict=True)]
 
-    def of_masses(self, place: int) -> Floats:
-        """Of the masses beyond an element, about the origin of the frame before it, shape (n, 3), [N m]."""
+    def of_masses(self, place: int, which: slice) -> Floats:
+        """Of the masses beyond an element, about some axes of the frame before it, shape (n, n_axes), [N m]."""
         axes, p = self._frames[place]
         beyond = [(mass, first) for end, mass, first in self._masses if end > place]
-        return self._along(axes, sum(first for _, first in beyond) - sum(mass for mass, _ in beyond) * p)
+        return self._along(axes[which], sum(first for _, first in beyond) - sum(mass for mass, _ in beyond) * p)
 
     def of_unit(self, place: int, joint: int, axis: int) -> Floats:
-        """Of a unit first moment along an axis of the frame that a joint turns, shape (n, 3), [m/s^2].
+        """Of a unit first moment along an axis of the frame that a joint turns, about z, shape (n, 1), [m/s^2].
 
         Along the axis of a slide it is that of a unit mass, in proportion to the reading.
         """
         i, e = _moving(self.robot, joint)
         u = self._frames[i + 1][0][axis] * (self.readings[:, joint] if axis == e.axis else 1.0)
-        return self._along(self._frames[place][0], u)
+        return self._along(self._frames[place][0][2:], u)
 
     def _along(self, axes: Sequence[Floats], first: Floats) -> Floats:
-        """Moments of gravity along axes, shape (n, 3), of first moments, shape (3, n)."""
+        """Moments of gravity along axes, shape (n, n_axes), of first moments, shape (3, n)."""
         moment = self._cross @ first
         return np.stack([np.sum(axis * moment, axis=0) for axis in axes], axis=1)
 
@@ -266,7 +270,7 @@ def _frames(robot: Robot, readings: Floats, wanted: Collection[int]) -> dict[int
     """Axes and origin, shape (3, n) each, of the frames before some elements of a chain without effects."""
     n, nominal, found = len(readings), robot.nominal, {}
     axes, p = [np.repeat(axis[:, None], n, axis=1) for axis in np.eye(3)], np.zeros((3, n))
-    for i, e in enumerate((*robot.elements, Element(Axis.TX))):
+    for i, e in enumerate((*robot.elements, Element(Axis.TX))[: max(wanted) + 1]):
         if i in wanted:
             found[i] = axes.copy(), p
         reading = 0.0 if e.joint is None else readings[:, e.joint]
@@ -384,7 +388,7 @@ class Compliance(_Loaded, Record):
         parts = [self._torques(robot, readings, context, joints, gravity)]
         if self.lateral and self.masses is not None:
             moments = _Moments(robot, readings, context, gravity, self.masses)
-            parts += [moments.of_masses(_moving(robot, i)[0])[:, :2] for i in joints]
+            parts += [moments.of_masses(_moving(robot, i)[0], ACROSS) for i in joints]
         return np.hstack(parts)
 
     def _torques(
@@ -395,9 +399,9 @@ class Compliance(_Loaded, Record):
         for i in joints:
             place, e = _moving(robot, i)
             each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
-            each = each or [moments.of_masses(place)]
-            columns += [e.sign * m[:, 2] for m in each]
-        return np.stack(columns, axis=1)
+            each = each or [moments.of_masses(place, slice(2, 3))]
+            columns += [e.sign * m for m in each]
+        return np.hstack(columns)
 
 
 class Bending(_Loaded, Record):
@@ -418,7 +422,7 @@ class Bending(_Loaded, Record):
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         moments = _Moments(robot, readings, context, np.array(self.gravity), self.masses)
-        return _with_slopes(moments.of_masses(robot.end_of(0))[:, :2])
+        return _with_slopes(moments.of_masses(robot.end_of(0), ACROSS))
 
 
 class Backlash(_Loaded, Record):
