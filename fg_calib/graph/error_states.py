@@ -462,6 +462,15 @@ class WhitenedRows(Brief):
 
         return Eliminated(own, rows[:, :-1], -rows[:, -1], follow, spread, np.zeros(len(own), dtype=np.bool_))
 
+    def with_curves_held(self, at: State) -> Eliminated:
+        """The rows with error curves held, and these curves' priors in a last row."""
+        assert at.curves is not None
+        R, n = self.square_root(at.without_curves()), len(at.curves.sigma)
+        b = np.append(-R[:, -1], np.linalg.norm(at.curves.values / at.curves.sigma))
+        A, follow = np.pad(R[:, :-1], ((0, 1), (0, 0))), np.zeros((n, R.shape[1] - 1))
+        spread = lambda y: np.zeros((n, *y.shape[1:]))  # noqa: E731
+        return Eliminated(np.zeros(0), A, b, follow, spread, np.zeros(n, dtype=np.bool_))
+
     def posterior_mean(self, at: State) -> Floats:
         """Posterior mean of the error states, shape (n_configurations, n_slots), [sigma]."""
         r = self.private(at.without_columns())[:, -1:]

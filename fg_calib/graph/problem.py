@@ -128,12 +128,13 @@ class Problem(FrozenArrays):
         """The normal system at `start`."""
         return self.linearize(self.start)
 
-    def linearize(self, parameters: Floats, *, with_loss: bool = False) -> NormalSystem:
+    def linearize(self, parameters: Floats, *, with_loss: bool = False, held: bool = False) -> NormalSystem:
         """The normal system at a parameter vector: all train rows, priors and added factors.
 
         Args:
             parameters: The parameter vector.
             with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
+            held: Whether error curves stay as they are, where no errors are shared and nothing was added.
 
         Raises:
             SolverError: A residual or derivative is not finite.
@@ -143,7 +144,7 @@ class Problem(FrozenArrays):
         if not v.n_curves or given.states.n_states or self.has_more:
             rows: Floats | Eliminated = square_root(self, parameters, with_loss=with_loss)
         else:
-            rows = self._without_curves(parameters, with_loss)
+            rows = self._without_curves(parameters, with_loss, held)
         with np.errstate(over="ignore"):
             size = rows if isinstance(rows, np.ndarray) else rows.A
             if not np.isfinite(np.vdot(size, size) + np.vdot(priors, priors)):
@@ -151,10 +152,10 @@ class Problem(FrozenArrays):
         gather = lambda: given.private(v.at(parameters))  # noqa: E731 -- for statistics of single rows alone
         return NormalSystem(rows, v.n_columns, v.prior_scales, priors, self.rows.states, gather)
 
-    def _without_curves(self, parameters: Floats, with_loss: bool) -> Eliminated:
+    def _without_curves(self, parameters: Floats, with_loss: bool, held: bool) -> Eliminated:
         """The rows with error curves, then landmarks, eliminated."""
         v, variance = self.variables, loss_variance(self) if with_loss else 1.0
-        found = self._curve_roots(parameters.tobytes(), variance)
+        found = self._curve_roots(parameters.tobytes(), variance, held)
         (r, J), n = unknown_prior_rows(v, parameters, of_curves=False), v.n_columns
         others = np.column_stack([np.delete(J, np.s_[n : n + v.n_curves], axis=1), r])
         return eliminate_more(found, others, n)
@@ -274,12 +275,15 @@ class Problem(FrozenArrays):
         return lru_cache(N_REMEMBERED)(lambda x: rows.square_root(variables.at(np.frombuffer(x))))
 
     @cached_property
-    def _curve_roots(self) -> Callable[[bytes, float], Eliminated]:
-        """The same with error curves eliminated, where no errors are shared; and with so many times the variance."""
-        rows, variables = self.rows, self.variables
-        return lru_cache(N_REMEMBERED)(
-            lambda x, variance: rows.without_curves(variables.at(np.frombuffer(x)), variance)
-        )
+    def _curve_roots(self) -> Callable[[bytes, float, bool], Eliminated]:
+        """The same with error curves eliminated, or held, where no errors are shared, at so many times the variance."""
+        rows, at = self.rows, self.variables.at
+
+        def roots(x: bytes, variance: float, held: bool) -> Eliminated:
+            state = at(np.frombuffer(x))
+            return rows.with_curves_held(state) if held else rows.without_curves(state, variance)
+
+        return lru_cache(N_REMEMBERED)(roots)
 
 
 def with_factors(problem: Problem, start: Floats, state: NoiseState | None = None, **changes: Any) -> Problem:

@@ -175,9 +175,9 @@ class Solution(FrozenArrays):
 def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDArray[Any] | None = None) -> Solution:
     """Estimate the parameters.
 
-    First measurement frame, base and tool alone with the arm at nominal, then everything; of very many measurements at
-    first some, drawn evenly, whose steps are not counted. Near the optimum rows are whitened anew after every step, and
-    robust weights follow from the residuals there.
+    First measurement frame, base and tool alone with the arm at nominal, then a step of all but error curves, then
+    everything; of very many measurements at first some, drawn evenly, whose steps are not counted. Near the optimum
+    rows are whitened anew after every step, and robust weights follow from the residuals there.
 
     Args:
         problem: The problem, with what was added to its graph.
@@ -194,12 +194,17 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
     with one_blas_thread:
         before = _fit_frames(problem, options) if start is None else np.asarray(start, dtype=np.float64)
         problem = relinearized_at(problem, before) if before is not problem.start else problem
-        run = _fit(_started_by_few(problem, options), options)
+        begun = _started_by_few(problem, options)
+        if problem.variables.n_curves and problem.options.loss == "none":
+            begun = relinearized_at(begun, take_steps(begun, 1, held=True))
+        run = _fit(begun, options)
         state, variables, cost = run.problem.state, run.problem.variables, run.cost
         parameters = variables.parameters(variables.values(run.parameters))  # angles in usual range
         if state.weights is not None:
             cost = relinearized_at(run.problem, parameters, replace(state, weights=None)).system.cost
-        found = replace(run, parameters=parameters, before=before, initial_cost=problem.system.cost, cost=cost)
+        found = replace(
+            run, parameters=parameters, before=before, initial_cost=problem.linearize(before, held=True).cost, cost=cost
+        )
         return replace(found, seconds=time.perf_counter() - clock)
 
 
@@ -245,16 +250,18 @@ class _Point(Record):
     Attributes:
         problem: The problem.
         parameters: The parameter vector.
+        held: Whether error curves are held.
     """
 
     problem: Problem
     parameters: Floats
+    held: bool = False
 
     @cached_property
     def system(self) -> NormalSystem:
         """The normal system."""
         try:
-            return self.problem.linearize(self.parameters)
+            return self.problem.linearize(self.parameters, held=self.held)
         except CalibrationError:
             raise
         except Exception as error:  # of LAPACK or an added factor
@@ -274,7 +281,7 @@ class _Point(Record):
     def after(self, step: Floats) -> "_Point":
         """The point after a tangent step."""
         parameters = self.problem.variables.moved(self.parameters, step)
-        return _Point(loaded_at(self.problem, parameters), parameters)
+        return _Point(loaded_at(self.problem, parameters), parameters, self.held)
 
     def descend(self, damping: float) -> "tuple[_Point, float, float] | None":
         """Take the next step, undamped if that keeps what it promises: the point, its damping, and the next one.
@@ -391,14 +398,15 @@ def _iteration(before: _Point, after: _Point, damping: float) -> Iteration:
     return Iteration(after.system.cost, damping, float(np.linalg.norm(taken)), before.system.decrement)
 
 
-def take_steps(problem: Problem, most: int) -> Floats:
+def take_steps(problem: Problem, most: int, *, held: bool = False) -> Floats:
     """The parameter vector after some steps from the start, rows whitened as there: for a quick look.
 
     Args:
         problem: The problem.
         most: Steps at most; fewer where one promises less than a thousandth of the cost.
+        held: Whether error curves are held.
     """
-    here, damping = _Point(problem, problem.start), FIRST_DAMPING
+    here, damping = _Point(problem, problem.start, held), FIRST_DAMPING
     for _ in range(most):
         found = here.descend(damping) if here.system.decrement**2 > 2e-3 * here.system.cost else None
         if found is None:
