@@ -41,6 +41,9 @@ def test_sparse_elimination_gives_the_dense_system(model, reach, variance):
     assert found.step / sigma == pytest.approx(expected.step / sigma, abs=1e-6)  # [sigma]
     C, D = (s.full_root @ s.full_root.T / np.outer(sigma, sigma) for s in (found, expected))
     assert pytest.approx(D, abs=1e-8) == C
+    held = problem.linearize(x, held=True)
+    assert held.cost == pytest.approx(problem.linearize(x).cost, rel=1e-9)
+    assert not held.step[v.n_columns :].any()
 
 
 def test_a_point_has_the_loads_of_its_parameters():
