@@ -68,6 +68,9 @@ RIDGE = 0.1
 MAX_RESIDUALS = 40_000
 """Residuals above which some measurements, drawn evenly, are enough to choose by."""
 
+LEAST_NOISE, LEAST_LEFT = 1e-6, 10
+"""Least variance of the noise over that specified; and degrees of freedom that a fit with an effect must leave."""
+
 FIT_ROUNDS, FIT_SETTLED = 30, 0.02
 """Rounds of a linear fit, and change of the logarithms of noise and sigma below which they have settled."""
 
@@ -265,7 +268,7 @@ class _Choice:
             square = float(self.gram[-1, -1] + h @ x)
             determinant = 2.0 * np.log(np.diag(U)).sum() + np.log(prior).sum()
             found = c, noise, prior, 0.5 * float(determinant - self.n * np.log(noise) - square / noise), x, U
-            before, noise = np.array([noise, sigma]), max(square / max(self.n - int(base.sum()), 1), LEAST_SHARE)
+            before, noise = np.array([noise, sigma]), max(square / max(self.n - int(base.sum()), 1), LEAST_NOISE)
             gamma = float(np.sum(1.0 - prior[curve] * np.sum(U[:, curve] ** 2, axis=0)))
             sigma = max(float(np.linalg.norm(x[curve])) / np.sqrt(max(gamma, LEAST_SHARE)), 1e-3)
             if np.abs(np.log([noise, sigma] / before)).max() < FIT_SETTLED:
@@ -296,15 +299,18 @@ class _Choice:
         return (again, fewer) if again.kept else (found, frozenset())
 
     def _p_value(self, kept: frozenset[_Group], of: Collection[_Group]) -> float:
-        """Of an F test of some of the groups that are kept."""
-        c, _, _, _, x, U = self.fit(kept)
+        """Of an F test of some of the groups that are kept; 1 where their fit leaves few degrees of freedom."""
+        c, _, prior, _, x, U = self.fit(kept)
+        left = self.n - float(np.sum(1.0 - prior * np.sum(U**2, axis=0)))
+        if left < LEAST_LEFT:
+            return 1.0
         own = self._columns(of)[c]
         square, k = float(x[own] @ np.linalg.solve(U[:, own].T @ U[:, own], x[own])), max(int(own.sum()), 1)
-        return float(special.fdtrc(k, self.n, square / k))
+        return float(special.fdtrc(k, left, square / k))
 
     def _test(self, kept: frozenset[_Group], added: frozenset[_Group], effect: Effect) -> EffectTest:
         p_value = self._p_value(kept | added, added)
-        if isinstance(effect, ErrorCurve):  # sigma is on the boundary where there is no curve
+        if isinstance(effect, ErrorCurve) and p_value < 1.0:  # sigma is on the boundary where there is no curve
             gain = self.fit(kept | added)[3] - self.fit(kept)[3]
             p_value = 0.5 * float(special.chdtrc(1, 2.0 * max(gain, 0.0)))
         old, new, bare = map(self.held_out, (kept, kept | added, frozenset[_Group]()))

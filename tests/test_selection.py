@@ -209,10 +209,23 @@ def test_an_effect_of_some_joints_is_kept_on_these():
     true = arm_with(Harmonics([1], [3]))
     true = true.with_values([1e-3 if p.kind in ("sin", "cos") else p.nominal for p in true.parameters])
     tried, kept = (Harmonics([1, 2, 3, 4], joints) for joints in ("all", [3]))
-    job = Job(None, choosing(arm_with(tried)), measured(true, 4, n=20), Options(model="position"))
+    job = Job(None, choosing(arm_with(tried)), measured(true, 4, n=24), Options(model="position"))
     chosen, (test,) = select_effects(job, solve_job)
     assert (test.kept, test.joints) == (True, (3,))
     assert chosen.robot.effects == (kept,)
+
+
+def test_few_rows_are_no_evidence():
+    """A curve explains 8 positions without noise, and then anything is significant."""
+    job = Job(None, choosing(arm_with(*LISTED)), measured(arm_with(), 1, n=8), Options(model="position"))
+    assert [test.effect for test in select_effects(job, solve_job)[1] if test.kept] == []
+
+
+def test_joints_that_rise_under_load_are_named():
+    arm = arm_with(Compliance(MASSES, [2, 3]))
+    true = arm.with_values([-3e-5 if p.kind == "compliance" else p.nominal for p in arm.parameters])
+    warnings = calibrate(arm, measured(true, 1), model="position").assessment.verdict.warnings
+    assert warnings[0].startswith("joints rise under load (compliance in sigma: theta2.compliance -")
 
 
 def test_a_robust_loss_does_not_take_for_outliers_what_an_effect_explains():

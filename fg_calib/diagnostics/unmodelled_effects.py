@@ -79,7 +79,7 @@ _STAGES = ("1 ", "2 ", "3 ")
 _WORDS = {
     "1 gravity": "yields to gravity",
     "2 position": "errs with its position (gear, encoder)",
-    "3 side load": "yields to loads along x and y of the base",
+    "3 side load": "yields to loads along x and y of the base (is gravity there? key `gravity`)",
 }
 """Effects of single joints, by how the names of their columns begin, before the number of the joint."""
 

@@ -21,7 +21,18 @@ from fg_calib.inputs import CalibrationError, Floats, Record, shorten
 from fg_calib.measurements import missing_values
 from fg_calib.observability import NOT_EXCITED, Identifiability
 from fg_calib.robot import SCALES, pose
-from fg_calib.statistics import CONFIDENCE, FACTOR, FINE, LEAST_REDUNDANCY, OUTLIER_WEIGHT, Fit, GrossErrors, Spread
+from fg_calib.statistics import (
+    CONFIDENCE,
+    FACTOR,
+    FINE,
+    LEAST_REDUNDANCY,
+    OUTLIER_WEIGHT,
+    Fit,
+    GrossErrors,
+    Spread,
+    upper_probability,
+)
+from fg_calib.statistics.priors import Beyond
 
 Severity = Literal["error", "warning", "note"]
 
@@ -52,8 +63,14 @@ MAX_OUTLIER_SHARE = 0.5
 MOST_ESTIMATED = 2.0
 """Estimated over specified noise above which an unmodelled effect is more likely."""
 
-MAX_NOISE_FACTOR = 5.0
-"""Estimated over specified noise above which one asks why."""
+MAX_NOISE_FACTOR = 1.2
+"""Estimated over specified noise above which, if significant, one asks why."""
+
+LEAST_COMPLIANCE = -4.0
+"""Compliance in its sigma below which it is negative: gravity never lifts a joint."""
+
+ESTIMATED_LEFT = 0.5
+"""Part of chi-square that a change leaves at most where noise was estimated."""
 
 
 class Statement(Record):
@@ -177,6 +194,8 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     regression = None if problem.evaluated else effects.regress(solution)
     suspicious = solution.estimated_noise is not None or any(kind.verdict not in FINE for kind in fit.goodness.kinds)
     change = effects.find_change(regression) if suspicious and regression is not None else None
+    if change is not None and solution.estimated_noise is not None and change.left > ESTIMATED_LEFT:
+        change = None  # for the noise holds what a change would have to explain
     systematic = None if regression is None or change is not None else effects.find_systematic(regression)
     case = Case(solution, spread, fit, identifiability, regression, change, systematic)
     found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}
@@ -276,7 +295,8 @@ def check_chi_square(
     significant = low <= reduced <= high and chi2.p_value is not None and chi2.p_value < SIGNIFICANT
     text = f"reduced chi-square {reduced:.3g}: residuals are significantly larger than the specified noise"
     text += f" ({ratio:.2f} times), and sigmas are shown larger by as much"
-    yield Statement("note", text, significant and ratio > NOTABLE_RATIO)
+    text += ": is the instrument as bad? Else the model lacks an effect"
+    yield Statement("warning", text, significant and ratio > NOTABLE_RATIO)
 
 
 def check_kept_noise(case: Case) -> Iterator[Statement]:
@@ -358,7 +378,7 @@ def check_priors(case: Case) -> Iterator[Statement]:
     for one in fit.beyond:
         text = f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}"
         yield Statement("error", text, one.is_place)
-    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place]
+    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place and not rises(one)]
     text = f"corrections beyond their prior sigmas (in sigma of these: {shorten(worst)}): {causes}"
     yield Statement("error", text, worst)
     largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
@@ -367,6 +387,23 @@ def check_priors(case: Case) -> Iterator[Statement]:
     p_value = 1.0 if fit.beyond or fit.p_value is None else fit.p_value
     certain = fit.chi2 > FACTOR * fit.expected and p_value < PRIOR_P_VALUE
     yield Statement("error" if certain else "note", text, p_value < SIGNIFICANT)
+
+
+def check_compliances(case: Case) -> Iterator[Statement]:
+    """Check for joints that rise under load."""
+    robot, sigma = case.problem.robot, np.sqrt(np.diagonal(case.spread.tangent))
+    z = {name: case.solution.parameters[robot.index(name)] / sigma[k] if sigma[k] else 0.0
+         for k, name in enumerate(case.problem.variables.names) if name.endswith(".compliance")}  # fmt: skip
+    worst = [f"{name} {z[name]:.0f}" for name in z if z[name] < LEAST_COMPLIANCE]
+    text = f"joints rise under load (compliance in sigma: {shorten(worst)}): the masses or gravity are wrong, or a"
+    text += " spring balances the arm; estimate the loads instead (`masses: free`)"
+    far = case.fit.priors is not None and any(rises(one) for one in case.fit.priors.beyond)
+    yield Statement("error" if far else "warning", text, worst)
+
+
+def rises(one: Beyond) -> bool:
+    """Whether a correction beyond its prior sigma is a negative compliance."""
+    return one.name.endswith(".compliance") and one.z < 0.0
 
 
 def check_signs(case: Case) -> Iterator[Statement]:
@@ -422,13 +459,14 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
         text += ": the arm explains next to nothing; check the table and the job"
         yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)
         text = f"the noise estimated of {fit.kind} is {fit.factor:.3g} times that specified (1 mm, 1 mrad where nothing"
-        text += " was): is that known, or are effects not modelled?"
-        yield Statement("warning", text, gross is None and fit.factor > MAX_NOISE_FACTOR)
+        text += " was): is the instrument as bad? Else the model lacks an effect, and no sigma holds what it costs"
+        significant = fit.factor > MAX_NOISE_FACTOR and upper_probability(fit.factor**2, fit.degrees) < SIGNIFICANT
+        yield Statement("warning", text, gross is None and significant)
 
 
 CHECKS: tuple[Callable[[Case], Iterator[Statement]], ...] = (
     *(check_solver, check_change, check_fit, check_kept_noise, check_test_rows, check_gain, check_priors),
-    *(check_signs, check_estimated_noise),
+    *(check_compliances, check_signs, check_estimated_noise),
 )
 """The checks of every solution, in the order of their statements; for what comes before and after them see `judge`."""
 

@@ -166,7 +166,7 @@ def _left_out(robot: Robot, to: str, measured: Floats | None) -> tuple[list[str]
     values = {name: value for name, value in mapping.pop("values", {}).items() if not name.endswith(".curve")}
     error = dh.errors(robot.geometry, robot, dh.drawn(robot, dh.N_JUDGED, 1) if measured is None else measured)
     note = f"it cannot hold {', '.join(mapping)}, without which the tool is off {where}: {error}"
-    assumed = ", ".join(effect.assumed for effect in robot.effects if effect.assumed)
+    assumed = ", ".join(words for effect in robot.effects for words in effect.assumed())
     note += f" (at {assumed}; more otherwise)" * bool(assumed)
     if to == "zeros":  # which are fitted to the arm with them
         return [note], {}

@@ -375,6 +375,9 @@ _NOT_JOINTS = names_of(OF_CONFIGURATIONS[k] for k in ("id", "split", "group", "x
 _BY_AXIS = {"position": "sigma_x", "orientation": "sigma_rx", "pixel": "sigma_u"}
 """First of the columns that may hold sigma on each axis, by kind of noise."""
 
+HEAVY = 0.5
+"""Mass that no finger of a gripper has, [kg]."""
+
 ROUNDED = 1e-9
 """Share of a covariance that may be rounding."""
 
@@ -568,6 +571,8 @@ def _read_context(
             return table.numbers(columns) * [units.factor(outside[c].unit) if c in outside else 1.0 for c in columns]
         return np.full((table.n_rows, len(columns)), 0.0 if needed else np.nan)
 
+    if needed and (missing := outside_joints(robot, HEAVY).keys() - set(table.frame.columns)):
+        _log.warning("%s: no column %s: outside the chain joints are at 0", table.name, ", ".join(sorted(missing)))
     context = [effect.context(robot, readings, read) for effect in robot.effects]
     return {name: values for one in context for name, values in one.items() if not np.isnan(values).all()}
 

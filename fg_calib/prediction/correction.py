@@ -52,7 +52,7 @@ class Correction(FrozenArrays, eq=False):
         expected_fitted: RMS position error after the best rigid fit of all targets, which needs no base, [m];
             nan where it is not determined.
         turns: Whether the targets have an orientation.
-        context: Whether it is known what effects depend on besides.
+        context: Names of what effects depend on besides, as far as it is known.
     """
 
     readings: Floats
@@ -64,7 +64,7 @@ class Correction(FrozenArrays, eq=False):
     expected: Floats
     expected_fitted: float
     turns: bool
-    context: bool
+    context: tuple[str, ...]
 
     @cached_property
     def reached(self) -> Booleans:
@@ -123,7 +123,8 @@ def correct_targets(
     fitted = errors_at(posterior, found.readings, context)[1].position
     missed, expected = np.column_stack([found.miss_position, found.miss_rotation]), np.sqrt(variance)
     at, whole = (commanded.position, commanded.rotation), np.nan if fitted is None else fitted
-    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, turned is not None, bool(context))
+    names, turn = tuple(context or ()), turned is not None
+    return Correction(found.readings, *at, uncorrected, off, missed, expected, whole, turn, names)
 
 
 def _check_targets(

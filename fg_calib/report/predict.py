@@ -1,6 +1,6 @@
 """Expected errors of a calibrated arm, and joint positions that correct them: for the terminal and for programs."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -217,7 +217,7 @@ def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
 
 def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
     yield "Errors are RMS, from the specified noise and prior sigmas. Unmodelled effects are not included."
-    yield from () if found.context else _assumed(robot)
+    yield from _assumed(robot, found.context)
     if not found.given:
         unlimited = [j.name for j in robot.joints if not np.isfinite(j.upper - j.lower)]
         instead = f" ({', '.join(unlimited)} without any: +-180 deg, or +-1 m)" if unlimited else ""
@@ -294,13 +294,13 @@ def _commands(ids: Sequence[str], correction: Correction, robot: Robot) -> Table
     return table_of(columns, rows, most=MAX_LISTED)
 
 
-def _assumed(robot: Robot) -> Iterator[str]:
-    if words := [effect.assumed for effect in robot.effects if effect.assumed]:
-        yield f"Taken for granted: {', '.join(words)}."
+def _assumed(robot: Robot, known: Collection[str]) -> Iterator[str]:
+    if words := [one for effect in robot.effects for one in effect.assumed(known)]:
+        yield f"Taken for granted: {', '.join(dict.fromkeys(words))}."
 
 
 def _correction_notes(ids: Sequence[str], correction: Correction, robot: Robot) -> Iterator[str]:
-    yield from () if correction.context else _assumed(robot)
+    yield from _assumed(robot, correction.context)
     yield "Give the controller the joint positions; or the poses that --out writes, with its nominal model unchanged."
     point = correction.missed[:, 0] < 1e-9
     doubts = {

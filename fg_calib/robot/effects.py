@@ -219,9 +219,9 @@ class Mass(NamedTuple):
         return points
 
 
-def outside_joints(robot: Robot) -> dict[str, Joint]:
-    """The joints outside the chain that masses hang on, by their names."""
-    masses = [m for effect in robot.effects for m in getattr(effect, "masses", None) or ()]
+def outside_joints(robot: Robot, least: float = 0.0) -> dict[str, Joint]:
+    """The joints outside the chain that masses of at least some [kg] hang on, by their names."""
+    masses = [m for effect in robot.effects for m in getattr(effect, "masses", None) or () if m.mass >= least]
     return {hinge.joint.name: hinge.joint for m in masses for hinge in m.hinges}
 
 
@@ -300,11 +300,10 @@ class _Loaded(Effect):
         if not 0.0 < np.linalg.norm(gravity) < MOST_GRAVITY:
             raise InputError("gravity", f"found {shown(self.gravity)}", "m/s^2, such as [0, 0, -9.81]")
 
-    @property
-    def assumed(self) -> str:
-        masses = self.masses or ()
-        words = [f"{m.column} {m.mass:g} kg" for m in masses if m.column]
-        return ", ".join(words + ["joints outside the chain at 0"] * any(m.hinges for m in masses))
+    def assumed(self, known: Collection[str] = ()) -> list[str]:
+        words = [f"{m.column} {m.mass:g} kg" for m in self.masses or () if m.column and m.column not in known]
+        outside = {hinge.joint.name for m in self.masses or () for hinge in m.hinges}
+        return words + ["joints outside the chain at 0"] * (not outside <= set(known))
 
     def context(self, robot: Robot, readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
         masses = self.masses or ()
@@ -445,9 +444,8 @@ class Backlash(_Loaded, Record):
     def by_loads(self) -> bool:
         return self.side == "load"
 
-    @property
-    def assumed(self) -> str:
-        return super().assumed if self.by_loads else "no side of approach"
+    def assumed(self, known: Collection[str] = ()) -> list[str]:
+        return super().assumed(known) if self.by_loads else ["no side of approach"] * (self.side not in known)
 
     def terms(self, robot: Robot) -> list[Term]:
         return [_own(robot, i, "backlash", 1e-3, -1) for i in _joints(robot, self.joints, "backlash")]
@@ -539,9 +537,8 @@ class Thermal(Effect, Record):
         of = ((i, e, robot.parameters[e.parameter]) for i, e in enumerate(robot.elements) if e.parameter is not None)
         return [(i, e, p) for i, e, p in of if p.name in names]  # type: ignore[operator]
 
-    @property
-    def assumed(self) -> str:
-        return f"{self.column} {self.reference:g}"
+    def assumed(self, known: Collection[str] = ()) -> list[str]:
+        return [f"{self.column} {self.reference:g}"] * (self.column not in known)
 
     def _drifting(self, robot: Robot) -> list[int]:
         return _joints(robot, "all", "thermal") if self.zeros else []

@@ -9,7 +9,7 @@ import logging
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from enum import IntEnum
 from functools import cached_property, lru_cache
@@ -247,10 +247,9 @@ class Effect(ABC):
             InputError: The robot has no such joint.
         """
 
-    @property
-    def assumed(self) -> str:
-        """What is taken where nothing is known of what it depends on besides readings."""
-        return ""
+    def assumed(self, known: Collection[str] = ()) -> list[str]:
+        """What is taken of what it depends on besides readings, in words, but for what is known by name."""
+        return []
 
     @abstractmethod
     def values(self, robot: "Robot", readings: Floats, context: Context, at: Floats) -> Floats:

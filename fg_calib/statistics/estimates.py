@@ -249,7 +249,9 @@ def _landmarks(solution: graph.Solution, whole: Spread) -> tuple[LandmarkEstimat
         if kind.estimate is not None:
             k = i if kind.reference is None else names.index((kind.reference.letter, name))
             values, C, units = kind.estimate(at.coordinates[first[k] : first[k + 1]], values, C)
-        found.append(LandmarkEstimate(name, int(counts[i]), values, np.sqrt(np.diag(C)), kind.name, units))
+        found.append(
+            LandmarkEstimate(name, int(counts[i]), values, np.sqrt(np.maximum(np.diag(C), 0.0)), kind.name, units)
+        )
     return tuple(found)
 
 

@@ -75,7 +75,7 @@ def chi_square(reduced, p_value=0.5, dof=40):
 @pytest.mark.parametrize(("chi2", "settings", "severity", "words"), [
     (chi_square(1.0, dof=0), {}, "error", "no degree of freedom is left"),
     (chi_square(1.3), {}, None, ""),
-    (chi_square(1.3, 1e-4), {}, "note", "(1.14 times), and sigmas are shown larger by as much"),
+    (chi_square(1.3, 1e-4), {}, "warning", "(1.14 times), and sigmas are shown larger by as much"),
     (chi_square(1.2, 1e-4), {}, None, ""),
     (chi_square(0.4), {}, "note", "noise specified too large"),
     (chi_square(0.4), {"noise": False}, None, ""),

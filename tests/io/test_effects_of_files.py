@@ -33,9 +33,9 @@ effects:
   base_bending: true
   values: {theta2.compliance: 1.5e-5, theta2.curve: [1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4, 7e-4, 8e-4]}
 """
-LINK = '<link name="{name}"><inertial><origin xyz="{com}"/><mass value="{mass}"/></inertial></link>'
-ENDS = '<parent link="{parent}"/><child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/>'
-JOINT = f'<joint name="{{name}}" type="{{kind}}">{ENDS}</joint>'
+LINK = '<link name="{}"><inertial><origin xyz="{}"/><mass value="{}"/></inertial></link>'
+ENDS = '<parent link="{}"/><child link="{}"/><origin xyz="{}" rpy="{}"/><axis xyz="{}"/></joint>'
+JOINT = '<joint name="{}" type="{}">' + ENDS
 
 
 @pytest.fixture
@@ -124,9 +124,7 @@ JOINTS = [
 @pytest.fixture
 def two_arms(tmp_path):
     """What writes and reads the robot between two links."""
-    names = ("name", "kind", "parent", "child", "xyz", "rpy", "axis")
-    text = "".join(LINK.format(name=n, com=COM[n], mass=MASSES[n]) for n in COM)
-    text += "".join(JOINT.format(**dict(zip(names, joint, strict=True))) for joint in JOINTS)
+    text = "".join([LINK.format(n, COM[n], MASSES[n]) for n in COM] + [JOINT.format(*joint) for joint in JOINTS])
     (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
     chain = "urdf: arm.urdf\nbase_link: {}\ntip_link: {}\neffects: {{compliance: true}}\n"
 
@@ -139,7 +137,7 @@ def two_arms(tmp_path):
 
 @pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base")])
 def test_masses_of_a_urdf_are_where_its_links_are(ends, two_arms, tmp_path):
-    """Torques by the potential of all links, those of the other arm where its joints stand."""
+    """Torques by the potential of all links, those of the other arm where its joints stand; written and read back."""
     from yourdfpy import URDF
 
     robot, q = two_arms(*ends), np.array([[0.4, -0.9, 0.7, 0.2], [1.0, 0.3, -1.1, 0.4]])
@@ -153,32 +151,29 @@ def test_masses_of_a_urdf_are_where_its_links_are(ends, two_arms, tmp_path):
         return -9.81 * sum(MASSES[n] * points[n][2] for n in COM)
 
     outside = dict(zip(OUTSIDE, q.T[2:], strict=True))
-    for context, at in ((outside, q), ({}, q * [1, 1, 0, 0])):
-        found = robot.effects[0].values(robot.geometry, q[:, :2], context, np.zeros(2))[:, :, 0]
+    write_robot(tmp_path / "again.yaml", robot, urdf_name="arm.urdf")
+    for arm, context, at in ((read_robot(tmp_path / "again.yaml"), outside, q), (robot, {}, q * [1, 1, 0, 0])):
+        found = arm.effects[0].values(arm.geometry, q[:, :2], context, np.zeros(2))[:, :, 0]
         for row, torque in zip(at, found, strict=True):
             expected = [(potential(row + h) - potential(row - h)) / 2e-5 for h in 1e-5 * np.eye(2, 4)]
             assert torque == pytest.approx(expected, abs=1e-7)
 
 
-def test_joints_outside_the_chain_are_columns_that_a_table_may_have(two_arms, tmp_path):
+def test_joints_outside_the_chain_are_columns_that_a_table_may_have(two_arms, tmp_path, caplog):
     robot, table = two_arms("base", "fore"), tmp_path / "t.csv"
     table.write_text("shoulder,elbow,x,y,z,other_shoulder\n10,20,1,2,3,30\n")
     found = read_measurements(table, robot, units=Units("mm", "deg")).context
     assert {name: values.tolist() for name, values in found.items()} == {
         "other_shoulder": pytest.approx([np.pi / 6]), "other_slide": [0.0],
     }  # fmt: skip
-    configurations = tmp_path / "q.csv"
-    configurations.write_text("shoulder,elbow,other_slide\n10,20,300\n")
-    assert read_joint_table(configurations, robot, Units("mm", "deg"))[2] == {"other_slide": pytest.approx([0.3])}
-
-
-def test_masses_of_the_other_arm_are_written_and_read_back(two_arms, tmp_path):
-    robot = two_arms("base", "fore")
-    write_robot(tmp_path / "again.yaml", robot, urdf_name="arm.urdf")
-    again, q = read_robot(tmp_path / "again.yaml"), np.array([[0.4, -0.9]])
-    context = {"other_shoulder": np.array([0.7]), "other_slide": np.array([0.2])}
-    loads = [r.effects[0].values(r.geometry, q, context, np.zeros(2)) for r in (robot, again)]
-    assert loads[1] == pytest.approx(loads[0], abs=1e-12)
+    assert [r.getMessage() for r in caplog.records] == [
+        "t.csv: no column other_slide: outside the chain joints are at 0"
+    ]
+    assert robot.effects[0].assumed(found) == []
+    (tmp_path / "q.csv").write_text("shoulder,elbow,other_slide\n10,20,300\n")
+    found = read_joint_table(tmp_path / "q.csv", robot, Units("mm", "deg"))[2]
+    assert found == {"other_slide": pytest.approx([0.3])}
+    assert robot.effects[0].assumed(found) == ["joints outside the chain at 0"]
 
 
 @pytest.mark.parametrize(
