@@ -190,20 +190,20 @@ def sockets(task: Task) -> Row:
 
 
 def cost(task: Task) -> Row:
-    """Processor time of a solve of all rows, least of five, [s]."""
+    """Processor time of a solve of all rows, and of the geometry's in turn with it, least of fifteen, [s]."""
     (name,) = task
     data = data_folder("ur10_tmac")
     if data is None:
         return {}
     effects = SETS[name] | ({"error_curve": CURVE | {"sigma": PRIOR}} if "error_curve" in SETS[name] else {})
-    job = ur10_job(data, effects, noise=LEFT)
-    tables = with_test(job, np.zeros(len(job.tables[0].measurements.readings), dtype=bool))
-    seconds = []
-    for _ in range(5):
+    jobs = {"seconds": ur10_job(data, effects, noise=LEFT), "geometry": ur10_job(data, {}, noise=LEFT)}
+    seconds: dict[str, list[float]] = {key: [] for key in jobs}
+    for key, job in 15 * list(jobs.items()):
+        tables = with_test(job, np.zeros(len(job.tables[0].measurements.readings), dtype=bool))
         problem, start = build_problem(job.robot, tables, job.options), time.process_time()
         solve(problem)
-        seconds.append(time.process_time() - start)
-    return {"seconds": min(seconds)}
+        seconds[key].append(time.process_time() - start)
+    return {key: min(each) for key, each in seconds.items()}
 
 
 def held_out_answer(found: Row) -> str:
@@ -244,9 +244,9 @@ def cost_answer(found: Row) -> str:
     """Multiple of the geometry's time."""
     if not found:
         return "the data are missing"
-    once = found["geometry"]["seconds"]
-    cells = [f"{name} {row['seconds'] / once:.1f}" for name, row in found.items() if name != "geometry"]
-    return f"1 495 poses, times the geometry's {once:.2f} s: {', '.join(cells)}"
+    cells = [f"{name} {row['seconds'] / row['geometry']:.1f}" for name, row in found.items()]
+    once = min(row["geometry"] for row in found.values())
+    return f"1 495 poses, times the geometry's {once:.3f} s: {', '.join(cells)}"
 
 
 def names(of: Row) -> Any:
@@ -263,8 +263,7 @@ QUESTIONS = (
              parts, by_name, parts_answer),
     Question("sockets", "And a real Panda's touches?", names(SOCKETS), sockets, by_name, sockets_answer),
     Question("cost", "How long does a solve take?",
-             names({"geometry": 0, "compliance": 0, "error curve and compliance": 0}), cost, by_name, cost_answer,
-             timed=True),
+             names({"compliance": 0, "error curve and compliance": 0}), cost, by_name, cost_answer, timed=True),
 )  # fmt: skip
 
 if __name__ == "__main__":
