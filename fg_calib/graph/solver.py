@@ -194,10 +194,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
     with one_blas_thread:
         before = _fit_frames(problem, options) if start is None else np.asarray(start, dtype=np.float64)
         problem = relinearized_at(problem, before) if before is not problem.start else problem
-        begun = _started_by_few(problem, options)
-        if problem.variables.n_curves and problem.options.loss == "none":
-            begun = relinearized_at(begun, take_steps(begun, 1, held=True))
-        run = _fit(begun, options)
+        run = _fit(_started_by_rest(_started_by_few(problem, options)), options)
         state, variables, cost = run.problem.state, run.problem.variables, run.cost
         parameters = variables.parameters(variables.values(run.parameters))  # angles in usual range
         if state.weights is not None:
@@ -234,6 +231,20 @@ def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
     return relinearized_at(problem, run.parameters) if run.converged else problem
 
 
+def _started_by_rest(problem: Problem) -> Problem:
+    """A problem with error curves, started where a step of all but these leads, if that lowers the cost."""
+    if not problem.variables.n_curves or problem.options.loss != "none":
+        return problem
+    held = problem.linearize(problem.start, held=True)
+    if held.decrement <= COARSE:
+        return problem
+    there = relinearized_at(problem, problem.variables.moved(problem.start, held.step))
+    try:
+        return there if _Point(there, there.start).system.cost < held.cost else problem
+    except SolverError:
+        return problem
+
+
 def _fit_frames(problem: Problem, options: SolverOptions) -> Floats:
     """The parameter vector with measurement frame, base, tool and landmarks fitted, the arm as it is at the start."""
     frames = frames_only(problem)
@@ -250,18 +261,16 @@ class _Point(Record):
     Attributes:
         problem: The problem.
         parameters: The parameter vector.
-        held: Whether error curves are held.
     """
 
     problem: Problem
     parameters: Floats
-    held: bool = False
 
     @cached_property
     def system(self) -> NormalSystem:
         """The normal system."""
         try:
-            return self.problem.linearize(self.parameters, held=self.held)
+            return self.problem.linearize(self.parameters)
         except CalibrationError:
             raise
         except Exception as error:  # of LAPACK or an added factor
@@ -281,7 +290,7 @@ class _Point(Record):
     def after(self, step: Floats) -> "_Point":
         """The point after a tangent step."""
         parameters = self.problem.variables.moved(self.parameters, step)
-        return _Point(loaded_at(self.problem, parameters), parameters, self.held)
+        return _Point(loaded_at(self.problem, parameters), parameters)
 
     def descend(self, damping: float) -> "tuple[_Point, float, float] | None":
         """Take the next step, undamped if that keeps what it promises: the point, its damping, and the next one.
@@ -398,15 +407,14 @@ def _iteration(before: _Point, after: _Point, damping: float) -> Iteration:
     return Iteration(after.system.cost, damping, float(np.linalg.norm(taken)), before.system.decrement)
 
 
-def take_steps(problem: Problem, most: int, *, held: bool = False) -> Floats:
+def take_steps(problem: Problem, most: int) -> Floats:
     """The parameter vector after some steps from the start, rows whitened as there: for a quick look.
 
     Args:
         problem: The problem.
         most: Steps at most; fewer where one promises less than a thousandth of the cost.
-        held: Whether error curves are held.
     """
-    here, damping = _Point(problem, problem.start, held), FIRST_DAMPING
+    here, damping = _Point(problem, problem.start), FIRST_DAMPING
     for _ in range(most):
         found = here.descend(damping) if here.system.decrement**2 > 2e-3 * here.system.cost else None
         if found is None:
