@@ -337,10 +337,9 @@ class CurveTurns(Brief):
         of_turns = np.swapaxes(self.turns, 1, 2) @ y.reshape(n, h, y.shape[1])
         return np.asarray(self.splines.T @ of_turns.reshape(n * k, y.shape[1]))
 
-    def among(self, place: Integers, scale: Floats) -> "CurveTurns":
+    def among(self, to: Integers, scale: Floats) -> "CurveTurns":
         """The same in coefficients that are numbered, and measured, in another way."""
-        n = int(place[-1]) + 1
-        return replace(self, knots=place[self.knots], weights=self.weights * scale[self.knots], n_curves=n)
+        return replace(self, knots=to[self.knots], weights=self.weights * scale[self.knots], n_curves=int(to[-1]) + 1)
 
 
 class CurveSplines(NamedTuple):
@@ -468,8 +467,7 @@ class WhitenedRows(Brief):
         R, n = self.square_root(at.without_curves()), len(at.curves.sigma)
         b = np.append(-R[:, -1], np.linalg.norm(at.curves.values / at.curves.sigma))
         A, follow = np.pad(R[:, :-1], ((0, 1), (0, 0))), np.zeros((n, R.shape[1] - 1))
-        spread = lambda y: np.zeros((n, *y.shape[1:]))  # noqa: E731
-        return Eliminated(np.zeros(0), A, b, follow, spread, np.zeros(n, dtype=np.bool_))
+        return Eliminated(np.zeros(0), A, b, follow, lambda y: np.zeros((n, *y.shape[1:])), np.zeros(n, dtype=np.bool_))
 
     def posterior_mean(self, at: State) -> Floats:
         """Posterior mean of the error states, shape (n_configurations, n_slots), [sigma]."""

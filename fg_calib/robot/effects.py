@@ -225,18 +225,13 @@ def outside_joints(robot: Robot, least: float = 0.0) -> dict[str, Joint]:
     return {hinge.joint.name: hinge.joint for m in masses for hinge in m.hinges}
 
 
-ACROSS = slice(2)
-"""The axes of a joint's frame across its own, which is z."""
-
-
 class _Moments:
     """Moments of gravity about the origins of some joints' frames, in these frames just before they turn."""
 
     def __init__(
         self, robot: Robot, readings: Floats, context: Context, gravity: Floats, masses: Sequence[Mass]
     ) -> None:
-        self.robot, self.readings = robot, readings
-        self._cross = np.cross(np.eye(3), -gravity)  # times x it is x cross gravity
+        self.robot, self.readings, self._cross = robot, readings, np.cross(np.eye(3), -gravity)
         ends = [robot.end_of(m.link) for m in masses]
         of_joints = (_moving(robot, j)[0] + k for j in range(robot.n_joints) for k in (0, 1))
         self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
@@ -262,7 +257,7 @@ class _Moments:
 
     def _along(self, axes: Sequence[Floats], first: Floats) -> Floats:
         """Moments of gravity along axes, shape (n, n_axes), of first moments, shape (3, n)."""
-        moment = self._cross @ first
+        moment = self._cross @ first  # first cross gravity
         return np.stack([np.sum(axis * moment, axis=0) for axis in axes], axis=1)
 
 
@@ -387,7 +382,7 @@ class Compliance(_Loaded, Record):
         parts = [self._torques(robot, readings, context, joints, gravity)]
         if self.lateral and self.masses is not None:
             moments = _Moments(robot, readings, context, gravity, self.masses)
-            parts += [moments.of_masses(_moving(robot, i)[0], ACROSS) for i in joints]
+            parts += [moments.of_masses(_moving(robot, i)[0], slice(2)) for i in joints]
         return np.hstack(parts)
 
     def _torques(
@@ -421,7 +416,7 @@ class Bending(_Loaded, Record):
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         moments = _Moments(robot, readings, context, np.array(self.gravity), self.masses)
-        return _with_slopes(moments.of_masses(robot.end_of(0), ACROSS))
+        return _with_slopes(moments.of_masses(robot.end_of(0), slice(2)))
 
 
 class Backlash(_Loaded, Record):
