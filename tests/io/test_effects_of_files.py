@@ -86,8 +86,13 @@ def test_columns_that_effects_need_are_known_and_missed_by_name(read, tmp_path):
 
 def test_select_stands_for_the_standard_effects(read):
     robot = read(HEAD + "effects: select\n")
-    assert robot.select_effects
-    assert [type(e).__name__ for e in robot.effects] == ["ErrorCurve", "Compliance", "Harmonics", "Gain"]
+    assert [robot.select_effects, *(type(e).__name__ for e in robot.effects)] == [
+        True,
+        "ErrorCurve",
+        "Compliance",
+        "Harmonics",
+        "Gain",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -121,26 +126,21 @@ JOINTS = [
 ]
 
 
-@pytest.fixture
-def two_arms(tmp_path):
-    """What writes and reads the robot between two links."""
+def two_arms(folder, *ends):
+    """The robot between two links, written and read."""
     text = "".join([LINK.format(n, COM[n], MASSES[n]) for n in COM] + [JOINT.format(*joint) for joint in JOINTS])
-    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
+    (folder / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
     chain = "urdf: arm.urdf\nbase_link: {}\ntip_link: {}\neffects: {{compliance: true}}\n"
-
-    def read(*ends):
-        (tmp_path / "robot.yaml").write_text(chain.format(*ends))
-        return read_robot(tmp_path / "robot.yaml")
-
-    return read
+    (folder / "robot.yaml").write_text(chain.format(*ends))
+    return read_robot(folder / "robot.yaml")
 
 
 @pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base")])
-def test_masses_of_a_urdf_are_where_its_links_are(ends, two_arms, tmp_path):
+def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
     """Torques by the potential of all links, those of the other arm where its joints stand; written and read back."""
     from yourdfpy import URDF
 
-    robot, q = two_arms(*ends), np.array([[0.4, -0.9, 0.7, 0.2], [1.0, 0.3, -1.1, 0.4]])
+    robot, q = two_arms(tmp_path, *ends), np.array([[0.4, -0.9, 0.7, 0.2], [1.0, 0.3, -1.1, 0.4]])
     turning = ["shoulder", "elbow"] if ends[0] == "base" else ["elbow", "shoulder"]
     assert [p.name for p in robot.parameters if p.kind == "compliance"] == [f"{name}.compliance" for name in turning]
     urdf = URDF.load(str(tmp_path / "arm.urdf"), load_meshes=False, build_scene_graph=True)
@@ -159,8 +159,8 @@ def test_masses_of_a_urdf_are_where_its_links_are(ends, two_arms, tmp_path):
             assert torque == pytest.approx(expected, abs=1e-7)
 
 
-def test_joints_outside_the_chain_are_columns_that_a_table_may_have(two_arms, tmp_path, caplog):
-    robot, table = two_arms("base", "fore"), tmp_path / "t.csv"
+def test_joints_outside_the_chain_are_columns_that_a_table_may_have(tmp_path, caplog):
+    robot, table = two_arms(tmp_path, "base", "fore"), tmp_path / "t.csv"
     table.write_text("shoulder,elbow,x,y,z,other_shoulder\n10,20,1,2,3,30\n")
     found = read_measurements(table, robot, units=Units("mm", "deg")).context
     assert {name: values.tolist() for name, values in found.items()} == {
