@@ -24,16 +24,14 @@ def problem_of(model="position", n=40, seed=0, reach=2.5, **options):
     return build_problem(robot, data, Options(model=model, gauge="prior", **options)), true
 
 
-@pytest.mark.parametrize(
-    ("model", "reach", "times"), [("position", 2.5, 1), ("position", 0.6, 2), ("distance", 0.6, 2)]
-)
-def test_sparse_elimination_gives_the_dense_system(model, reach, times):
+@pytest.mark.parametrize(("model", "reach", "var"), [("position", 2.5, 1), ("position", 0.6, 2), ("distance", 0.6, 2)])
+def test_sparse_elimination_gives_the_dense_system(model, reach, var):
     problem, _ = problem_of(model, reach=reach, pair_errors="independent")  # some knots are out of reach
     v, x = problem.variables, problem.start.copy()
     x[: len(problem.robot.parameters)] += 1e-4 * np.random.default_rng(1).normal(size=len(problem.robot.parameters))
     priors, own = (np.column_stack(of(v, x)[::-1]) for of in (prior_rows, unknown_prior_rows))
-    rows = np.vstack([own, problem.rows.square_root(v.at(x)) / np.sqrt(times)])
-    left = eliminate_more(problem.rows.without_curves(v.at(x), times), np.zeros((0, v.n_columns + 1)), v.n_columns)
+    rows = np.vstack([own, problem.rows.square_root(v.at(x)) / np.sqrt(var)])
+    left = eliminate_more(problem.rows.without_curves(v.at(x), var), np.zeros((0, v.n_columns + 1)), v.n_columns)
     found, expected = (NormalSystem(of, v.n_columns, v.prior_scales, priors) for of in (left, rows))
     assert found.cost == pytest.approx(expected.cost, rel=1e-9)
     sigma = np.linalg.norm(expected.full_root, axis=1)
