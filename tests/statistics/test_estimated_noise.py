@@ -42,8 +42,7 @@ def test_estimated_noise_of_a_healthy_table_is_good_and_of_another_arm_is_not(in
     """All readings exchanged with those of other rows: the noise estimated is then as large as what was measured."""
     rng = np.random.default_rng(4)
     robot, table = touched(instrument, rng) if instrument in TOUCHED else measured_by(instrument, rng)[::2]
-    found = calibrate(robot, table, estimate_noise=True)
-    assert not found.findings
+    assert not calibrate(robot, table, estimate_noise=True).findings
     m = table.measurements
     mixed = replace(m, readings=rng.permutation(m.readings), ids=np.arange(m.n_configurations).astype(str))
     wrong = calibrate(robot, replace(table, measurements=mixed), estimate_noise=True)
