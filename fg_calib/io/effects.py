@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import model_validator
 
-from fg_calib.inputs import InputError, as_floats, check_names, check_type, did_you_mean, shown, within
+from fg_calib.inputs import InputError, as_floats, check_names, check_type, did_you_mean, expect, shown, within
 from fg_calib.io.yaml import Number, Positive, Schema, validate
 from fg_calib.robot import EFFECT_KINDS, EFFECTS, Effect, Mass, Robot
 
@@ -32,7 +32,7 @@ NO_MASSES = "`masses: free`, or the mass and com of each link"
 
 def select_standard(links: Mapping[Any, Any]) -> dict[str, Any]:
     """What `effects: select` stands for; compliance with known masses, free products without."""
-    compliance: Any = True if links.get("urdf") else {"masses": "free"}
+    compliance: Any = True if None in links and links[None]() else {"masses": "free"}
     return dict.fromkeys(STANDARD, True) | {"compliance": compliance, "select": True}
 
 
@@ -51,14 +51,14 @@ class _Payload(_Mass):
     column: str = ""
 
 
-def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any], n_joints: int) -> list[Effect]:
+def read_effects(given: Mapping[str, Any], place: str, links: Mapping[Any, Any], n_joints: int) -> list[Effect]:
     """The effects that a mapping lists.
 
     Args:
         given: The mapping.
         place: Its place, for messages.
         links: What masses may be on, joints' numbers or links of a URDF, and what makes a `Mass` of mass and com there;
-            `urdf` has the masses of its inertials.
+            None has what makes the masses of its inertials.
         n_joints: Number of joints: the payload is on the last one's frame.
 
     Raises:
@@ -71,8 +71,6 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
     loaded = {key: one for key, one in given.items() if isinstance(one, Mapping) and {"masses", "payload"} & one.keys()}
     for key, one in loaded.items():
         masses = masses or _masses(one, f"{place}: {key}", links, n_joints)
-    if not loaded and "urdf" in links:
-        masses = tuple(links["urdf"])
     compliance = given.get("compliance")
     gravity = compliance.get("gravity") if isinstance(compliance, Mapping) else None
     gravity = None if gravity == "estimate" else gravity
@@ -85,13 +83,14 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
         options = dict(one for one in options.items() if one not in not_given)
         if "masses" in names:
             free = key == "compliance" and isinstance(given[key], Mapping) and given[key].get("masses") == "free"
-            if not masses and not free and (key != "backlash" or options.get("side") == "load"):
-                raise InputError(
-                    here, "no masses", NO_MASSES if key == "compliance" else "the mass and com of each link"
-                )
+            needed = not free and (key != "backlash" or options.get("side") == "load")
+            if needed and not loaded and None in links:
+                masses = masses or tuple(links[None]())
+            expected = NO_MASSES if key == "compliance" else "the mass and com of each link"
+            expect(masses or not needed, here, "no masses", expected)
             if free and "payload" in given[key]:
                 raise InputError(here, "a payload with free masses", "masses: urdf, or by link")
-            options["masses"] = None if free else masses or ()
+            options["masses"] = None if free else masses if needed else ()
         if "gravity" in names and gravity is not None:
             options.setdefault("gravity", gravity)
         with within(here):
@@ -99,18 +98,16 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[int | str,
     return effects
 
 
-def _masses(given: Mapping[str, Any], place: str, links: Mapping[int | str, Any], n_joints: int) -> tuple[Mass, ...]:
+def _masses(given: Mapping[str, Any], place: str, links: Mapping[Any, Any], n_joints: int) -> tuple[Mass, ...]:
     """The masses of the entry of compliance, its payload among them."""
-    wanted, found = given.get("masses", "urdf" if "urdf" in links else None), list[Mass]()
+    wanted, found = given.get("masses", "urdf" if None in links else None), list[Mass]()
     if wanted == "urdf":
-        if "urdf" not in links:
-            raise InputError(f"{place}: masses", "found 'urdf', but there is none", NO_MASSES)
-        found += links["urdf"]
+        expect(None in links, f"{place}: masses", "found 'urdf', but there is none", NO_MASSES)
+        found += links[None]()
     elif isinstance(wanted, Mapping):
         for link, value in wanted.items():
             here = f"{place}: masses: {link}"
-            if str(link) not in links:
-                raise InputError(here, f"no link {shown(link)}", f"one of {', '.join(map(str, links))}")
+            expect(str(link) in links, here, f"no link {shown(link)}", f"one of {', '.join(filter(None, links))}")
             mass = validate(_Mass, value, here)
             found.append(links[str(link)](mass.mass, mass.com))
     elif wanted not in (None, "free"):

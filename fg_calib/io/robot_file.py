@@ -134,12 +134,13 @@ def read_urdf(
         raise InputError(error.place, error.found, error.expected, hint) from None
     builder.add_frame("tool", model.frame_values("tool", tool), n_joints + 1, False)
     choices = {"fixed": fixed, "estimate": estimate, "tolerance": tolerance}
-    links, source = _links_of(root, tree, chain, base_link), UrdfSource(text, base_link, tip_link)
+    links, source = _links_of(tree, chain, base_link, path.name), UrdfSource(text, base_link, tip_link)
+    links[None] = partial(_inertials, root, links, path.name)
     return _with_effects(builder, effects or {}, links, place or path.name, urdf=source, **choices)
 
 
-def _links_of(root: etree._Element, tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base: str) -> dict[str, Any]:
-    """What makes a mass on the arm of a mass on each link that hangs on the chain, and the masses of all inertials.
+def _links_of(tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base: str, place: str) -> dict[str | None, Any]:
+    """What makes a mass on the arm of a mass on each link that hangs on the chain.
 
     Joints outside the chain that mimic others, and floating or planar ones, are taken at readings of zero.
     """
@@ -150,34 +151,35 @@ def _links_of(root: etree._Element, tree: _Tree, chain: list[tuple[_UrdfJoint, b
         at = np.eye(4) if moves else at @ (np.linalg.inv(origin) if backwards else origin)
         on_chain[joint.parent if backwards else joint.child] = number, at
 
-    def maker(link: str) -> Any:
-        places, below, moving = [np.eye(4)], link, list[_UrdfJoint]()  # from the link up
-        while below not in on_chain and (joint := tree.above(below)) is not None:
+    def made(below: str, link: str, mass: float, com: Sequence[float]) -> Mass:
+        (owner, at), hinges = on_chain[below], list[Hinge]()
+        for joint, _ in tree.chain(below, link):
+            at, here = at @ model.matrix_of_frame(joint.origin), f"{place}: joint {joint.name!r}"
             if joint.element.get("type") in _MOVING and joint.element.find("mimic") is None:
-                moving.append(joint)
-                places.append(np.eye(4))
-            places[-1], below = model.matrix_of_frame(joint.origin) @ places[-1], joint.parent
-        if below not in on_chain:
-            return None
-        owner, first = on_chain[below]
-        places[-1] = first @ places[-1]
-        hinges = tuple(
-            Hinge(_moving_joint(j, j.name), j.child, origin.tolist(), _axis(j, j.name).tolist())
-            for j, origin in zip(moving[::-1], places[:0:-1], strict=True)
-        )
-        T = places[0]
-        return lambda mass, com: Mass(owner, mass, tuple((T[:3, :3] @ com + T[:3, 3]).tolist()), "", hinges)
+                axis = _axis(joint, here).tolist()
+                hinges.append(Hinge(_moving_joint(joint, here), joint.child, at.tolist(), axis))
+                at = np.eye(4)
+        return Mass(owner, mass, tuple((at[:3, :3] @ com + at[:3, 3]).tolist()), "", tuple(hinges))
 
-    links: dict[str, Any] = {str(i): partial(Mass, i) for i in range(number + 1)}
-    links |= {name: made for link in root.findall("link") if (made := maker(name := link.get("name", "")))}
-    masses = list[Mass]()
+    links: dict[str | None, Any] = {str(i): partial(Mass, i) for i in range(number + 1)}
+    for link in tree.links:
+        if (below := next((one for one in tree.up(link) if one in on_chain), None)) is not None:
+            links[link] = partial(made, below, link)
+    return links
+
+
+def _inertials(root: etree._Element, links: Mapping[Any, Any], place: str) -> list[Mass]:
+    """The masses of the inertials of all links that hang on the chain."""
+    found = list[Mass]()
     for link in root.findall("link"):
-        inertial, made = link.find("inertial"), links.get(link.get("name", ""))
-        if made is not None and inertial is not None and (mass := inertial.find("mass")) is not None:
-            com = inertial.find("origin")
-            xyz = _figures("0 0 0" if com is None else com.get("xyz", "0 0 0"))
-            masses += [made(value, xyz) for value in _figures(mass.get("value", "0")) if value > 0.0]
-    return links | {"urdf": masses}
+        name, inertial = link.get("name", ""), link.find("inertial")
+        if name in links and inertial is not None:
+            here = f"{place}: link {name!r}"
+            com = _numbers(inertial, "origin", "xyz", "0 0 0", here)
+            (mass,) = _numbers(inertial, "mass", "value", "0", here)
+            inputs.expect(mass >= 0.0, f"{here}: mass", f"found {mass:g}", "0 or above")
+            found += [links[name](mass, com)] if mass else []
+    return found
 
 
 def _with_effects(builder: RobotBuilder, given: Any, links: Mapping[Any, Any], place: str, **choices: Any) -> Robot:
@@ -384,7 +386,7 @@ class _Tree:
 
     def __init__(self, joints: Sequence[_UrdfJoint], links: Sequence[str], place: str) -> None:
         self._place = place
-        self._links = list(dict.fromkeys([*links, *(link for j in joints for link in (j.parent, j.child))]))
+        self.links = list(dict.fromkeys([*links, *(link for j in joints for link in (j.parent, j.child))]))
         self._above: dict[str, _UrdfJoint] = {}  # by child link
         for joint in joints:
             if (first := self._above.setdefault(joint.child, joint)) is not joint:
@@ -393,35 +395,31 @@ class _Tree:
 
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
-        if link not in self._links:
-            hint = did_you_mean(link, self._links, NEAR)
-            raise InputError(self._place, f"no link {link!r}", inputs.known_names(self._links, 40), hint)
+        if link not in self.links:
+            hint = did_you_mean(link, self.links, NEAR)
+            raise InputError(self._place, f"no link {link!r}", inputs.known_names(self.links, 40), hint)
         return link
 
     def root(self) -> str:
         """The only link without a parent."""
-        inputs.expect(self._links, self._place, "no links and joints", "<link> and <joint> within <robot>")
-        return self._only([link for link in self._links if self._up(link) == [link]], "root", "base_link")
+        inputs.expect(self.links, self._place, "no links and joints", "<link> and <joint> within <robot>")
+        return self._only([link for link in self.links if self.up(link) == [link]], "root", "base_link")
 
     def leaf(self, base: str) -> str:
         """The only link without a child at or below `base`."""
         parents = {joint.parent for joint in self._above.values()}
-        leaves = [link for link in self._links if link not in parents and base in self._up(link)]
+        leaves = [link for link in self.links if link not in parents and base in self.up(link)]
         return self._only(leaves, "leaf", "tip_link")
 
     def chain(self, base: str, tip: str) -> list[tuple[_UrdfJoint, bool]]:
         """The joints from `base` to `tip`, with whether each is passed from child to parent."""
-        up, down = self._up(base), self._up(tip)
+        up, down = self.up(base), self.up(tip)
         if up[-1] != down[-1]:
             raise InputError(self._place, f"links {base!r} and {tip!r} are not connected", "two links of one tree")
         there, back = [link for link in up if link not in down], [link for link in down if link not in up]
         return [(self._above[link], True) for link in there] + [(self._above[link], False) for link in reversed(back)]
 
-    def above(self, link: str) -> _UrdfJoint | None:
-        """The joint whose child a link is."""
-        return self._above.get(link)
-
-    def _up(self, link: str) -> list[str]:
+    def up(self, link: str) -> list[str]:
         """`link` and the links above it, up to the root."""
         links = [link]
         while links[-1] in self._above:

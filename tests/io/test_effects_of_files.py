@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusals import refusal
 
-from fg_calib.io import Column, Units, read_joint_table, read_measurements, read_robot, write_robot
+from fg_calib.io import Column, Units, read_joint_table, read_measurements, read_robot, read_urdf, write_robot
 from fg_calib.robot import Backlash, Compliance, ErrorCurve, Harmonics, Mass
 
 HEAD = """\
@@ -86,20 +86,14 @@ def test_columns_that_effects_need_are_known_and_missed_by_name(read, tmp_path):
 
 def test_select_stands_for_the_standard_effects(read):
     robot = read(HEAD + "effects: select\n")
-    assert [robot.select_effects, *(type(e).__name__ for e in robot.effects)] == [
-        True,
-        "ErrorCurve",
-        "Compliance",
-        "Harmonics",
-        "Gain",
-    ]
+    assert robot.select_effects
+    assert [type(e).__name__ for e in robot.effects] == ["ErrorCurve", "Compliance", "Harmonics", "Gain"]
 
 
-@pytest.mark.parametrize(
-    ("effects", "said"),
-    [("backlash: {side: q}", "t.csv: q1: found 0.5, expected sides of approach, -1, 0 or 1"),
-     ("compliance: {payload: {mass: 1, column: load}}", "t.csv: load: found -2, expected masses, 0 or above")],
-)  # fmt: skip
+@pytest.mark.parametrize(("effects", "said"), [
+    ("backlash: {side: q}", "t.csv: q1: found 0.5, expected sides of approach, -1, 0 or 1"),
+    ("compliance: {payload: {mass: 1, column: load}}", "t.csv: load: found -2, expected masses, 0 or above"),
+])  # fmt: skip
 def test_columns_of_what_cannot_be_are_refused(read, tmp_path, effects, said):
     (tmp_path / "t.csv").write_text("q1,q2,q3,x,y,z,load\n0.5,0,0,1,2,3,-2\n")
     assert said in refusal(read_measurements, tmp_path / "t.csv", read(HEAD + f"effects: {{{effects}}}\n"))
@@ -163,17 +157,25 @@ def test_joints_outside_the_chain_are_columns_that_a_table_may_have(tmp_path, ca
     robot, table = two_arms(tmp_path, "base", "fore"), tmp_path / "t.csv"
     table.write_text("shoulder,elbow,x,y,z,other_shoulder\n10,20,1,2,3,30\n")
     found = read_measurements(table, robot, units=Units("mm", "deg")).context
-    assert {name: values.tolist() for name, values in found.items()} == {
-        "other_shoulder": pytest.approx([np.pi / 6]), "other_slide": [0.0],
-    }  # fmt: skip
-    assert [r.getMessage() for r in caplog.records] == [
-        "t.csv: no column other_slide: outside the chain joints are at 0"
-    ]
+    assert {name: q.item() for name, q in found.items()} == pytest.approx({OUTSIDE[0]: np.pi / 6, OUTSIDE[1]: 0.0})
+    (record,) = caplog.records
+    assert record.getMessage() == "t.csv: no column other_slide: outside the chain joints are at 0"
     assert robot.effects[0].assumed(found) == []
     (tmp_path / "q.csv").write_text("shoulder,elbow,other_slide\n10,20,300\n")
     found = read_joint_table(tmp_path / "q.csv", robot, Units("mm", "deg"))[2]
     assert found == {"other_slide": pytest.approx([0.3])}
     assert robot.effects[0].assumed(found) == ["joints outside the chain at 0"]
+
+
+@pytest.mark.parametrize(("before", "broken", "said"), [
+    ("0.6 0.8 0", "0 0 0", "joint 'other_slide': axis: found [0.0, 0.0, 0.0]"),
+    ("0 0.1 0.2", "0 .1", "link 'hand': origin xyz: found '0 .1'"),
+])  # fmt: skip
+def test_what_is_broken_outside_the_chain_matters_where_its_mass_does(before, broken, said, tmp_path):
+    two_arms(tmp_path, "base", "fore")
+    (tmp_path / "arm.urdf").write_text((tmp_path / "arm.urdf").read_text().replace(before, broken))
+    assert said in refusal(lambda: read_robot(tmp_path / "robot.yaml"))
+    assert read_urdf(tmp_path / "arm.urdf", base_link="base", tip_link="fore", effects={"harmonics": True}).effects
 
 
 @pytest.mark.parametrize(
