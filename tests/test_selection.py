@@ -16,11 +16,10 @@ from fg_calib.statistics import estimate_noise
 SIGMA, N_COEFFICIENTS = 8e-4, 40
 
 
-def with_prior(robot, sigma):
-    """The robot with the same tolerance of all coefficients of error curves."""
-    return replace(robot, parameters=tuple(
-        replace(p, tolerance=sigma) if p.kind == "curve" else p for p in robot.parameters
-    ))  # fmt: skip
+def with_prior(robot, sigma, kind="curve"):
+    """The robot with the same tolerance of all parameters of a kind."""
+    each = (replace(p, tolerance=sigma) if p.kind == kind else p for p in robot.parameters)
+    return replace(robot, parameters=tuple(each))
 
 
 def measured(true, seed, n=80):
@@ -221,11 +220,13 @@ def test_few_rows_are_no_evidence():
     assert [test.effect for test in select_effects(job, solve_job)[1] if test.kept] == []
 
 
-def test_joints_that_rise_under_load_are_named():
-    arm = arm_with(Compliance(MASSES, [2, 3]))
-    true = arm.with_values([-3e-5 if p.kind == "compliance" else p.nominal for p in arm.parameters])
-    warnings = calibrate(arm, measured(true, 1), model="position").assessment.verdict.warnings
-    assert warnings[0].startswith("joints rise under load (compliance in sigma: theta2.compliance -")
+@pytest.mark.parametrize(("value", "prior", "severity"), [(-3e-5, 1e-4, "warnings"), (-2e-6, 2e-7, "errors")])
+def test_joints_that_rise_under_load_are_named(value, prior, severity):
+    """By their sigma; of compliances that the prior holds near 0 by that of the prior."""
+    arm = with_prior(arm_with(Compliance(MASSES, [2, 3])), prior, "compliance")
+    true = arm.with_values([value if p.kind == "compliance" else p.nominal for p in arm.parameters])
+    found = getattr(calibrate(arm, measured(true, 1), model="position").assessment.verdict, severity)
+    assert found[0].startswith("joints rise under load (compliance in sigma: theta2.compliance -")
 
 
 def test_a_robust_loss_does_not_take_for_outliers_what_an_effect_explains():

@@ -394,10 +394,10 @@ def check_compliances(case: Case) -> Iterator[Statement]:
     robot, sigma = case.problem.robot, np.sqrt(np.diagonal(case.spread.tangent))
     z = {name: case.solution.parameters[robot.index(name)] / sigma[k] if sigma[k] else 0.0
          for k, name in enumerate(case.problem.variables.names) if name.endswith(".compliance")}  # fmt: skip
-    worst = [f"{name} {z[name]:.0f}" for name in z if z[name] < LEAST_COMPLIANCE]
+    far = [] if case.fit.priors is None else [one.name for one in case.fit.priors.beyond if rises(one)]
+    worst = [f"{name} {z[name]:.0f}" for name in z if z[name] < LEAST_COMPLIANCE or name in far]
     text = f"joints rise under load (compliance in sigma: {shorten(worst)}): the masses or gravity are wrong, or a"
     text += " spring balances the arm; estimate the loads instead (`masses: free`)"
-    far = case.fit.priors is not None and any(rises(one) for one in case.fit.priors.beyond)
     yield Statement("error" if far else "warning", text, worst)
 
 
