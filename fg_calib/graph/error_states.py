@@ -10,6 +10,12 @@ so [y - L Z; Z] are rows of unit covariance that say the same. A factor of S, or
 dense where these are few or full, else sparse by minimum degree, which does not fill where pairs make a tree. Errors
 that reach one measurement only are private noise.
 
+Coefficients of error curves, over their prior sigma, are states too where rows share no errors; but rows, of residuals
+r, are linearised at values z0 of theirs, and z0 + dz ~ N(0, 1). So `r + A x + L dz = e` has dz = -Z at x = 0 with
+Z = S^-1 (L^T r + z0), and [r - L Z; z0 - Z] are the rows that are left; columns of A are treated alike, without z0. A
+row depends on curves by the rotations of the joints at its ends alone, and each rotation on four splines: L = D B with
+D block diagonal, so that L^T L = B^T (D^T D) B is a sum over measurements.
+
 The second-order term of a pair formed from poses, `(e_j - e_i)^T H (e_j - e_i) / 2`, counts as private, of variance q.
 For equal noise its correlation is at most 1/4 with that of a pair that shares a pose, and 0 with others: together all
 have at most the variance of independent terms of `q (1 + (m_i + m_j - 2) / 4)` (Gershgorin), m_i the pairs of pose i.
@@ -273,7 +279,7 @@ class WhitenedBlock(Brief):
             yield rows if turns is None else np.hstack([rows[:, :n], turns.loadings.toarray(), rows[:, n:]])
 
     def apart(self, at: State) -> "Iterator[tuple[Floats, CurveTurns | None]]":
-        """[J r] by all columns but those of error curves, and what joints turn by these, chunk by chunk."""
+        """[J r] by all columns but those of error curves, and derivatives in these as products, chunk by chunk."""
         chain, block, plain, n = at.chains[self.table], self.at(at), at.without_curves(), at.n_columns
         splines = chain.splines(block.trig)
         of_curves = at.curves and at.curves.at(splines)
@@ -428,8 +434,7 @@ class WhitenedRows(Brief):
     def without_curves(self, at: State, variance: float = 1.0) -> Eliminated:
         """The rows with error curves eliminated, where no errors are shared.
 
-        A curve's coefficients, in units of their sigma, are states like others, but with values to linearise at. Those
-        on which no row depends keep their prior.
+        See the module's head. Coefficients on which no row depends keep their prior.
 
         Args:
             at: The state.
@@ -595,8 +600,7 @@ def _whiten(
         if carried:
             W[span] = white
 
-    for _ in over_spans(whiten, n):
-        pass
+    over_spans(whiten, n)
     part = WhitenedBlock(replace(measured, data=data, whitening=whitening), block.table, number, block.nuisances[train])
     if not carried:
         return part, Sparse((n * h, noise.place.n_errors)), Sparse((n * h, 0))

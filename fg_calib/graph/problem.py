@@ -131,10 +131,12 @@ class Problem(FrozenArrays):
     def linearize(self, parameters: Floats, *, with_loss: bool = False, held: bool = False) -> NormalSystem:
         """The normal system at a parameter vector: all train rows, priors and added factors.
 
+        Noise and the loads of effects are those at `start`: see `relinearized_at` and `loaded_at`.
+
         Args:
             parameters: The parameter vector.
             with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
-            held: Whether error curves stay as they are, where no errors are shared and nothing was added.
+            held: Whether error curves stay as they are. Where errors are shared or something was added they do not.
 
         Raises:
             SolverError: A residual or derivative is not finite.
@@ -276,7 +278,7 @@ class Problem(FrozenArrays):
 
     @cached_property
     def _curve_roots(self) -> Callable[[bytes, float, bool], Eliminated]:
-        """The same with error curves eliminated, or held, where no errors are shared, at so many times the variance."""
+        """The same with error curves held, or eliminated at so many times the variance, where no errors are shared."""
         rows, at = self.rows, self.variables.at
 
         def roots(x: bytes, variance: float, held: bool) -> Eliminated:

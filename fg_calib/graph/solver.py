@@ -175,9 +175,9 @@ class Solution(FrozenArrays):
 def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDArray[Any] | None = None) -> Solution:
     """Estimate the parameters.
 
-    First measurement frame, base and tool alone with the arm at nominal, then a step of all but error curves, then
-    everything; of very many measurements at first some, drawn evenly, whose steps are not counted. Near the optimum
-    rows are whitened anew after every step, and robust weights follow from the residuals there.
+    First measurement frame, base and tool alone with the arm at nominal; then, of very many measurements, some, drawn
+    evenly; of an arm with error curves one step of all but these; then everything. Only steps of the last are counted.
+    Near the optimum rows are whitened anew after every step, and robust weights follow from the residuals there.
 
     Args:
         problem: The problem, with what was added to its graph.
@@ -232,7 +232,10 @@ def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
 
 
 def _started_by_rest(problem: Problem) -> Problem:
-    """A problem with error curves, started where a step of all but these leads, if that lowers the cost."""
+    """A problem with error curves, started where a step of all but these leads, if that lowers the cost.
+
+    With a robust loss it is not: least squares, without weights yet, would follow gross errors.
+    """
     if not problem.variables.n_curves or problem.options.loss != "none":
         return problem
     held = problem.linearize(problem.start, held=True)

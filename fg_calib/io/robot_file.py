@@ -11,7 +11,7 @@ joints:                                units: {length: mm, angle: deg}
 Rows of `convention: poe` are axes at zero readings, `{axis: [0, 0, 1], point: [0, 0, 340]}`, and `tool` the tool's pose
 there; x, y, pitch and roll are how far a calibrated axis is from there, and `sigma` is for people alone.
 
-`convention: cpc` (complete and parametrically continuous) is read as `poe`: parameters, effects and priors are those of
+`convention: cpc` (complete and parametrically continuous) is read as `poe`, with its parameters, effects and priors:
 
     base_T_tool(q) = base V0 Q1 V1 ... Qn Vn tool,   Q = Rz or Tz(sign q + offset),   V = R(b) Rz(beta) Txyz(l)
 

@@ -563,7 +563,10 @@ def read_joint_table(
 def _read_context(
     table: Table, robot: Robot, readings: Floats | None, units: Units, *, needed: bool = False
 ) -> Context:
-    """What effects depend on besides readings, where a table has it; joints outside the chain are at 0 if needed."""
+    """What effects depend on besides readings, as far as a table has it.
+
+    If it is needed, as for measurements, columns must be there, but for joints outside the chain, which are at 0 then.
+    """
     outside = outside_joints(robot)
 
     def read(columns: Sequence[str]) -> Floats:

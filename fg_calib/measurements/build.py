@@ -51,16 +51,16 @@ class Dataset(Brief):
 
         Args:
             robot: The robot.
-            values: Values of its parameters first, by which loads are found; nominal if None.
+            values: A vector that begins with values of its parameters, by which loads are found; nominal if None.
         """
         at = robot.nominal if values is None else values[: len(robot.parameters)]
         key = (tuple(joint.prismatic for joint in robot.joints), robot.effects, at[robot.loads].tobytes())
-        if key not in self._trigs:
+        if (found := self._trigs.get(key)) is None:  # of several threads each returns what it found or made itself
             if robot.loads:
                 self._trigs.clear()
             each = [table.measurements for table in self.tables]
-            self._trigs[key] = tuple(robot.trig(m.readings, m.context, values) for m in each)
-        return self._trigs[key]
+            found = self._trigs[key] = tuple(robot.trig(m.readings, m.context, values) for m in each)
+        return found
 
     @property
     def n_configurations(self) -> int:

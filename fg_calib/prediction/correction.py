@@ -243,7 +243,10 @@ def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context
 
     @cache
     def look(*q: float) -> tuple[Floats, Floats]:
-        """Misses of the point and of the orientation, shape (6,), and their derivative in the joints."""
+        """Misses of the point and of the orientation, shape (6,), and their derivative in the joints, loads constant.
+
+        Of the orientation it is a = Log(R_target R^T); R turns by w in the base frame, so da = -Jr^-1(a) w.
+        """
         at = forward(chain, robot.trig(np.array([q]), context))
         turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
         of_turn = -inverse_right_jacobian(turn)[0] @ at.jacobian[0, :3]

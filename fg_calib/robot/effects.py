@@ -17,7 +17,8 @@ Joint i turns by q_i plus the sum of its effects; each is a coefficient, a param
 | `Thermal` | a2.expansion, theta2.drift | length or 1, times temperature minus reference |
 
 A joint of a URDF has its own name in place of `theta2`. Where joints give way, tau is that of the joints as they have
-turned: q + k tau(q), one step of the fixed point, which leaves errors of the third order in k.
+turned: q + k tau(q), one step of the fixed point, which leaves errors of the third order in k. Derivatives of poses
+take tau as constant: in k, lengths and readings they lack k dtau, some thousandth of them.
 
 References:
     Jia et al. (2019), section 2, for the geometry. Judd, Knasinski (1990), A technique to calibrate industrial robots
@@ -368,7 +369,7 @@ class Compliance(_Loaded, Record):
             readings = readings.copy()
             readings[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
         parts = [self._moments(robot, readings, context, joints, along)]
-        if self.gravity == "estimate":  # moments are linear in gravity, so k M is in either of both
+        if self.gravity == "estimate":  # k M has the tilts' share already: tilts have its derivatives, less that share
             turned = (np.cross(e, gravity) for e in np.eye(3)[:2])
             each = [self._moments(robot, readings, context, joints, g) for g in turned]
             x, y = (at[: m.shape[1]] * m for m in each)
