@@ -204,7 +204,7 @@ class State(Brief):
         return replace(self, chains=chains, n_columns=0, n_nuisance=0, curves=None)
 
     def without_curves(self) -> "State":
-        """Copy without derivatives in error curves, whose columns are the first nuisances'."""
+        """Copy without derivatives in error curves, whose columns are the first nuisance columns."""
         n = 0 if self.curves is None else len(self.curves.sigma)
         return replace(self, columns=self.columns - n, n_nuisance=self.n_nuisance - n, curves=None)
 
@@ -307,12 +307,12 @@ class WhitenedBlock(Brief):
 
 
 class CurveTurns(Brief):
-    """Derivatives of measurements in what joints turn, and of these turns in coefficients of error curves.
+    """Derivatives D of measurements in rotations of joints, and B of these in coefficients of error curves.
 
     Attributes:
-        turns: Derivatives in the turns of joints that have a curve, end by end, shape (n, residual_dim, k).
-        knots: Numbers of the coefficients that turns depend on, four each, shape (n, 4 k).
-        weights: Derivatives of the turns in these, shape (n, 4 k).
+        turns: D, whitened, by end and joint with a curve, which are k, shape (n, residual_dim, k).
+        knots: Numbers of the coefficients that each rotation depends on, four each, shape (n, 4 k).
+        weights: B, the derivatives of the rotations in these, shape (n, 4 k).
         n_curves: Number of coefficients.
     """
 
@@ -323,13 +323,13 @@ class CurveTurns(Brief):
 
     @cached_property
     def splines(self) -> Sparse:
-        """Derivatives of the turns in the coefficients, shape (n k, n_curves)."""
+        """B as a matrix, shape (n k, n_curves)."""
         starts = np.arange(0, self.knots.size + 1, 4)
         return Sparse((self.weights.ravel(), self.knots.ravel(), starts), shape=(len(starts) - 1, self.n_curves))
 
     @property
     def loadings(self) -> Sparse:
-        """L, derivatives of the rows in the coefficients, shape (n residual_dim, n_curves)."""
+        """L = D B, derivatives of the rows in the coefficients, shape (n residual_dim, n_curves)."""
         return Sparse(block_diagonal(self.turns) @ self.splines)
 
     def times(self, x: Floats) -> Floats:
@@ -344,16 +344,16 @@ class CurveTurns(Brief):
         return np.asarray(self.splines.T @ of_turns.reshape(n * k, y.shape[1]))
 
     def among(self, to: Integers, scale: Floats) -> "CurveTurns":
-        """The same in coefficients that are numbered, and measured, in another way."""
+        """The same in other coefficients: number `to[i]`, and in units of `scale[i]`, for number i; -1 is not used."""
         return replace(self, knots=to[self.knots], weights=self.weights * scale[self.knots], n_curves=int(to[-1]) + 1)
 
 
 class CurveSplines(NamedTuple):
-    """How far joints turn by error curves at some configurations.
+    """How rotations of joints follow from error curves at some configurations.
 
     Attributes:
         joints: The joints that have a curve, shape (k,).
-        knots: Numbers of the coefficients that each turn depends on, shape (n_configurations, k, 4).
+        knots: Numbers of the coefficients that each rotation depends on, shape (n_configurations, k, 4).
         weights: Its derivatives in these, shape (n_configurations, k, 4).
         n_curves: Number of coefficients.
     """
@@ -364,10 +364,10 @@ class CurveSplines(NamedTuple):
     n_curves: int
 
     def turns(self, J: Floats, ends: Integers, n_joints: int) -> CurveTurns:
-        """What measurements depend on by error curves.
+        """How measurements follow from error curves.
 
         Args:
-            J: Derivatives in what each joint turns, end by end, and whatever follows, shape (n, residual_dim, m).
+            J: Derivatives in rotations of all joints, end by end, then others, shape (n, residual_dim, m).
             ends: Configuration of each end, shape (n, n_ends).
             n_joints: Number of joints.
         """
@@ -467,7 +467,7 @@ class WhitenedRows(Brief):
         return Eliminated(own, rows[:, :-1], -rows[:, -1], follow, spread, np.zeros(len(own), dtype=np.bool_))
 
     def with_curves_held(self, at: State) -> Eliminated:
-        """The rows with error curves held, and these curves' priors in a last row."""
+        """The rows with error curves held, where no errors are shared; the last has the cost of the curves' priors."""
         assert at.curves is not None
         R, n = self.square_root(at.without_curves()), len(at.curves.sigma)
         b = np.append(-R[:, -1], np.linalg.norm(at.curves.values / at.curves.sigma))

@@ -495,7 +495,13 @@ def _off_nominal(frame: Floats, nominal: Floats) -> tuple[Floats, Floats]:
 
 
 def unknown_prior_rows(variables: Variables, parameters: Floats, *, of_curves: bool = True) -> tuple[Floats, Floats]:
-    """Whitened priors of nuisance variables and their derivatives, shapes (n,), (n, n_columns + n_nuisance)."""
+    """Whitened priors of nuisance variables and their derivatives, shapes (n,), (n, n_columns + n_nuisance).
+
+    Args:
+        variables: The variables.
+        parameters: The parameter vector.
+        of_curves: Whether those of error curves are among them.
+    """
     found = [(v, *v.prior) for v in variables.nuisance if v.prior is not None and (of_curves or v.kind != "curve")]
     columns = np.concatenate([np.zeros(0, np.int64), *(np.r_[v.columns] for v, _, _ in found)])
     x = np.concatenate([np.zeros(0), *(parameters[v.places] - mean for v, mean, _ in found)])

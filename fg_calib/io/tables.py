@@ -575,7 +575,7 @@ def _read_context(
         return np.full((table.n_rows, len(columns)), 0.0 if needed else np.nan)
 
     if needed and (missing := outside_joints(robot, HEAVY).keys() - set(table.frame.columns)):
-        _log.warning("%s: no column %s: outside the chain joints are at 0", table.name, ", ".join(sorted(missing)))
+        _log.warning("%s: no column %s: joints outside the chain are at 0", table.name, ", ".join(sorted(missing)))
     context = [effect.context(robot, readings, read) for effect in robot.effects]
     return {name: values for one in context for name, values in one.items() if not np.isnan(values).all()}
 

@@ -159,7 +159,7 @@ def test_joints_outside_the_chain_are_columns_that_a_table_may_have(tmp_path, ca
     found = read_measurements(table, robot, units=Units("mm", "deg")).context
     assert {name: q.item() for name, q in found.items()} == pytest.approx({OUTSIDE[0]: np.pi / 6, OUTSIDE[1]: 0.0})
     (record,) = caplog.records
-    assert record.getMessage() == "t.csv: no column other_slide: outside the chain joints are at 0"
+    assert record.getMessage() == "t.csv: no column other_slide: joints outside the chain are at 0"
     assert robot.effects[0].assumed(found) == []
     (tmp_path / "q.csv").write_text("shoulder,elbow,other_slide\n10,20,300\n")
     found = read_joint_table(tmp_path / "q.csv", robot, Units("mm", "deg"))[2]
