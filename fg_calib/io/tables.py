@@ -482,9 +482,12 @@ def read_table(
     path: Path | str | Any, robot: Robot, columns: Mapping[str, Column] | None = None, skip_lines: int = 0
 ) -> Table:
     """A table of configurations of a robot; for `columns` and `skip_lines` see `read_measurements`."""
-    joints, known = {joint.name for joint in robot.joints}, {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
+    joints, others = {joint.name for joint in robot.joints}, {*KNOWN, *(f"q{i + 1}" for i in range(robot.n_joints))}
+    known, hint = set(others), "rename the effect's column, or the joint outside the chain"
 
     def note(names: Sequence[str]) -> Floats:
+        taken = sorted((others | joints).intersection(names))
+        inputs.expect(not taken, robot.name, f"effects by {', '.join(taken)}", "columns of nothing else", hint)
         known.update(names)
         return np.full((1, len(names)), np.nan)
 

@@ -91,7 +91,7 @@ def test_select_stands_for_the_standard_effects(read):
 
 
 @pytest.mark.parametrize(("effects", "said"), [
-    ("backlash: {side: q}", "t.csv: q1: found 0.5, expected sides of approach, -1, 0 or 1"),
+    ("backlash: {side: q}", "arm: effects by q1, q2, q3, expected columns of nothing else"),
     ("compliance: {payload: {mass: 1, column: load}}", "t.csv: load: found -2, expected masses, 0 or above"),
 ])  # fmt: skip
 def test_columns_of_what_cannot_be_are_refused(read, tmp_path, effects, said):
