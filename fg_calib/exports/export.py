@@ -93,8 +93,8 @@ class Export(Record):
 
 
 def with_names(text: str, stem: str) -> str:
-    """Text with the real names of the files of effects next to a file."""
-    return re.sub(r"\*(?=_curves\.csv|_effects\.yaml)", lambda _: stem, text)
+    """Text with the real names of the files of effects next to a file, but for a name that no comment can hold."""
+    return re.sub(r"\*(?=_curves\.csv|_effects\.yaml)", lambda _: "*" if "--" in stem else printable(stem), text)
 
 
 @checked

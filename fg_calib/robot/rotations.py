@@ -63,7 +63,7 @@ def least_rotation(direction: Floats) -> Floats:
         -bx by / (1 + bz)      1 - by^2 / (1 + bz)    by
         -bx                    -by                    bz
 
-    Of b = -z there are many: it is singular there alone.
+    Of b = -z there are many: it is singular there alone, and rounding grows as 1 / (1 + bz).
 
     Args:
         direction: b, shape (3,).

@@ -181,7 +181,6 @@ def test_exports_without_effects_write_them_next_to_the_file(calibrated, tmp_pat
     assert f"off where it was measured: position {rms:.4g} mm RMS" in made.notes[0]
     made.write(tmp_path / "arm.yaml")
     geometry = read_robot(tmp_path / "arm.yaml")
-    assert not geometry.effects
     assert "next to it: arm_curves.csv, arm_effects.yaml in rad" in (tmp_path / "arm.yaml").read_text()
     assert tool_points(geometry, q) == pytest.approx(without, abs=1e-9)
     rows = [line.split(",") for line in (tmp_path / "arm_curves.csv").read_text().splitlines()]
@@ -193,8 +192,9 @@ def test_exports_without_effects_write_them_next_to_the_file(calibrated, tmp_pat
     values = yaml.safe_load((tmp_path / "arm_effects.yaml").read_text())["effects"]["values"]
     assert values["theta2.compliance"] == found.parameters["theta2.compliance"].estimate
     assert not any("curve" in name for name in values)
-    assert export(found, "yaml").effects == {}
-    assert export(found, "zeros").effects == {}
+    assert export(found, "yaml").effects == export(found, "zeros").effects == {}
+    export(found, "urdf").write(tmp_path / "a---b.urdf")
+    assert not read_robot(tmp_path / "a---b.urdf").effects
 
 
 def test_tables_to_predict_at_may_have_what_effects_depend_on(tmp_path):
