@@ -100,6 +100,11 @@ def _with_slopes(values: Floats, slopes: Floats | float = 0.0) -> Floats:
     return np.stack([values, np.broadcast_to(slopes, values.shape)], axis=2)
 
 
+def _known(context: Context, name: str, default: float) -> Floats:
+    """What was measured by some name, or a default for rows of which it is not known, shape (n,) or (1,)."""
+    return np.where(np.isnan(given := context.get(name, np.full(1, np.nan))), default, given)
+
+
 class Gain(Effect, Record):
     """An encoder or gear ratio that is slightly off: in proportion to the reading."""
 
@@ -186,7 +191,7 @@ class Hinge(NamedTuple):
 
     def place(self, points: Floats, context: Context) -> Floats:
         """Points that it moves, from its own frame to that of what it hangs on, shape (n, 3) or (1, 3), [m]."""
-        q, T, u = context.get(self.joint.name, np.zeros(1))[:, None], np.array(self.origin), np.array(self.axis)
+        q, T, u = _known(context, self.joint.name, 0.0)[:, None], np.array(self.origin), np.array(self.axis)
         if self.joint.prismatic:
             moved = points + q * u
         else:
@@ -238,7 +243,7 @@ class _Moments:
         self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
         frames = zip(masses, map(self._frames.__getitem__, ends), strict=True)
         at = [p + sum(x * axis for x, axis in zip(m.at(context).T, axes, strict=True)) for m, (axes, p) in frames]
-        each = [context.get(m.column, m.mass) for m in masses]
+        each = [_known(context, m.column, m.mass) for m in masses]
         self._masses = [(end, mass, mass * x) for end, mass, x in zip(ends, each, at, strict=True)]
 
     def of_masses(self, place: int, which: slice) -> Floats:
@@ -451,7 +456,7 @@ class Backlash(_Loaded, Record):
         if self.side == "load":
             of, gravity = Compliance(self.masses), np.array(self.gravity)
             return _with_slopes(np.sign(of._torques(robot, readings, context, joints, gravity)))
-        return _with_slopes(context.get(self.side, np.zeros(readings.shape))[:, joints])
+        return _with_slopes(np.nan_to_num(context.get(self.side, np.zeros(readings.shape))[:, joints]))
 
     def context(self, robot: Robot, readings: Floats | None, read: Callable[[Sequence[str]], Floats]) -> Context:
         if self.side == "load":

@@ -258,7 +258,7 @@ class Effect(ABC):
         Args:
             robot: The robot without effects.
             readings: Joint readings, shape (n, n_joints), [rad] (prismatic: [m]).
-            context: What else was measured, by name, shape (n,) or (n, n_joints) each.
+            context: What else was measured, by name, shape (n,) or (n, n_joints) each; nan where it is unknown.
             at: Values of the terms' coefficients, shape (n_terms,).
         """
 

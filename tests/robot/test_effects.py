@@ -172,12 +172,12 @@ def test_free_loads_hold_the_torques_of_masses_beyond_a_slide():
     assert found @ np.linalg.lstsq(found, known)[0] == pytest.approx(known, abs=1e-9)
 
 
-def test_a_payload_of_each_row_weighs_what_its_column_says(arm):
-    masses, q = (*MASSES, Mass(4, 2.0, (0.0, 0.1, 0.1), "load")), np.repeat(Q[:1], 2, axis=0)
-    of = Compliance(masses, [2, 3])
-    found = of.values(arm, q, of.context(arm, q, lambda names: np.array([[0.0], [7.0]])), np.zeros(2))[:, :, 0]
-    none, seven = (Compliance((*MASSES, *m), [2, 3]) for m in ((), (masses[-1]._replace(mass=7.0, column=""),)))
-    for row, one in zip(found, (none, seven), strict=True):
+def test_a_payload_of_each_row_weighs_what_its_column_says_or_else_its_mass(arm):
+    payload, q = Mass(4, 2.0, (0.0, 0.1, 0.1), "load"), np.repeat(Q[:1], 3, axis=0)
+    of = Compliance((*MASSES, payload), [2, 3])
+    found = of.values(arm, q, of.context(arm, q, lambda _: np.array([[0.0], [7.0], [np.nan]])), np.zeros(2))[:, :, 0]
+    for row, mass in zip(found, (0.0, 7.0, 2.0), strict=True):
+        one = Compliance((*MASSES, payload._replace(mass=mass, column="")), [2, 3])
         assert row == pytest.approx(one.values(arm, q[:1], {}, np.zeros(2))[0, :, 0])
 
 
