@@ -464,7 +464,7 @@ def _lacking(robot: Robot, readings: Floats) -> tuple[list[str], Integers, Float
     """
     arm, n, names, joints, values = robot.geometry, robot.n_joints, list[str](), list[int](), list[Floats]()
     slides, has = [k for k, joint in enumerate(robot.joints, 1) if joint.prismatic], {p.name for p in robot.parameters}
-    loads = ([Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, n)]) if len(slides) < n else ()
+    loads = ([Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, max(n, 2))]) if len(slides) < n else ()
     compliant = [(e.terms(arm), e.gravity) for e in robot.effects if isinstance(e, Compliance)]
     loaded = [{t.owner for terms, g in compliant for t in terms if g == "estimate" or g[k]} for k in range(3)]
     candidates: list[tuple[str, Effect, set[int]]] = [("2 position", Gain(slides), set())] * bool(slides)

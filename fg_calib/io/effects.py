@@ -157,7 +157,7 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
         elif p.kind in EFFECT_KINDS and p.nominal:
             values[p.name] = p.nominal
     values |= {name: each for name, each in curves.items() if any(each)}
-    return out | ({"values": values} if values else {})
+    return out | ({"values": values} if values else {}) | ({"select": True} if robot.select_effects else {})
 
 
 def _mapping_of(masses: Sequence[Mass]) -> dict[int | str, Any]:

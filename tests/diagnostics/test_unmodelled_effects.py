@@ -15,7 +15,7 @@ from fg_calib import Table, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics import LIKE_NOISE, basis_of
 from fg_calib.diagnostics.unmodelled_effects import LINK, find_change, find_systematic, forgotten_offsets, regress
 from fg_calib.graph import prior_rows, unknown_prior_rows
-from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass, pose
+from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass, Robot, pose
 from fg_calib.statistics import estimate_noise, spread_of
 
 
@@ -113,6 +113,12 @@ def test_curves_are_eliminated_as_dense_columns_with_their_priors_would_be():
     assert regression.fit.dof == len(r) - Q.shape[1]
     curves = regression.fit.r[problem.n_residuals :][: len(r_1)]  # a state is minus its coefficient
     assert np.corrcoef(curves, r_1)[0, 1] < -0.99
+
+
+def test_an_arm_of_one_joint_is_looked_at():
+    robot = Robot.from_dh([[0.3, 0.1, 0.2, 0.0]], "dh")
+    m = measure_points(robot, np.linspace(-1.0, 1.0, 9)[:, None], np.random.default_rng(1))
+    assert find_systematic(regress(solve(build_problem(robot, m, model="position")))).p_value > 1e-3
 
 
 def test_rows_between_landmarks_alone_follow_no_effect_of_a_joint():

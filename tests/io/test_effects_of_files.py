@@ -61,12 +61,12 @@ def test_effects_are_read_with_their_options(read):
 
 
 def test_a_robot_with_effects_is_written_and_read_back(read, tmp_path):
-    robot = read(HEAD + EFFECTS)
+    robot = read(HEAD + EFFECTS + "  select: true\n")
     write_robot(tmp_path / "again.yaml", robot)
-    again = read_robot(tmp_path / "again.yaml")
+    again, loaded = read_robot(tmp_path / "again.yaml"), {"load": np.full(5, 3.0)}
+    assert again.select_effects
     q = np.random.default_rng(0).uniform(-2, 2, (5, 3))
     assert again.nominal == pytest.approx(robot.nominal, abs=1e-15)
-    loaded = {"load": np.full(5, 3.0)}
     assert again.trig(q, loaded) == pytest.approx(robot.trig(q, loaded), abs=1e-12)  # masses on one link are one
 
 

@@ -72,11 +72,7 @@ def test_page_one_says_whether_and_how_well_it_may_be_used(made, page):
     (verdict,) = (text_of(one) for one in page.xpath("//div[contains(@class, 'verdict')]"))
     assert verdict.startswith("DOUBTFUL: do not use it yet FAIL: position")
     tiles = [text_of(tile) for tile in page.xpath("//div[@class='tile']")]
-    assert [" error of the tool itself" in tile for tile in tiles] == [
-        True,
-        False,
-        False,
-    ]  # no orientation
+    assert [" error of the tool itself" in tile for tile in tiles] == [True, False, False]  # no orientation
     assert all(finding in verdict for finding in made.findings)
     lengths = 1e3 * made.configurations["rms_position"].to_numpy()[made.report_data.held_out]
     old, new = made.result.residual_statistics["test"]["position"]["before"], np.quantile(lengths, [0.95, 1.0])
