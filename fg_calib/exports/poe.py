@@ -1,4 +1,4 @@
-"""An arm by its screw axes (a product of exponentials, CPC), and an axis report: how far each is from nominal.
+"""An arm by its screw axes (a product of exponentials, or links of CPC), and an axis report: how far each is off.
 
 The point of an axis is that nearest to the base's origin, p - z (z . p) with any point p on it. From a frame there with
 the axis as its z, another axis crosses the plane across z at (x, y), and its direction is

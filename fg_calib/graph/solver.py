@@ -234,7 +234,8 @@ def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
 def _started_by_rest(problem: Problem) -> Problem:
     """A problem with error curves, started where a step of all but these leads, if that lowers the cost.
 
-    With a robust loss it is not: least squares, without weights yet, would follow gross errors.
+    With a robust loss it is not: least squares, without weights yet, would follow gross errors. Where errors are shared
+    or something was added curves cannot be held, and the step is one of all (see `Problem.linearize`).
     """
     if not problem.variables.n_curves or problem.options.loss != "none":
         return problem

@@ -243,9 +243,10 @@ def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context
 
     @cache
     def look(*q: float) -> tuple[Floats, Floats]:
-        """Misses of the point and of the orientation, shape (6,), and their derivative in the joints, loads constant.
+        """Misses of the point and of the orientation, shape (6,), and their derivative in the joints.
 
-        Of the orientation it is a = Log(R_target R^T); R turns by w in the base frame, so da = -Jr^-1(a) w.
+        Of the orientation it is a = Log(R_target R^T); R turns by w in the base frame, so da = -Jr^-1(a) w. Slopes of
+        error curves and loads are left out.
         """
         at = forward(chain, robot.trig(np.array([q]), context))
         turn = rotation_vector(rotation[None] @ np.swapaxes(at.rotation, 1, 2))
