@@ -21,17 +21,7 @@ from fg_calib.inputs import CalibrationError, Floats, Record, shorten
 from fg_calib.measurements import missing_values
 from fg_calib.observability import NOT_EXCITED, Identifiability
 from fg_calib.robot import SCALES, pose
-from fg_calib.statistics import (
-    CONFIDENCE,
-    FACTOR,
-    FINE,
-    LEAST_REDUNDANCY,
-    OUTLIER_WEIGHT,
-    Fit,
-    GrossErrors,
-    Spread,
-    upper_probability,
-)
+from fg_calib.statistics import CONFIDENCE, FACTOR, FINE, LEAST_REDUNDANCY, OUTLIER_WEIGHT, Fit, GrossErrors, Spread
 from fg_calib.statistics.priors import Beyond
 
 Severity = Literal["error", "warning", "note"]
@@ -460,7 +450,9 @@ def check_estimated_noise(case: Case) -> Iterator[Statement]:
         yield Statement("error", text, (fit.table, fit.kind) in estimated and ratio >= LARGE_NOISE)
         text = f"the noise estimated of {fit.kind} is {fit.factor:.3g} times that specified (1 mm, 1 mrad where nothing"
         text += " was): is the instrument as bad? Else the model lacks an effect, and no sigma holds what it costs"
-        significant = fit.factor > MAX_NOISE_FACTOR and upper_probability(fit.factor**2, fit.degrees) < SIGNIFICANT
+        significant = (
+            fit.factor > MAX_NOISE_FACTOR and statistics.upper_probability(fit.factor**2, fit.degrees) < SIGNIFICANT
+        )
         yield Statement("warning", text, gross is None and significant)
 
 

@@ -573,9 +573,14 @@ def _read_context(
     outside = outside_joints(robot)
 
     def read(columns: Sequence[str]) -> Floats:
-        if set(columns) <= set(table.frame.columns) or (needed and columns[0] not in outside):
-            return table.numbers(columns) * [units.factor(outside[c].unit) if c in outside else 1.0 for c in columns]
-        return np.full((table.n_rows, len(columns)), 0.0 if needed else np.nan)
+        joint = outside.get(columns[0])
+        if not set(columns) <= set(table.frame.columns) and (joint or not needed):
+            return np.full((table.n_rows, len(columns)), 0.0 if needed else np.nan)
+        values = table.numbers(columns) * units.factor("" if joint is None else joint.unit)
+        if joint is not None:
+            good = np.clip(values[:, 0], joint.lower, joint.upper) == values[:, 0]
+            table.require(good, columns[0], f"{joint.lower:g} to {joint.upper:g} {joint.unit}, its limits")
+        return values
 
     if needed and (missing := outside_joints(robot, HEAVY).keys() - set(table.frame.columns)):
         _log.warning("%s: no column %s: joints outside the chain are at 0", table.name, ", ".join(sorted(missing)))

@@ -34,8 +34,8 @@ effects:
   values: {theta2.compliance: 1.5e-5, theta2.curve: [1e-4, 2e-4, 3e-4, 4e-4, 5e-4, 6e-4, 7e-4, 8e-4]}
 """
 LINK = '<link name="{}"><inertial><origin xyz="{}"/><mass value="{}"/></inertial></link>'
-ENDS = '<parent link="{}"/><child link="{}"/><origin xyz="{}" rpy="{}"/><axis xyz="{}"/></joint>'
-JOINT = '<joint name="{}" type="{}">' + ENDS
+ENDS = '<parent link="{}"/><child link="{}"/><origin xyz="{}" rpy="{}"/><axis xyz="{}"/><limit lower="-2" upper="2"/>'
+JOINT = f'<joint name="{{}}" type="{{}}">{ENDS}</joint>'
 
 
 @pytest.fixture
@@ -120,12 +120,12 @@ JOINTS = [
 ]
 
 
-def two_arms(folder, *ends):
+def two_arms(folder, base, tip):
     """The robot between two links, written and read."""
     text = "".join([LINK.format(n, COM[n], MASSES[n]) for n in COM] + [JOINT.format(*joint) for joint in JOINTS])
     (folder / "arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
-    chain = "urdf: arm.urdf\nbase_link: {}\ntip_link: {}\neffects: {{compliance: true}}\n"
-    (folder / "robot.yaml").write_text(chain.format(*ends))
+    ends = f"base_link: {base}\ntip_link: {tip}\n"
+    (folder / "robot.yaml").write_text("urdf: arm.urdf\neffects: {compliance: true}\n" + ends)
     return read_robot(folder / "robot.yaml")
 
 
@@ -155,11 +155,11 @@ def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
 
 def test_joints_outside_the_chain_are_columns_that_a_table_may_have(tmp_path, caplog):
     robot, table = two_arms(tmp_path, "base", "fore"), tmp_path / "t.csv"
-    table.write_text("shoulder,elbow,x,y,z,other_shoulder\n10,20,1,2,3,30\n")
+    table.write_text("shoulder,elbow,x,y,z,other_shoulder\n1,2,1,2,3,30\n")
+    assert "other_shoulder: found '30', expected -2 to 2 rad" in refusal(read_measurements, table, robot)
     found = read_measurements(table, robot, units=Units("mm", "deg")).context
     assert {name: q.item() for name, q in found.items()} == pytest.approx({OUTSIDE[0]: np.pi / 6, OUTSIDE[1]: 0.0})
-    (record,) = caplog.records
-    assert record.getMessage() == "t.csv: no column other_slide: joints outside the chain are at 0"
+    assert caplog.messages[-1] == "t.csv: no column other_slide: joints outside the chain are at 0"
     assert robot.effects[0].assumed(found) == []
     (tmp_path / "q.csv").write_text("shoulder,elbow,other_slide\n10,20,300\n")
     found = read_joint_table(tmp_path / "q.csv", robot, Units("mm", "deg"))[2]
