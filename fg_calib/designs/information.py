@@ -252,7 +252,7 @@ class Posterior(Brief):
         v = self.problem.variables
         left = eliminate(self.rows, np.zeros(len(self.rows)), v.n_columns)
         own = left.inverse[: v.n_curves]
-        curves = np.hstack([left.follow[: v.n_curves], np.linalg.cholesky(own @ own.T)])
+        curves = np.hstack([left.follow[: v.n_curves], np.transpose(np.linalg.qr(own.T, mode="r"))])
         return replace(statistics.covariance_of_rows(v, self.problem.start, left.A), curves=curves)
 
     def error_of_curves(self, task: Task) -> float:

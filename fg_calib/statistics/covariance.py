@@ -138,8 +138,9 @@ class Spread(TangentCovariance):
         n = self.variables.n_columns
         follow, own = np.split(self.curves, [n], axis=1)
         sure = own / self.variables.all_scales[n : n + len(own), None]  # of their priors
-        grown = np.eye(len(own)) + (variance - 1.0) * (np.eye(len(own)) - sure.T @ sure)
-        curves = np.hstack([follow, np.linalg.cholesky(own @ grown @ own.T)])
+        share, V = np.linalg.eigh(sure.T @ sure)  # in [0, 1] but for rounding
+        grown = V * np.sqrt(1.0 + (variance - 1.0) * (1.0 - np.clip(share, 0.0, 1.0)))
+        curves = np.hstack([follow, np.transpose(np.linalg.qr((own @ grown).T, mode="r"))])
         return replace(self, root=root, tangent=self.tangent + more, actual=self.actual + more, curves=curves)
 
 
@@ -183,7 +184,7 @@ def spread_of(solution: graph.Solution) -> Spread:
 def _curves_of(system: graph.NormalSystem, n: int) -> Floats:
     """`TangentCovariance.curves` of a system, whose first nuisance columns are those of the curves."""
     own = system.left.inverse[:n]
-    return np.hstack([system.left.follow[:n], np.linalg.cholesky(own @ own.T)])
+    return np.hstack([system.left.follow[:n], np.transpose(np.linalg.qr(own.T, mode="r"))])
 
 
 def held_frames(undetermined: Floats, undetermined_at_nominal: Floats, scales: Floats, n_robot: int) -> Floats:
