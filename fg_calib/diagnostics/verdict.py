@@ -368,7 +368,7 @@ def check_priors(case: Case) -> Iterator[Statement]:
     for one in fit.beyond:
         text = f"{one.name} lies {one.z:.1f} prior sigmas from where it was specified: {causes}"
         yield Statement("error", text, one.is_place)
-    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place and not rises(one)]
+    worst = [f"{one.name} {one.z:+.1f}" for one in fit.beyond if not one.is_place and not is_negative_compliance(one)]
     text = f"corrections beyond their prior sigmas (in sigma of these: {shorten(worst)}): {causes}"
     yield Statement("error", text, worst)
     largest = [f"{fit.names[i]} {fit.z[i]:+.1f}" for i in np.argsort(-np.abs(fit.z))]
@@ -384,14 +384,14 @@ def check_compliances(case: Case) -> Iterator[Statement]:
     robot, sigma = case.problem.robot, np.sqrt(np.diagonal(case.spread.tangent))
     z = {name: case.solution.parameters[robot.index(name)] / sigma[k] if sigma[k] else 0.0
          for k, name in enumerate(case.problem.variables.names) if name.endswith(".compliance")}  # fmt: skip
-    far = [] if case.fit.priors is None else [one.name for one in case.fit.priors.beyond if rises(one)]
+    far = [] if case.fit.priors is None else [one.name for one in case.fit.priors.beyond if is_negative_compliance(one)]
     worst = [f"{name} {z[name]:.0f}" for name in z if z[name] < LEAST_COMPLIANCE or name in far]
     text = f"joints rise under load (compliance in sigma: {shorten(worst)}): the masses or gravity are wrong, or a"
     text += " spring balances the arm; estimate the loads instead (`masses: free`)"
     yield Statement("error" if far else "warning", text, worst)
 
 
-def rises(one: Beyond) -> bool:
+def is_negative_compliance(one: Beyond) -> bool:
     """Whether a correction beyond its prior sigma is a negative compliance."""
     return one.name.endswith(".compliance") and one.z < 0.0
 

@@ -264,7 +264,7 @@ class WhitenedBlock(Brief):
         one = slice(k, k + 1)
         return replace(self, block=residuals.rows_of(self.block, one), nuisances=self.nuisances[one])
 
-    def weighed(self, weight: float) -> "WhitenedBlock":
+    def weighted(self, weight: float) -> "WhitenedBlock":
         """Copy whose measurements count for so many times as much."""
         return replace(self, block=replace(self.block, whitening=self.block.whitening * np.sqrt(weight)))
 
@@ -343,7 +343,7 @@ class CurveTurns(Brief):
         of_turns = np.swapaxes(self.turns, 1, 2) @ y.reshape(n, h, y.shape[1])
         return np.asarray(self.splines.T @ of_turns.reshape(n * k, y.shape[1]))
 
-    def among(self, to: Integers, scale: Floats) -> "CurveTurns":
+    def renumbered(self, to: Integers, scale: Floats) -> "CurveTurns":
         """The same in other coefficients: number `to[i]`, and in units of `scale[i]`, for number i; -1 is not used."""
         return replace(self, knots=to[self.knots], weights=self.weights * scale[self.knots], n_curves=int(to[-1]) + 1)
 
@@ -442,10 +442,10 @@ class WhitenedRows(Brief):
         """
         assert at.curves is not None
         sigma, before = at.curves.sigma, at.curves.values / at.curves.sigma
-        found = [(y, of) for part in self.parts for y, of in part.weighed(1.0 / variance).apart(at) if of]
+        found = [(y, of) for part in self.parts for y, of in part.weighted(1.0 / variance).apart(at) if of]
         counts = sum((np.bincount(of.knots.ravel(), None, len(sigma)) for _, of in found), np.zeros(len(sigma)))
         seen, place = np.flatnonzero(counts), np.cumsum(counts > 0) - 1
-        found = [(y, of.among(place, sigma)) for y, of in found]
+        found = [(y, of.renumbered(place, sigma)) for y, of in found]
         S, b = np.eye(len(seen)), np.zeros((len(seen), at.n_columns + at.n_nuisance + 1 - len(sigma)))
         for y, of in found:
             add_gram(np.swapaxes(of.turns, 1, 2) @ of.turns, of.knots, of.weights, S)

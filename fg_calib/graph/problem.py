@@ -128,6 +128,11 @@ class Problem(FrozenArrays):
         """The normal system at `start`."""
         return self.linearize(self.start)
 
+    @property
+    def curves_are_states(self) -> bool:
+        """Whether error curves are eliminated as states, or held: no errors are shared, and nothing was added."""
+        return bool(self.variables.n_curves) and not self.rows.states.n_states and not self.has_more
+
     def linearize(self, parameters: Floats, *, with_loss: bool = False, held: bool = False) -> NormalSystem:
         """The normal system at a parameter vector: all train rows, priors and added factors.
 
@@ -136,17 +141,17 @@ class Problem(FrozenArrays):
         Args:
             parameters: The parameter vector.
             with_loss: Whether a robust loss counts for what it loses of clean data (see `robust.Effect`).
-            held: Whether error curves stay as they are. Where errors are shared or something was added they do not.
+            held: Whether error curves stay as they are, if they are states.
 
         Raises:
             SolverError: A residual or derivative is not finite.
         """
         v, given = self.variables, self.rows  # of the system, which would keep the problem in a cycle
         priors = np.column_stack(prior_rows(v, parameters)[::-1])
-        if not v.n_curves or given.states.n_states or self.has_more:
-            rows: Floats | Eliminated = square_root(self, parameters, with_loss=with_loss)
+        if self.curves_are_states:
+            rows: Floats | Eliminated = self._without_curves(parameters, with_loss, held)
         else:
-            rows = self._without_curves(parameters, with_loss, held)
+            rows = square_root(self, parameters, with_loss=with_loss)
         with np.errstate(over="ignore"):
             size = rows if isinstance(rows, np.ndarray) else rows.A
             if not np.isfinite(np.vdot(size, size) + np.vdot(priors, priors)):

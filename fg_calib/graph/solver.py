@@ -194,7 +194,7 @@ def solve(problem: Problem, options: SolverOptions | None = None, *, start: NDAr
     with one_blas_thread:
         before = _fit_frames(problem, options) if start is None else np.asarray(start, dtype=np.float64)
         problem = relinearized_at(problem, before) if before is not problem.start else problem
-        run = _fit(_started_by_rest(_started_by_few(problem, options)), options)
+        run = _fit(_started_with_curves_held(_started_by_few(problem, options)), options)
         state, variables, cost = run.problem.state, run.problem.variables, run.cost
         parameters = variables.parameters(variables.values(run.parameters))  # angles in usual range
         if state.weights is not None:
@@ -231,13 +231,12 @@ def _started_by_few(problem: Problem, options: SolverOptions) -> Problem:
     return relinearized_at(problem, run.parameters) if run.converged else problem
 
 
-def _started_by_rest(problem: Problem) -> Problem:
+def _started_with_curves_held(problem: Problem) -> Problem:
     """A problem with error curves, started where a step of all but these leads, if that lowers the cost.
 
-    With a robust loss it is not: least squares, without weights yet, would follow gross errors. Where errors are shared
-    or something was added curves cannot be held, and the step is one of all (see `Problem.linearize`).
+    With a robust loss it is not: least squares, without weights yet, would follow gross errors.
     """
-    if not problem.variables.n_curves or problem.options.loss != "none":
+    if not problem.curves_are_states or problem.options.loss != "none":
         return problem
     held = problem.linearize(problem.start, held=True)
     if held.decrement <= COARSE:

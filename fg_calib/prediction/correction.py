@@ -242,7 +242,7 @@ def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context
     chain = build_chain(robot).with_joint_columns()
 
     @cache
-    def look(*q: float) -> tuple[Floats, Floats]:
+    def linearise(*q: float) -> tuple[Floats, Floats]:
         """Misses of the point and of the orientation, shape (6,), and their derivative in the joints.
 
         Of the orientation it is a = Log(R_target R^T); R turns by w in the base frame, so da = -Jr^-1(a) w. Slopes of
@@ -255,10 +255,10 @@ def _rotate(robot: Robot, q: Floats, position: Floats, rotation: Floats, context
         return miss, np.concatenate([at.jacobian[0, 3:] * _WEIGHT, of_turn])
 
     def miss(q: Floats) -> Floats:
-        return look(*q)[0]
+        return linearise(*q)[0]
 
     def derivative(q: Floats) -> Floats:
-        return look(*q)[1]
+        return linearise(*q)[1]
 
     best = optimize.least_squares(miss, q, derivative, tuple(robot.limits.T), xtol=1e-10, ftol=1e-10, gtol=1e-10).x
     found = solve_inverse(robot, position, None, context, near=best, n_starts=1)
