@@ -1,4 +1,4 @@
-"""What a call that is refused says."""
+"""What a call that is refused says, in one line."""
 
 import pytest
 
@@ -6,7 +6,9 @@ from fg_calib import InputError
 
 
 def refusal(call, /, *arguments, error=InputError, **options) -> str:
-    """The message of the error that a call ends with."""
+    """The message of the error that a call ends with: one printable line."""
     with pytest.raises(error) as caught:
         call(*arguments, **options)
-    return str(caught.value)
+    said = str(caught.value)
+    assert said.isprintable()
+    return said

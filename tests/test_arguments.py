@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 
-from fg_calib import InputError, Options, Robot
+from fg_calib import Options, Robot
 from fg_calib.inputs import Strategy, check_type, checked
 
 
@@ -20,23 +21,20 @@ def named(path: Path | str, options: Options | None = None, robots: Sequence[Rob
     ((3,), "path: found 3, expected a path"),
     (("",), "path: found '', expected a path"),
     (("a", "pose"), "options: found 'pose', expected an Options, such as Options"),
-    (("a", None, [None]), "robots: found .*, expected a list of Robot"),
+    (("a", None, [None]), "robots: found [None], expected a list of Robot"),
 ])  # fmt: skip
 def test_an_argument_that_does_not_fit_is_one_line(arguments, message):
-    with pytest.raises(InputError, match=message):
-        named(*arguments)
+    assert message in refusal(named, *arguments)
 
 
 def test_a_wrong_call_fails_in_pythons_own_words():
-    with pytest.raises(TypeError, match=r"^named\(\) missing 1 required positional argument: 'path'$"):
-        named()
-    with pytest.raises(TypeError, match=r"^named\(\) got an unexpected keyword argument 'option'"):
-        named("a", option=3)
+    assert refusal(named, error=TypeError) == "named() missing 1 required positional argument: 'path'"
+    said = refusal(named, "a", option=3, error=TypeError)
+    assert said.startswith("named() got an unexpected keyword argument 'option'")
 
 
 def test_choices_and_switches_are_checked_and_numbers_where_they_are_used():
     check_type("x", "text", float)
     check_type("x", "star", Strategy | None)
     check_type("x", np.True_, bool)
-    with pytest.raises(InputError, match="x: found 'yes', expected True or False"):
-        check_type("x", "yes", bool)
+    assert "x: found 'yes', expected True or False" in refusal(check_type, "x", "yes", bool)

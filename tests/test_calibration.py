@@ -6,6 +6,7 @@ from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, small_arm, true_robot
 
@@ -55,8 +56,7 @@ def test_parts_are_tables_and_drawings(found):
     for drawing in (result.plot_parameters(), result.plot_residuals(), result.plot_workspace()):
         assert drawing.startswith("<svg")
         assert drawing._repr_svg_() == drawing
-    with pytest.raises(InputError, match="of: found 'frames', expected one of parameters, covariance"):
-        result.to_dataframe("frames")
+    assert "of: found 'frames', expected one of parameters, covariance" in refusal(result.to_dataframe, "frames")
 
 
 @pytest.mark.sampled(1)
@@ -93,8 +93,7 @@ def test_covariance_is_in_the_order_asked_for(found):
     assert np.array_equal(result.covariance(["d3", "a2"]), u.covariance[np.ix_([i, j], [i, j])])
     with_fixed = result.covariance(["tool.x", "a2"])  # the tool is fixed here
     assert np.array_equal(with_fixed, [[0.0, 0.0], [0.0, u.covariance[j, j]]])
-    with pytest.raises(InputError, match="covariance: unknown parameter 'a9'"):
-        result.covariance(["a9"])
+    assert "covariance: unknown parameter 'a9'" in refusal(result.covariance, ["a9"])
     assert result.covariance("a2") == u.covariance[j, j]
 
 
@@ -158,11 +157,8 @@ def test_what_is_loaded_says_what_was_saved(found, tmp_path, name):
         assert after.covariance == pytest.approx(before.covariance, rel=1e-10, abs=1e-13 * size, nan_ok=True)
     assert repr(again) == repr(result)
     assert str(again) == str(result)
-    for nothing in ("solution", "assessment"):
-        with pytest.raises(InputError, match="it was loaded from a folder"):
-            getattr(again, nothing)
-    with pytest.raises(InputError, match="it was loaded from a folder"):
-        again.save(tmp_path / "again")
+    for nothing in (lambda: again.solution, lambda: again.assessment, lambda: again.save(tmp_path / "again")):
+        assert "it was loaded from a folder" in refusal(nothing)
 
 
 @pytest.mark.slow
@@ -246,13 +242,11 @@ def test_mistakes_are_named(wrong, error, message):
 
 
 def test_predictions_are_of_this_robot(found):
-    with pytest.raises(InputError, match=r"readings: shape \(4, 3\), expected \(n, 4\)"):
-        found["priors"].predict(Q[:, :3])
-    with pytest.raises(InputError, match="world: the measurement frame was not estimated"):
-        found["priors"].predict(Q, world=True)
-    with pytest.raises(InputError, match="world: found 'yes'"):
-        found["priors"].predict(Q, world="yes")
-    assert found["priors"].predict(Q[0]).position.shape == (1, 3)
+    predict = found["priors"].predict
+    assert "readings: shape (4, 3), expected (n, 4)" in refusal(predict, Q[:, :3])
+    assert "world: the measurement frame was not estimated" in refusal(predict, Q, world=True)
+    assert "world: found 'yes'" in refusal(predict, Q, world="yes")
+    assert predict(Q[0]).position.shape == (1, 3)
 
 
 def test_the_frame_of_several_is_named():
@@ -263,8 +257,8 @@ def test_the_frame_of_several_is_named():
     tables[1] = replace(measure(robot, 20, rng, sigma=(1e-4, 1e-4), frame=other), source="other")
     found = calibrate(robot, tables, model="pose", frame="unknown")
     q = np.zeros(4)
-    with pytest.raises(InputError, match="table: several measurement frames, expected one of 0, 1: the table whose"):
-        found.predict(q, world=True)
+    several = "table: several measurement frames, expected one of 0, 1: the table whose"
+    assert several in refusal(found.predict, q, world=True)
     at = [found.predict(q, world=True, table=k).position[0] for k in range(2)]
     p = pose(robot, q[None]).position[0]
     for k, (rotation, shift) in enumerate((FRAME, other)):

@@ -6,10 +6,11 @@ import sys
 import numpy as np
 import pytest
 from recordings import FORMATS, NAMES, POSE_TYPES, START, BagWriter, arm, record, write_bag
+from refusals import refusal
 from scipy.stats import chi2
 from sparing import diagonal
 
-from fg_calib import InputError, Robot, Table, calibrate
+from fg_calib import Robot, Table, calibrate
 from fg_calib.importers.bag import average_stops, read_bag, write_stops
 from fg_calib.io import read_measurements, write_robot
 
@@ -88,8 +89,8 @@ def test_the_table_is_read_as_it_was_averaged(tmp_path):
                                 ("orientation", m.rotation, m.sigma_orientation)):  # fmt: skip
         assert values == pytest.approx(stops.means[kind], abs=1e-12)
         assert sigma is None or sigma == pytest.approx(stops.sigmas[kind], abs=0)
-    with pytest.raises(InputError, match="is there already, expected a folder without it"):
-        write_stops(tmp_path / "poses.csv", stops, arm())
+    said = refusal(write_stops, tmp_path / "poses.csv", stops, arm())
+    assert "is there already, expected a folder without it" in said
 
 
 # Topics, frames, stamps and names
@@ -140,9 +141,7 @@ def test_what_is_left_out_or_put_in_order_is_reported(bag):
 
 
 def error(path, robot=None, **more):
-    with pytest.raises(InputError) as caught:
-        read_bag(path, robot or arm(), **more)
-    return str(caught.value)
+    return refusal(read_bag, path, robot or arm(), **more)
 
 
 def test_topics_and_joints_that_are_missing(bag):

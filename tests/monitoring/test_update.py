@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from month import arm, calibrated, measured, placed, seen, slipped
+from refusals import refusal
 from simulated import true_robot
 
-from fg_calib import InputError, Measurements, Table, calibrate, export
+from fg_calib import Measurements, Table, calibrate, export
 
 FINE = (5e-8, 1e-7)
 """Noise so small that all is linear: a thousandth of an instrument's."""
@@ -56,8 +57,8 @@ def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
     rng = np.random.default_rng(1)
     robot = fine_arm()
     old, new = tables_of(FINE, unknown, "pose", rng, true_robot(robot, rng))
-    with pytest.raises(InputError, match="update: gauge none, and rows that do not determine"):
-        calibrate(robot, old, gauge="none").update(new)
+    said = refusal(calibrate(robot, old, gauge="none").update, new)
+    assert "update: gauge none, and rows that do not determine" in said
 
 
 @pytest.mark.slow
@@ -99,8 +100,7 @@ def test_a_joint_of_fixed_parameters_has_no_zero_to_change():
     rows = measured(slipped(true, theta3=2e-3), 10, rng, ids="new")
     changed = calibration.update(rows, changed="theta3").parameters["theta3"]
     assert abs(changed.estimate - true.nominal[true.index("theta3")] - 2e-3) < 4.0 * changed.sigma
-    with pytest.raises(InputError, match="changed"):
-        calibration.update(rows, changed="q1.zero")
+    assert "changed" in refusal(calibration.update, rows, changed="q1.zero")
     assert all(zero["determined"] for zero in export(calibration, "zeros").details["zeros"].values())
 
 
@@ -205,11 +205,8 @@ def test_rows_that_are_counted_already_are_refused_in_memory():
     sigmas = {"sigma_position": 5e-5, "sigma_orientation": 1e-4}
     longer = Measurements.from_arrays(q, position=p * 1e3 * 1e-3, rotation=R, **sigmas)
     for rows in (first, first.select(np.arange(5)), first.select(np.arange(40)[::-1]), longer):
-        with pytest.raises(InputError, match="its rows are in the calibration already"):
-            calibration.update(rows)
-    updated = calibration.update(more)
-    with pytest.raises(InputError, match="already"):
-        updated.update(more)
+        assert "its rows are in the calibration already" in refusal(calibration.update, rows)
+    assert "already" in refusal(calibration.update(more).update, more)
 
 
 def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_not():
@@ -218,8 +215,7 @@ def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_
     today = calibration.result.date[:10]
     assert calibration.update(rows, date=today).result.date.startswith(today)
     for date in ("1999-01-01", "2000-01-01T12:00:00+00:00"):
-        with pytest.raises(InputError, match="is before the calibration"):
-            calibration.update(rows, date=date)
+        assert "is before the calibration" in refusal(calibration.update, rows, date=date)
 
 
 @pytest.mark.parametrize(("options", "message"), [
@@ -229,5 +225,4 @@ def test_dates_before_the_calibration_are_refused_and_those_of_the_same_day_are_
 ])  # fmt: skip
 def test_names_that_are_none_are_refused(options, message):
     calibration, true, rng = calibrated(9)
-    with pytest.raises(InputError, match=message):
-        calibration.update(measured(true, 6, rng), **options)
+    assert message in refusal(calibration.update, measured(true, 6, rng), **options)
