@@ -6,11 +6,13 @@ import numpy as np
 from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
+from fg_calib.importers.board import CalibrationBoard
 from fg_calib.initialization import Camera
 
 CAMERA = Camera(fx=620.0, fy=625.0, cx=322.0, cy=237.0, k1=-0.12, k2=0.06, p1=8e-4, p2=-6e-4, k3=-0.01)
 SIZE = (640, 480)
 """Width and height, [px]."""
+BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 
 _FINE = 2
 """Points a pixel is the mean of, along each side."""

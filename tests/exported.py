@@ -13,9 +13,10 @@ SCARA = [[0.2, 0, 0.4, 0, 0], [0.325, 0, 0, 0, 0], [0.275, np.pi, 0, 0, 0], [0, 
 """The slide is the third: it goes down."""
 
 TREE = """<?xml version='1.0'?>
-<!-- a column, an arm on it, a hand -->
+<!-- a column, an arm on it, a hand; a gate -->
 <robot name="column">
-  <link name="floor"/><link name="column"/><link name="plate"/><link name="upper"/><link name="lower"/>
+  <link name="floor"/><link name="column"/><link name="gate"/><link name="upper"/><link name="lower"/>
+  <link name="plate"><visual><geometry><mesh filename="package://nowhere/a.stl"/></geometry></visual></link>
   <link name="wrist"/><link name="flange"/><link name="tip"/><link name="finger"/><link name="thumb"/>
   <joint name="lift" type="prismatic"><origin xyz="0.1 0.2 0.3" rpy="0.1 -0.2 0.3"/>
     <parent link="floor"/><child link="column"/><axis xyz="0.1 -0.2 1"/>
@@ -38,6 +39,8 @@ TREE = """<?xml version='1.0'?>
     <limit lower="0" upper="0.05" effort="1" velocity="1"/></joint>
   <joint name="thumb" type="prismatic"><parent link="tip"/><child link="thumb"/><axis xyz="0 -1 0"/>
     <limit lower="0" upper="0.05" effort="1" velocity="1"/><mimic joint="finger"/></joint>
+  <joint name="gate" type="continuous">
+    <parent link="floor"/><child link="gate"/><axis xyz="0 0 -1"/></joint>
 </robot>
 """
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from simulated import small_arm, true_robot
+from simulated import LARGE, small_arm, true_robot
 
 from fg_calib import KnownPoint, Measurements, Table
 from fg_calib.initialization import Camera
 from fg_calib.robot import pose
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
+TOLERANCE = LARGE | {"tool": 5e-3}
 CAMERA = Camera(fx=900, fy=905, cx=640, cy=480, k1=-0.1, k2=0.05)
 TARGETS = np.array([[0.3, 0.1, -0.2], [-0.2, 0.3, 0.1], [0.05, -0.3, 0.4]])
 

@@ -13,18 +13,14 @@ SIGMA = (5e-5, 1e-4)
 PLACED = (Rotation.from_euler("xyz", [0.3, -0.7, 1.9]), np.array([1.0, -2.0, 0.5]))
 """World_T_base of a tracker next to the robot."""
 
+ROWS = [(0.1625, 0, 90), (0, -0.425, 0), (0, -0.3922, 0), (0.1333, 0, 90), (0.0997, 0, -90), (0.0996, 0, 0)]
+"""d and a, [m], and alpha, [deg], of each joint of a UR5e."""
+
 UR5E = {
     "name": "ur5e",
     "convention": "dh-hayati",
     "units": {"length": "m", "angle": "deg"},
-    "joints": [
-        {"theta": 0, "d": 0.1625, "a": 0, "alpha": 90, "beta": 0},
-        {"theta": 0, "d": 0, "a": -0.425, "alpha": 0, "beta": 0},
-        {"theta": 0, "d": 0, "a": -0.3922, "alpha": 0, "beta": 0},
-        {"theta": 0, "d": 0.1333, "a": 0, "alpha": 90, "beta": 0},
-        {"theta": 0, "d": 0.0997, "a": 0, "alpha": -90, "beta": 0},
-        {"theta": 0, "d": 0.0996, "a": 0, "alpha": 0, "beta": 0},
-    ],
+    "joints": [{"theta": 0, "d": d, "a": a, "alpha": alpha, "beta": 0} for d, a, alpha in ROWS],
     "tool": {"x": 0.05, "y": -0.03, "z": 0.12, "roll": 20},
     "tolerance": {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.1, "beta": 0.05},
 }

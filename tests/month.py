@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from jobs import UR5E
+from jobs import ROWS, SIGMA
 from scenarios import INSTRUMENTS, scenario
 from scipy.spatial.transform import Rotation
 from simulated import measure, true_robot
@@ -13,15 +13,13 @@ from fg_calib.measurements.dataset import Labels
 from fg_calib.robot import pose
 from fg_calib.simulation.scenario import Errors
 
-SIGMA = (5e-5, 1e-4)
-ROWS = [[joint["a"], np.deg2rad(joint["alpha"]), joint["d"], 0] for joint in UR5E["joints"]]
 TOLERANCE = {"a": 5e-4, "d": 5e-4, "alpha": 1e-3, "theta": 2e-3}
 
 
 def arm(**more):
     """A UR5e."""
-    limits = [[-3.0, 3.0]] * 6
-    return Robot.from_dh(ROWS, "dh", name="ur5e", tool=[0.05, -0.03, 0.12], tolerance=TOLERANCE, limits=limits, **more)
+    rows, limits = [[a, np.deg2rad(alpha), d, 0] for d, a, alpha in ROWS], [[-3.0, 3.0]] * 6
+    return Robot.from_dh(rows, "dh", name="ur5e", tool=[0.05, -0.03, 0.12], tolerance=TOLERANCE, limits=limits, **more)
 
 
 def placed(rng):

@@ -1,17 +1,15 @@
 """Scenarios of a small arm and one instrument, of every kind, that several test files use."""
 
 import numpy as np
+from instruments import CAMERA, TOLERANCE
 from scipy.spatial.transform import Rotation
 from simulated import small_arm
 
 from fg_calib import Noise, Pairing, Scenario
-from fg_calib.initialization import Camera
 from fg_calib.simulation.scenario import Errors, Instrument, Placement, RandomReadings, Spot, board_corners
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA = Noise(1e-4, 2e-4, 0.0, distance=1e-4, angle=2e-4, point=1e-4, pixel=0.1)
 EXACT = Noise(0.0, 0.0, 0.0, distance=0.0, angle=0.0, point=0.0, pixel=0.0)
-CAMERA = Camera(fx=900, fy=905, cx=640, cy=480, k1=-0.1, k2=0.05)
 GRID = board_corners(5, 4, 0.1)
 WALL = {"wall": Placement(Rotation.from_euler("y", -0.5 * np.pi).as_matrix(), np.array([2.5, 0.0, 0.0]))}
 """Across x, its front towards the arm."""

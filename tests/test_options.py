@@ -9,7 +9,6 @@ from refusals import refusal
 from simulated import measure, planar_robot
 
 from fg_calib import Noise, Pairing, SolverOptions, build_problem, simulate, solve
-from fg_calib.diagnostics import check_setup
 from fg_calib.inputs import InputError, options
 from fg_calib.io import Units, read_measurements
 from fg_calib.observability import observe_configurations, observe_structure
@@ -35,10 +34,6 @@ def structure(model="distance", **options):
 
 def practical(model="distance", **options):
     return observe_configurations(ROBOT, TABLE, model, **options)
-
-
-def setup(model="distance", **options):
-    return check_setup(ROBOT, TABLE, model, **options)
 
 
 def scenario(**changes):

@@ -8,19 +8,18 @@ import numpy as np
 import polars as pl
 import pytest
 import yaml
-from boards import CAMERA, SIZE, render, views
+from boards import BOARD, CAMERA, SIZE, render, views
 from scipy.spatial.transform import Rotation
 
 from fg_calib import InputError
 from fg_calib.importers import board as images
-from fg_calib.importers.board import CalibrationBoard, load_opencv
+from fg_calib.importers.board import load_opencv
 from fg_calib.io.job import read_camera
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
 CHECKERBOARD = {"type": "checkerboard", "columns": 9, "rows": 6, "square": 20, "units": {"length": "mm"}}
 CHARUCO = CHECKERBOARD | {"type": "charuco", "rows": 7, "marker": 14, "dictionary": "DICT_5X5_100"}
-BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 TABLES = {"board.csv", "board.json", "camera.yaml", "pixels.csv"}
 N = 4
 

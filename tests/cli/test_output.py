@@ -4,37 +4,19 @@ import csv
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
+from scenarios import scenario
+from simulated import LARGE, small_arm
 
-from fg_calib import Calibration, calibrate_job, simulate
-from fg_calib.simulation import read_scenario, write_simulation
+from fg_calib import Calibration, Noise, calibrate_job, simulate
+from fg_calib.simulation import write_simulation
 
 STEERING = "\x1b[31m\x07\b\x9b2J\x7f\u202e\u2066[/red]"
 """What turns a terminal red, rings, goes back, clears the screen, deletes, and turns the direction of reading."""
 
-"""The same as it is shown."""
-
-ROBOT = """
-name: "arm{0}\\nGOOD"
-convention: mdh
-units: {{length: m, angle: deg}}
-joints:
-- {{name: "one{0}", a: 0.0, alpha: 0.0, d: 0.33, theta: 0.0, limits: [-170.0, 170.0]}}
-- {{name: "two{0}", a: 0.05, alpha: -90.0, d: 0.0, theta: 0.0, limits: [-120.0, 120.0]}}
-- {{name: "three{0}", a: 0.6, alpha: 0.0, d: 0.0, theta: 0.0, limits: [-150.0, 150.0]}}
-tolerance: {{a: 0.001, d: 0.001, theta: 0.05, alpha: 0.05}}
-"""
-
-SCENARIO = """
-robot: robot.yaml
-units: {length: m, angle: deg}
-errors: {normal: tolerance}
-configurations: {random: {count: 25}}
-noise: {position: 0.0005, orientation: 0.02, joint: 0.01}
-frame: unknown
-job: {model: pose, encoder: estimated}
-"""
+NOISE, CHOICES = Noise(5e-4, 3e-4, 2e-4), {"model": "pose", "encoder": "estimated"}
 
 
 def quoted(text):
@@ -47,19 +29,13 @@ def clean(text):
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A job all of whose names would steer a terminal, the folder's and those of files included."""
+def job(tmp_path_factory):
+    """A simulated job of two rows that are grossly wrong, all of whose names would steer a terminal, of files too."""
     folder = tmp_path_factory.mktemp("steering") / f"job{STEERING.replace('/', '')}"
-    folder.mkdir()
-    (folder / "robot.yaml").write_text(ROBOT.format(quoted(STEERING)))
-    (folder / "scenario.yaml").write_text(SCENARIO)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def job(folder):
-    """A simulated job in which two rows are grossly wrong, and ids and the table's name would steer a terminal."""
-    write_simulation(folder, simulate(read_scenario(folder / "scenario.yaml"), 1))
+    robot = small_arm(LARGE)
+    joints = tuple(replace(joint, name=f"{joint.name}{STEERING}") for joint in robot.joints)
+    of = scenario(robot=replace(robot, name=f"arm{STEERING}\nGOOD", joints=joints), n=25, noise=NOISE, job=CHOICES)
+    write_simulation(folder, simulate(of, 1))
     rows = list(csv.reader((folder / "poses.csv").read_text().splitlines()))
     for k, row in enumerate(rows[1:]):
         row[0] = f"p{k}{STEERING}"
@@ -102,13 +78,6 @@ def test_a_notebook_a_saved_result_and_reprs_are_clean(found, tmp_path):
     assert [text for text in shown if not clean(text)] == []
 
 
-def run(arguments, **options):
-    """A command in a process of its own: exit code, stdout, stderr."""
-    command = [sys.executable, "-m", "fg_calib.cli", *map(str, arguments)]
-    ended = subprocess.run(command, check=False, text=True, **({"capture_output": True} | options))
-    return ended.returncode, ended.stdout, ended.stderr
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("command", ["calibrate", "compare", "observe"])
 @pytest.mark.parametrize("stdout", ["/dev/full", "closed pipe"])
@@ -120,9 +89,9 @@ def test_a_report_that_nobody_takes_loses_no_result(example, command, stdout):
     else:
         sink = os.open(stdout, os.O_WRONLY)
     buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
-    streams = {"stdout": sink, "stderr": subprocess.PIPE, "capture_output": False, "env": buffered}
-    code, _, err = run([command, job, "--out", example / "out"], **streams)
+    words = [sys.executable, "-m", "fg_calib.cli", command, job, "--out", example / "out"]
+    ended = subprocess.run(words, check=False, text=True, stdout=sink, stderr=subprocess.PIPE, env=buffered)
     os.close(sink)
     full = "error: the output cannot be written: No space left on device\n"
-    assert (code, err) == ((1, full) if stdout == "/dev/full" else (1, ""))
+    assert (ended.returncode, ended.stderr) == (1, full if stdout == "/dev/full" else "")
     assert list((example / "out").glob("*.json"))

@@ -101,14 +101,7 @@ def test_tables_of_four_figures_say_what_they_miss_and_by_how_much(name, to, tmp
 
 # --- ur_description ---------------------------------------------------------------------------------------------------
 
-UR_JOINTS = {
-    "shoulder": ("shoulder_pan_joint", "base_link_inertia", "shoulder_link"),
-    "upper_arm": ("shoulder_lift_joint", "shoulder_link", "upper_arm_link"),
-    "forearm": ("elbow_joint", "upper_arm_link", "forearm_link"),
-    "wrist_1": ("wrist_1_joint", "forearm_link", "wrist_1_link"),
-    "wrist_2": ("wrist_2_joint", "wrist_1_link", "wrist_2_link"),
-    "wrist_3": ("wrist_3_joint", "wrist_2_link", "wrist_3_link"),
-}
+UR_JOINTS = [f"{name}_joint" for name in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")]
 
 
 def ur_macro(kinematics):
@@ -124,7 +117,8 @@ def ur_macro(kinematics):
     for name, parent, child, rpy in fixed:
         parts.append(f'<link name="{child}"/><joint name="{name}" type="fixed"><origin xyz="0 0 0" rpy="{rpy}"/>'
                      f'<parent link="{parent}"/><child link="{child}"/></joint>')  # fmt: skip
-    for link, (name, parent, child) in UR_JOINTS.items():
+    links = [f"{link}_link" for link in UR10_DEFAULT]
+    for name, parent, child, link in zip(UR_JOINTS, ["base_link_inertia", *links], links, UR10_DEFAULT, strict=False):
         o = kinematics[link]
         parts.append(
             f'<link name="{child}"/><joint name="{name}" type="revolute">'
@@ -183,7 +177,7 @@ def test_ur_descriptions_urdf_has_the_tool_poses_with_the_file(convention, ur_ur
     assert list(document) == ["kinematics"]
     q = drawn(robot, 20, 4)
     (tmp_path / "made.urdf").write_text(ur_macro(document["kinematics"]))
-    found = yourdfpy_poses(tmp_path / "made.urdf", base, "tool0", [j for j, _, _ in UR_JOINTS.values()], q)
+    found = yourdfpy_poses(tmp_path / "made.urdf", base, "tool0", UR_JOINTS, q)
     assert np.abs(found @ np.array(made.details["tool0_T_tool"]) - ours(robot, q)).max() < EXACT
     assert made.details["base"] == base
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from boards import CAMERA, render
+from boards import BOARD, CAMERA, render
 from refusals import refusal
 from scipy.spatial.transform import Rotation
 
@@ -10,9 +10,8 @@ from fg_calib.importers.board import CalibrationBoard, charuco_board, find_corne
 
 pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
-CHECKERBOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 CHARUCO = CalibrationBoard(type="charuco", columns=9, rows=7, square=0.02, marker=0.014, dictionary="DICT_5X5_100")
-BOARDS = [CHECKERBOARD, CalibrationBoard(type="checkerboard", columns=6, rows=9, square=0.02), CHARUCO]
+BOARDS = [BOARD, CalibrationBoard(type="checkerboard", columns=6, rows=9, square=0.02), CHARUCO]
 EVERY = pytest.mark.parametrize("board", BOARDS, ids=["9 x 6", "6 x 9", "charuco"])
 
 
@@ -49,9 +48,9 @@ def test_a_charuco_board_is_known_by_what_is_seen_of_it():
 
 @pytest.mark.parametrize("turn", [np.s_[:, :], np.s_[::-1, ::-1], np.s_[:, ::-1], np.s_[::-1]], ids=str)
 def test_a_checkerboard_begins_with_a_black_square_and_is_seen_from_the_front(turn):
-    R, t = seen_from(CHECKERBOARD, 40)
-    grid = images_of(CHECKERBOARD, R, t).reshape(6, 9, 2)
-    assert in_order(render(CHECKERBOARD, R, t, np.random.default_rng(3)), grid[turn]) == pytest.approx(grid, abs=0.0)
+    R, t = seen_from(BOARD, 40)
+    grid = images_of(BOARD, R, t).reshape(6, 9, 2)
+    assert in_order(render(BOARD, R, t, np.random.default_rng(3)), grid[turn]) == pytest.approx(grid, abs=0.0)
 
 
 def test_corners_of_a_charuco_board_are_opencvs():

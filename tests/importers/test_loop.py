@@ -5,21 +5,18 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 import yaml
-from boards import CAMERA, render, views
+from boards import BOARD, CAMERA, render, views
 from jobs import ur5e
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from simulated import nees, true_robot
+from simulated import TOOL, nees, true_robot
 
 from fg_calib.calibration import calibrate_job
-from fg_calib.importers.board import CalibrationBoard
 from fg_calib.io.tables import write_csv
 from fg_calib.robot.inverse import solve_inverse
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
-BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
-TOOL = ["tool.x", "tool.y", "tool.z", "tool.roll", "tool.pitch", "tool.yaw"]
 TOLERANCE = {"a": 0.0005, "d": 0.0005, "alpha": 0.05, "theta": 0.1, "beta": 0.05, "tool": 0.005}
 
 

@@ -4,7 +4,7 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-from boards import CAMERA, SIZE, views
+from boards import BOARD, CAMERA, SIZE, views
 from refusals import refusal
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest
@@ -15,7 +15,6 @@ from fg_calib.measurements.kinds.board import BoardPose
 
 cv2 = pytest.importorskip("cv2", reason="no OpenCV: pip install 'fg_calib[camera]'")
 
-BOARD = CalibrationBoard(type="checkerboard", columns=9, rows=6, square=0.02)
 SIGMA = 0.05
 """Of a corner, [px]."""
 

@@ -1,11 +1,12 @@
 """URDF: chains against yourdfpy's own forward kinematics, origins written back, and one message a mistake."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 import yourdfpy
-from exported import yourdfpy_poses
+from exported import TREE, yourdfpy_poses
 from lxml import etree
 from oracle import tool_pose
 from refusals import refusal
@@ -15,69 +16,39 @@ from fg_calib.inputs import InputError
 from fg_calib.io.robot_file import read_robot, read_urdf, write_robot, write_urdf
 from fg_calib.robot.model import Joint
 
-TREE = """\
-<?xml version="1.0"?>
-<!-- a torso with two arms -->
-<robot name="torso">
-  <link name="world"/>
-  <link name="left_1"/>
-  <link name="left_2"><visual><geometry><mesh filename="package://nowhere/a.stl"/></geometry></visual></link>
-  <link name="left_tip"/>
-  <link name="right_1"/>
-  <link name="right_2"/>
-  <link name="right_tip"/>
-  <joint name="l1" type="revolute"><origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.5 0.6"/>
-    <parent link="world"/><child link="left_1"/><axis xyz="1 2 -3"/>
-    <limit lower="-1.5" upper="2" effort="1" velocity="1"/></joint>
-  <joint name="l2" type="fixed"><origin xyz="0.3 0 0.1" rpy="-1 0.3 2"/>
-    <parent link="left_1"/><child link="left_2"/></joint>
-  <joint name="l3" type="prismatic"><!-- no axis: x --><origin xyz="0 0.5 0" rpy="0 1.5708 0"/>
-    <parent link="left_2"/><child link="left_tip"/>
-    <limit lower="0" upper="0.7" effort="1" velocity="1"/></joint>
-  <joint name="r1" type="continuous">
-    <parent link="world"/><child link="right_1"/><axis xyz="0 0 -1"/></joint>
-  <joint name="r2" type="revolute"><origin xyz="0 0.05 0.7"/>
-    <parent link="right_1"/><child link="right_2"/><axis xyz="-2 0.5 0.1"/>
-    <limit effort="1" velocity="1"/></joint>
-  <joint name="r3" type="fixed"><origin rpy="0.1 0.2 0.3" xyz="1 2 3"/>
-    <parent link="right_2"/><child link="right_tip"/></joint>
-</robot>
-"""
-LINKS = ["world", "left_1", "left_2", "left_tip", "right_1", "right_2", "right_tip"]
-
 
 @pytest.fixture
 def tree(tmp_path):
-    path = tmp_path / "torso.urdf"
+    path = tmp_path / "column.urdf"
     path.write_text(TREE)
     return path
 
 
 def test_changed_parameters_of_a_reversed_chain_are_those_of_the_file(tree, tmp_path):
-    robot = read_urdf(tree, base_link="left_tip", tip_link="right_tip")
+    robot = read_urdf(tree, base_link="tip", tip_link="gate")
     rng = np.random.default_rng(2)
-    own = np.array([1 <= p.owner <= 4 for p in robot.parameters])
+    own = np.array([1 <= p.owner <= 6 for p in robot.parameters])
     changed = robot.with_values(robot.nominal + own * rng.uniform(-0.1, 0.1, len(own)))
     out = tmp_path / "calibrated.urdf"
     write_urdf(out, changed)
-    q = {"l3": 0.3, "l1": -0.7, "r1": 2.0, "r2": 0.4}
-    (expected,) = yourdfpy_poses(out, "left_tip", "right_tip", list(q), [list(q.values())])
+    q = {"tilt": 0.4, "roll": -1.1, "swivel": 0.9, "turn": -0.7, "lift": 0.3, "gate": 2.0}
+    (expected,) = yourdfpy_poses(out, "tip", "gate", list(q), [list(q.values())])
     assert tool_pose(changed, list(q.values())) == pytest.approx(expected, abs=rounding(1.0))
-    back = read_urdf(out, base_link="left_tip", tip_link="right_tip")
+    back = read_urdf(out, base_link="tip", tip_link="gate")
     assert back.parameters == changed.parameters  # exactly
     assert np.abs(tool_pose(robot, list(q.values())) - expected).max() > 1e-3
 
 
 def test_only_origins_of_moving_joints_are_rewritten(tree, tmp_path):
-    robot = read_urdf(tree, tip_link="right_tip")
+    robot = read_urdf(tree, base_link="tip", tip_link="gate")
     values = robot.nominal
-    values[robot.index("r1.z")] = 0.1
-    values[robot.index("r2.yaw")] = 1 / 3
+    values[robot.index("gate.z")] = 0.1
+    values[robot.index("turn.yaw")] = 1 / 3
     write_urdf(tmp_path / "out.urdf", robot.with_values(values))
     expected = (
-        TREE.replace('<joint name="r1" type="continuous">\n    ', '<joint name="r1" type="continuous">\n    '
+        TREE.replace('<joint name="gate" type="continuous">\n    ', '<joint name="gate" type="continuous">\n    '
                  '<origin xyz="0.0 0.0 0.1"/>\n    ')
-        .replace('<origin xyz="0 0.05 0.7"/>', '<origin xyz="0 0.05 0.7" rpy="0.0 0.0 0.3333333333333333"/>')
+        .replace('<origin xyz="0 0 0.1"/>', '<origin xyz="0 0 0.1" rpy="0.0 0.0 0.3333333333333333"/>')
     )  # fmt: skip
     assert canonical((tmp_path / "out.urdf").read_text()) == canonical(expected)
 
@@ -92,20 +63,20 @@ def test_a_yaml_gives_a_urdf_links_a_tool_and_tolerances(tree, tmp_path):
     folder.mkdir()
     path = folder / "robot.yaml"
     path.write_text(
-        "urdf: ../torso.urdf\nbase_link: world\ntip_link: right_tip\nunits: {length: mm, angle: deg}\n"
-        "tool: {z: 100, yaw: 90}\nfixed: [r1.x]\nestimate: [tool.z]\ntolerance: {x: 2, roll: 1, tool: 5, r2.yaw: 3}\n"
+        "urdf: ../column.urdf\nbase_link: floor\ntip_link: tip\ntool: {z: 100, yaw: 90}\nfixed: [lift.x]\n"
+        "estimate: [tool.z]\nunits: {length: mm, angle: deg}\ntolerance: {x: 2, roll: 1, tool: 5, turn.yaw: 3}\n"
     )
     robot = read_robot(path)
-    assert (robot.name, robot.urdf.tip_link) == ("torso", "right_tip")
+    assert (robot.name, robot.urdf.tip_link) == ("column", "tip")
     by_name = {p.name: p for p in robot.parameters}
     assert by_name["tool.z"].nominal == pytest.approx(0.1)
     assert by_name["tool.yaw"].nominal == pytest.approx(math.pi / 2)
-    assert not by_name["r1.x"].estimated
+    assert not by_name["lift.x"].estimated
     assert by_name["tool.z"].estimated
-    assert by_name["r2.x"].tolerance == pytest.approx(2e-3)
-    assert by_name["r2.roll"].tolerance == pytest.approx(math.radians(1))
-    assert by_name["r2.yaw"].tolerance == pytest.approx(math.radians(3))
-    assert read_robot(path, tip_link="right_2").urdf.tip_link == "right_2"
+    assert by_name["turn.x"].tolerance == pytest.approx(2e-3)
+    assert by_name["turn.roll"].tolerance == pytest.approx(math.radians(1))
+    assert by_name["turn.yaw"].tolerance == pytest.approx(math.radians(3))
+    assert read_robot(path, tip_link="wrist").urdf.tip_link == "wrist"
 
     write_urdf(tmp_path / "calibrated.urdf", robot)
     write_robot(tmp_path / "calibrated.yaml", robot, urdf_name="calibrated.urdf")
@@ -187,28 +158,28 @@ def changed(old, new):
     return TREE.replace(old, new)
 
 
-ALL = "one of " + ", ".join(LINKS)
+ALL = "one of " + ", ".join(re.findall(r'<link name="(\w+)"', TREE))
 MISTAKES = [
-    ("<html/>", {}, "torso.urdf: root element <html>, expected <robot>"),
-    (TREE, {"base_link": "nowhere"}, f"torso.urdf: no link 'nowhere', expected {ALL}"),
-    (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "left_tip"},
-     "torso.urdf: links 'island' and 'left_tip' are not connected, expected two links of one tree"),
-    (changed('<origin xyz="0.3 0 0.1"', '<orign xyz="0.3 0 0.1"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l2': element <orign>; did you mean origin?"),
-    (changed('<origin xyz="0.3 0 0.1"', '<origin/><origin xyz="0.3 0 0.1"'), {"tip_link": "left_tip"},
-     "torso.urdf: joint 'l2': two elements <origin>, expected one"),
-    (TREE, {"tip_link": "left_tip", "estimate": ["zeros"]},
-     "torso.urdf: joint 'l3': a slide, with estimate: zeros, expected joints that turn; `fg-calib export --to yaml` "
+    ("<html/>", {}, "column.urdf: root element <html>, expected <robot>"),
+    (TREE, {"base_link": "nowhere"}, f"column.urdf: no link 'nowhere', expected {ALL}"),
+    (changed("</robot>", '<link name="island"/></robot>'), {"base_link": "island", "tip_link": "tip"},
+     "column.urdf: links 'island' and 'tip' are not connected, expected two links of one tree"),
+    (changed('<origin xyz="0 0 0.05"', '<orign xyz="0 0 0.05"'), {"tip_link": "tip"},
+     "column.urdf: joint 'flange_fixed': element <orign>; did you mean origin?"),
+    (changed('<origin xyz="0 0 0.05"', '<origin/><origin xyz="0 0 0.05"'), {"tip_link": "tip"},
+     "column.urdf: joint 'flange_fixed': two elements <origin>, expected one"),
+    (TREE, {"tip_link": "tip", "estimate": ["zeros"]},
+     "column.urdf: joint 'lift': a slide, with estimate: zeros, expected joints that turn; `fg-calib export --to yaml` "
      "writes the arm as rows of dh-hayati, whose d is the zero of a slide"),
     (changed("</robot>", "<xacro:arm/></robot>"), {},
-     "torso.urdf:26: not XML: Namespace prefix xacro on arm is not defined, line 26, column 11; "
+     "column.urdf:30: not XML: Namespace prefix xacro on arm is not defined, line 30, column 11; "
      "it holds elements of xacro: expand them by `xacro arm.urdf.xacro > arm.urdf`"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("text", "links", "message"), MISTAKES, ids=range(len(MISTAKES)))
 def test_a_mistake_is_named_in_one_line(tmp_path, text, links, message):
-    path = tmp_path / "torso.urdf"
+    path = tmp_path / "column.urdf"
     path.write_text(text)
     assert refusal(read_urdf, path, **links) == message
 
@@ -218,7 +189,7 @@ def test_a_mistake_is_named_in_one_line(tmp_path, text, links, message):
     [('<!ENTITY a "&b;"><!ENTITY b "&a;">', '<link name="&a;"/>'), ('<!ENTITY a SYSTEM "secret">', "&a;"), ("", "&a;")],
 )
 def test_entities_are_refused_in_one_line(tmp_path, declared, used):
-    path = tmp_path / "torso.urdf"
+    path = tmp_path / "column.urdf"
     path.write_text(f"<!DOCTYPE robot [{declared}]>" + TREE.partition("\n")[2].replace("</robot>", f"{used}</robot>"))
-    with pytest.raises(InputError, match=r"^torso\.urdf:.*, expected a URDF without entities: they are not expanded$"):
-        read_urdf(path, tip_link="left_tip")
+    with pytest.raises(InputError, match=r"^column\.urdf:.*, expected a URDF without entities: they are not expanded$"):
+        read_urdf(path, tip_link="tip")

@@ -77,7 +77,7 @@ def test_what_the_convention_lacks_is_an_error_only_where_it_explains_the_misfit
     true = true_robot(ur5e(tmp_path), rng)
     if not tilted:
         true = true.with_values([0.0 if p.kind == "beta" else p.nominal for p in true.parameters])
-    m = measure(true, 60, rng, sigma=(5e-5, 1e-4))
+    m = measure(true, 60, rng, sigma=SIGMA)
     if not tilted:
         m = replace(m, sigma_position=m.sigma_position / 5, sigma_orientation=m.sigma_orientation / 5)
     verdict = assess(solve(build_problem(ur5e(tmp_path, **DH), m, model=model))).verdict

@@ -12,9 +12,6 @@ from fg_calib.robot import pose
 from fg_calib.statistics.covariance import held_frames
 from fg_calib.statistics.goodness_of_fit import chi2_bounds
 
-TOLERANCE = {"a": 5e-3, "d": 5e-3, "alpha": 2e-3, "theta": 2e-3, "beta": 2e-3, "tool": 5e-3}
-TOLERANCE |= {f"tool.{k}": 2e-3 for k in ("roll", "pitch", "yaw")}
-
 
 def sigma_of(uncertainty):
     return {p.name: p.sigma for p in uncertainty.estimates.parameters}

@@ -8,7 +8,7 @@ from oracle import central_differences
 from reported import format_report
 from scipy.stats import kstest
 from simulated import LARGE, measure, pairs_between, plus, small_arm, true_robot
-from touches import SIGMA, TOOL_POINT, corners, touch
+from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import Pairing, Table, assess, build_problem, calibrate, solve
 from fg_calib.graph import NoiseState
@@ -166,7 +166,7 @@ def predicted(name, rng):
     """A problem with test rows of a drawn true robot."""
     sigma_joint = 2e-4 if "joint" in name else 0.0
     if name.startswith("touches"):
-        robot = small_arm(tolerance=LARGE | {"tool": 5e-3}, estimate=TOOL_POINT)
+        robot = small_arm(tolerance=TOLERANCE, estimate=TOOL_POINT)
         return build_problem(robot, touched(robot, rng, sigma_joint=sigma_joint), model="distance")
     robot = small_arm(tolerance=LARGE)
     true = true_robot(robot, rng)
@@ -215,7 +215,7 @@ def test_touches_of_a_point_that_is_their_mean_share_its_noise():
     To 1e-3 of it or of the noise: derivatives of rows are less `a x (p - point)`, the noise times an angle's error.
     """
     rng = np.random.default_rng(22)
-    robot = small_arm(tolerance=LARGE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    robot = small_arm(tolerance=TOLERANCE, estimate=TOOL_POINT)
     m = touched(robot, rng)
     m = replace(m, test=m.groups.index >= 3)
     solution = solve(build_problem(robot, m, model="distance"))
@@ -277,7 +277,7 @@ def test_predicted_pairs_that_share_joint_noise_with_fitted_ones_have_their_cova
 def test_degrees_of_freedom_count_core_and_landmarks():
     """Five points touched eight times: three coordinates each come off, and every parameter, for all have priors."""
     rng = np.random.default_rng(31)
-    robot = small_arm(tolerance=LARGE | {"tool": 5e-3}, estimate=TOOL_POINT)
+    robot = small_arm(tolerance=TOLERANCE, estimate=TOOL_POINT)
     true = true_robot(robot, rng)
     problem = build_problem(robot, touch(true, corners(true, 5, rng), 8, rng), model="distance")
     n_estimated = sum(p.estimated for p in robot.parameters)

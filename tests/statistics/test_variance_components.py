@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from dense import dense
 from simulated import measure, pairs_between, small_arm, true_robot
-from touches import TOOL_POINT, corners, touch
+from touches import TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import Measurements, Pairing, Table, assess, build_problem, solve
 from fg_calib.graph import JOINT_NOISE, prior_rows, relinearized_at, whitener_of
@@ -15,7 +15,6 @@ from fg_calib.robot import pose
 from fg_calib.statistics import variance_components as estimation
 from fg_calib.statistics.variance_components import NoiseComponents, estimate_noise, noise_components
 
-TOLERANCE = {"a": 2e-3, "d": 2e-3, "alpha": 2e-3, "theta": 2e-3, "tool": 5e-3}
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
 
 
