@@ -40,7 +40,7 @@ from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from fg_calib import inputs, io
-from fg_calib.inputs import NORM_TOLERANCE, CalibrationError, Floats, FrozenArrays, InputError, check_number, checked
+from fg_calib.inputs import CalibrationError, Floats, FrozenArrays, InputError, check_number, checked, expect
 from fg_calib.robot import Robot, build_chain, forward
 
 
@@ -253,10 +253,9 @@ def average_stops(
     check_number("still", still, above=True)
     pauses = find_standstills(joints, robot, still)
     spans = [_inner(span) for span in pauses if span[1] - span[0] >= still]
-    if not spans:
-        hint = f"the longest pause is {max(b - a for a, b in pauses):.2g} s" if pauses else ""
-        expected = "the arm at rest for a while, several times"
-        raise InputError(f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
+    hint = f"the longest pause is {max(b - a for a, b in pauses):.2g} s" if pauses else ""
+    expected = "the arm at rest for a while, several times"
+    expect(spans, f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
     estimate = None if offset is not None else estimate_offset(joints, poses, robot)
     if estimate is not None and most_offset is not None and abs(estimate.seconds) > most_offset:
         found = f"an offset of {estimate.seconds:.4g} s against the joints' clock"
@@ -267,7 +266,7 @@ def average_stops(
     skipped = tuple(Skipped(f"stop{k + 1}", spans[k][0] - float(joints.time[0]), reasons[k]) for k in sorted(reasons))
     good = [k for k in stops if k not in reasons]
     hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
-    inputs.expect(good, f"topic {poses.source.topic}", f"no stop of {len(spans)} can be used", hint=hint)
+    expect(good, f"topic {poses.source.topic}", f"no stop of {len(spans)} can be used", hint=hint)
     means, residuals = ({kind: [stops[k][kind][part] for k in good] for kind in stops[good[0]]} for part in (0, 1))
     scatter, sigmas = _scatter(residuals)
     ids, interval = tuple(f"stop{k + 1}" for k in good), np.array([spans[k] for k in good])
@@ -488,7 +487,7 @@ def read_bag(
         from rosbags import highlevel, typesys
     except ImportError:
         raise CalibrationError("fg-calib bag needs rosbags: pip install 'fg_calib[ros]'") from None
-    inputs.expect(path.exists(), str(path), "no such bag")
+    expect(path.exists(), str(path), "no such bag")
     try:
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
@@ -518,7 +517,7 @@ def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...
     if len(fitting) == 1:
         return fitting[0]
     listed = ", ".join(f"{topic} ({kind})" for topic, kind in fitting or every)
-    inputs.expect(not fitting, bag, f"{len(fitting)} topics fit: {listed}", f"one of them: --{what} TOPIC")
+    expect(not fitting, bag, f"{len(fitting)} topics fit: {listed}", f"one of them: --{what} TOPIC")
     raise InputError(bag, f"no topic {name or ''} for --{what}", hint=f"the bag has {listed or 'nothing'}")
 
 
@@ -543,11 +542,9 @@ def _read_joints(reader: Any, topic: tuple[str, str], wanted: tuple[str, ...], b
         n += 1
         if set(wanted) <= values.keys():
             samples.append((_stamp(m.header), received, [values[name] for name in wanted]))
-    if not samples:
-        missing = next((f"joint {name}" for name in wanted if name not in present), "message with all joints")
-        hint = "name the bag's joints in chain order: --names, or `name` in the robot file"
-        expected = f"the robot's joints among {', '.join(present)}"
-        raise InputError(f"{bag}: topic {topic[0]}", f"no {missing}", expected, hint)
+    missing = next((f"joint {name}" for name in wanted if name not in present), "message with all joints")
+    hint = "name the bag's joints in chain order: --names, or `name` in the robot file"
+    expect(samples, f"{bag}: topic {topic[0]}", f"no {missing}", f"the robot's joints among {', '.join(present)}", hint)
     return _sort(samples, topic, {"without the robot's joints left out": n - len(samples)}, bag)
 
 
@@ -565,19 +562,18 @@ def _read_poses(
             samples.setdefault(pair, []).append((_stamp(m.header), received, (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
     wanted = [None if frame is None else frame.removeprefix("/") for frame in frames]
     fitting = [pair for pair in samples if all(f in (None, g) for f, g in zip(wanted, pair, strict=True))]
-    if len(fitting) != 1:
-        listed = ", ".join(f"{a or '(no name)'} -> {b}" if b else a or "(no name)" for a, b in samples)
-        what = f"poses of {len(fitting)} frames" if fitting else "no poses of these frames"
-        raise InputError(place, what, "one: --parent FRAME --child FRAME", f"it has {listed}")
+    listed = ", ".join(f"{a or '(no name)'} -> {b}" if b else a or "(no name)" for a, b in samples)
+    what = f"poses of {len(fitting)} frames" if fitting else "no poses of these frames"
+    expect(len(fitting) == 1, place, what, "one: --parent FRAME --child FRAME", f"it has {listed}")
     stamps, values, source = _sort(samples[fitting[0]], topic, {}, bag)
     quaternions, rotation = values[:, 3:], None
     norm = np.linalg.norm(quaternions, axis=1)
-    wrong = np.abs(norm - 1.0) > NORM_TOLERANCE
+    wrong = np.abs(norm - 1.0) > inputs.NORM_TOLERANCE
     if not np.any(quaternions - quaternions[0]):
         source = replace(source, notes=(*source.notes, "all orientations are the same: taken as not measured"))
     elif wrong.any():
         found = f"quaternion of norm {norm[np.argmax(wrong)]:.6g}"
-        raise InputError(place, found, f"1 within {NORM_TOLERANCE:g}", f"{wrong.sum()} of {len(norm)} poses")
+        raise InputError(place, found, f"1 within {inputs.NORM_TOLERANCE:g}", f"{wrong.sum()} of {len(norm)} poses")
     else:
         rotation = np.asarray(Rotation.from_quat(quaternions).as_matrix(), dtype=np.float64)
     return PoseStream((stamps - origin) * 1e-9, values[:, :3], rotation, source)
@@ -604,7 +600,7 @@ def _sort(
         what = f"stamps go back by {back.max():.3g} s at message {int(np.argmax(back > MAX_BACK_S)) + 1}"
         raise InputError(place, what, "a clock that runs on")
     stamps, first = np.unique(stamps, return_index=True)
-    inputs.expect(len(stamps) >= 2, place, f"{len(stamps)} different stamps with finite values", "a recording")
+    expect(len(stamps) >= 2, place, f"{len(stamps)} different stamps with finite values", "a recording")
     found = {**counts, "with nan left out": np.sum(~finite), "out of order put in order": np.sum(back > 0.0)}
     found["with the stamp of another left out"] = len(values) - len(first)
     notes += [f"{n} message{'s' * int(n != 1)} {what}" for what, n in found.items() if n]

@@ -120,8 +120,8 @@ def load_opencv() -> Any:
         import cv2
     except ImportError:
         raise InputError("fg-calib board needs OpenCV", "pip install 'fg_calib[camera]'") from None
-    logging = getattr(cv2.utils, "logging", cv2)  # 4.11 has it in the module itself
-    logging.setLogLevel(0)  # what it could not read is said by us
+    # What it could not read is said by us; 4.11 has the logging in the module itself.
+    getattr(cv2.utils, "logging", cv2).setLogLevel(0)
     return cv2
 
 
@@ -555,10 +555,9 @@ def read_corners(
             without[file.name] = seen
         else:
             found.append(Corners(file.stem, *seen))
-    if not found:
-        reasons = "; ".join(dict.fromkeys(without.values()))
-        hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"
-        raise InputError("images", f"the board in none of {len(files)} ({reasons})", "at least one", hint)
+    reasons = "; ".join(dict.fromkeys(without.values()))
+    hint = "are columns, rows and dictionary those of the board? older charuco boards: legacy: true"
+    expect(found, "images", f"the board in none of {len(files)} ({reasons})", "at least one", hint)
     half = len(found[0].uv) // 2
     along = [one.uv[-half:].mean(axis=0) - one.uv[:half].mean(axis=0) for one in found]
     for k, step in enumerate(along):
@@ -619,9 +618,8 @@ class BoardTables(Record):
     camera_file: bytes | None
 
     def __post_init__(self) -> None:
-        if not self.used:
-            rows, images = (", ".join(names[:3]) for names in (self.without_image, self.without_row))
-            raise InputError("configurations", f"no id is the name of an image: {rows}", f"ids such as {images}")
+        rows, images = (", ".join(names[:3]) for names in (self.without_image, self.without_row))
+        expect(self.used, "configurations", f"no id is the name of an image: {rows}", f"ids such as {images}")
 
     @property
     def used(self) -> tuple[View, ...]:

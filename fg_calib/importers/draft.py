@@ -114,12 +114,11 @@ def _recognise(path: Path, robot: Robot) -> _Recognised:
     written = [(match["bracket"] or match["suffix"]).lower() if match else "" for match in headers]
     joints = _find_joints(bare, robot)
     is_pairs = not joints and {"a", "b"} <= set(bare)
-    if not joints and not is_pairs:
-        numbered = "q1" if robot.n_joints == 1 else f"q1 to q{robot.n_joints}"
-        names = ", ".join(joint.name for joint in robot.joints)
-        expected = f"columns {numbered}, or the joints' names {names}; or a and b of pairs"
-        hint = f"the columns are {', '.join(table.columns)}"
-        raise InputError(table.name, "neither joint readings nor pairs", expected, hint)
+    numbered = "q1" if robot.n_joints == 1 else f"q1 to q{robot.n_joints}"
+    names = ", ".join(joint.name for joint in robot.joints)
+    expected = f"columns {numbered}, or the joints' names {names}; or a and b of pairs"
+    hint = f"the columns are {', '.join(table.columns)}"
+    expect(joints or is_pairs, table.name, "neither joint readings nor pairs", expected, hint)
     sets = (OF_PAIRS if is_pairs else io.OF_CONFIGURATIONS).values()
     known, every = names_of(sets), dict(joints)
     for k in sorted(range(len(bare)), key=lambda k: table.columns[k] not in known):
@@ -268,8 +267,7 @@ def _with_pairs(recognised: Sequence[_Recognised]) -> list[_Recognised]:
     expect(len(pairs) <= 1, "init", f"several tables of pairs: {', '.join(t.path.name for t in pairs)}", "one")
     if not pairs:
         return tables
-    if not tables:
-        raise InputError(pairs[0].path.name, "pairs alone", "the table of the configurations that they are of too")
+    expect(tables, pairs[0].path.name, "pairs alone", "the table of the configurations that they are of too")
     first, *others = sorted(tables, key=lambda t: 0 if t.model is None else 1 if "group" in t.present else 2)
     measured = ("distance" in pairs[0].present, "angle" in pairs[0].present)
     model = {of: model for model, of in PAIR_MODELS.items()}.get(measured, "distance")

@@ -9,7 +9,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fg_calib.inputs import InputError
+from fg_calib.inputs import InputError, expect
 
 _noted: ContextVar[dict[Path, str] | None] = ContextVar("_noted", default=None)
 
@@ -41,8 +41,7 @@ def read_bytes(path: Path) -> bytes:
     except (OSError, ValueError, MemoryError) as error:  # ValueError: a path with a null character
         found = f"cannot be read: {getattr(error, 'strerror', None) or error or 'there is not enough memory for it'}"
         raise InputError(str(path), found, "a file that can be") from None
-    noted = _noted.get()
-    if noted is not None:
+    if (noted := _noted.get()) is not None:
         noted[path] = hashlib.sha256(content).hexdigest()
     return content
 
@@ -85,8 +84,7 @@ def write_text(path: Path, text: str) -> None:
         InputError: The folder does not exist or may not be written to.
     """
     content = text.encode()
-    if not is_folder(path.parent):
-        raise InputError(str(path), f"there is no folder {path.parent}")
+    expect(is_folder(path.parent), str(path), f"there is no folder {path.parent}")
     try:
         with TemporaryDirectory(prefix=".fg-calib-", dir=path.parent, ignore_cleanup_errors=True) as made:
             Path(made, path.name).write_bytes(content)
@@ -158,9 +156,8 @@ def require_absent(folder: Path, names: Iterable[str]) -> None:
     Raises:
         InputError: One does.
     """
-    for name in names:
-        if os.path.lexists(folder / name):  # also a link to nothing
-            raise InputError(str(folder / name), "is there already", "a folder without it")
+    for path in (folder / name for name in names):  # also a link to nothing
+        expect(not os.path.lexists(path), str(path), "is there already", "a folder without it")
 
 
 def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
@@ -176,13 +173,10 @@ def require_own(folder: Path, own: Mapping[str, bytes]) -> None:
     """
     first = next(iter(own), "")
     for name, beginning in own.items():
-        path = folder / name
-        if not os.path.lexists(path):
-            continue
-        if not path.is_file():
-            raise InputError(str(path), "is no file", "a place for a file")
-        if not (_begins(path, beginning) and _begins(folder / first, own[first])):
-            raise InputError(str(path), "is there already, not written by this command", "another folder")
+        if os.path.lexists(path := folder / name):
+            expect(path.is_file(), str(path), "is no file", "a place for a file")
+            ours = _begins(path, beginning) and _begins(folder / first, own[first])
+            expect(ours, str(path), "is there already, not written by this command", "another folder")
 
 
 def _begins(path: Path, beginning: bytes) -> bool:

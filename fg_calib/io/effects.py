@@ -147,8 +147,7 @@ def effects_mapping(robot: Robot) -> dict[str, Any]:
             options["masses"] = "free" if masses is None else _mapping_of([m for m in masses if not m.column])
             for m in (m for m in masses or () if m.column):
                 options["payload"] = {"mass": m.mass, "com": list(m.com), "column": m.column}
-        if type(effect) not in keys:
-            raise InputError(robot.name, f"an effect {type(effect).__name__}", f"of {', '.join(EFFECTS)}")
+        expect(type(effect) in keys, robot.name, f"an effect {type(effect).__name__}", f"of {', '.join(EFFECTS)}")
         out[keys[type(effect)]] = options
     curves = defaultdict[str, list[float]](list)
     for p in robot.parameters:

@@ -181,9 +181,8 @@ def _read_job(path: Path) -> Job:
 def _box(given: _KeepOut, units: Units, place: str) -> Floats:
     """Lower and upper corner of a box, shape (2, 3), [m]."""
     corners = np.array([given.lower, given.upper])
-    if not np.all(corners[0] < corners[1]):
-        found = yaml.shown(given.model_dump())
-        raise InputError(place, f"found {found}", "{below: z}, or {box: [lower, upper]} of x, y and z each")
+    expected = "{below: z}, or {box: [lower, upper]} of x, y and z each"
+    inputs.expect(np.all(corners[0] < corners[1]), place, f"found {yaml.shown(given.model_dump())}", expected)
     return corners * units.factor("m")
 
 
@@ -345,11 +344,10 @@ def camera_in(given: Any, place: str, folder: Path) -> tuple[Camera | None, bool
     return _camera(given, place), bool(given.get("fixed"))
 
 
-def _limits(given: object, units: Units) -> Limits:
+def _limits(given: Any, units: Units) -> Limits:
     """The errors that the user accepts, in [m] and [rad]."""
     given = {} if given is None else given
-    if not isinstance(given, dict):
-        raise InputError("accept", f"found {yaml.shown(given)}", "limits by name")
+    inputs.expect(isinstance(given, dict), "accept", f"found {yaml.shown(given)}", "limits by name")
     inputs.check_names("accept", given, list(LIMITED), "limit")
     return Limits(**{key: yaml.quantity(one, LIMITED[key], units, f"accept: {key}") for key, one in given.items()})
 

@@ -409,8 +409,7 @@ def _pairing(problem: Problem) -> str | None:
 
 def _noise_factors(solution: Solution, fits: tuple[statistics.KindFit, ...]) -> dict[str, Any]:
     """Factors of the estimated noise by key, and the keys of those that could not be estimated."""
-    estimated = solution.estimated_noise
-    if estimated is None:
+    if (estimated := solution.estimated_noise) is None:
         return {}
     of_noise = solution.problem.state.factors
     factors = {key_of(fit, fits): of_noise.get((fit.table, fit.kind), 1.0) for fit in fits}
@@ -486,10 +485,8 @@ def read_result(path: Path | str) -> Result:
     except (ValueError, RecursionError) as error:
         raise InputError(str(file), f"not JSON: {str(error).partition(';')[0]}", hint="was it cut off?") from None
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema == FORMER_SCHEMA:
-        document = _upgraded(document)
-    elif schema != SCHEMA:
-        raise InputError(str(file), f"schema {shown(schema)}", SCHEMA, "calibrate its job again")
+    expect(schema in (SCHEMA, FORMER_SCHEMA), str(file), f"schema {shown(schema)}", SCHEMA, "calibrate its job again")
+    document = _upgraded(document) if schema == FORMER_SCHEMA else document
     try:
         result = Result.model_validate(document)
     except ValidationError as error:

@@ -35,7 +35,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,7 +46,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, Field
 
 from fg_calib import inputs
-from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, etree, listed, shown
+from fg_calib.inputs import LEAST_SIZE, MOST_SIZE, NEAR, InputError, checked, did_you_mean, etree, expect, listed, shown
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.effects import effects_mapping, read_effects, select_standard, with_coefficients
 from fg_calib.io.yaml import FilePath, Loader, Number, Positive, Schema, Units, UnitsOfFile, read_yaml, validate
@@ -66,8 +66,7 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?inf(inity)?", re.
 _NO_ENTITIES = "a URDF without entities: they are not expanded"
 
 
-@dataclass(frozen=True)
-class _UrdfJoint:
+class _UrdfJoint(inputs.Record):
     """A joint as the file has it; its axis, limit and mimic matter only on the chain and are read there."""
 
     element: etree._Element
@@ -127,8 +126,7 @@ def read_urdf(
         tip_link = tree.leaf(base_link) if tip_link is None else tree.known(tip_link)
         chain = tree.chain(base_link, tip_link)
         n_joints = _add_chain(builder, chain, path.name, model.ZEROS in listed("estimate", estimate))
-        if n_joints == 0:
-            raise InputError(path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
+        expect(n_joints, path.name, f"no moving joint between links {base_link!r} and {tip_link!r}", "at least one")
     except InputError as error:  # elements of xacro may hold what is missing
         hint = _XACRO if any("xacro" in str(element.tag) for element in root.iter()) else error.hint
         raise InputError(error.place, error.found, error.expected, hint) from None
@@ -177,7 +175,7 @@ def _inertials(root: etree._Element, links: Mapping[Any, Any], place: str) -> li
             here = f"{place}: link {name!r}"
             com = _numbers(inertial, "origin", "xyz", "0 0 0", here)
             (mass,) = _numbers(inertial, "mass", "value", "0", here)
-            inputs.expect(mass >= 0.0, f"{here}: mass", f"found {mass:g}", "0 or above")
+            expect(mass >= 0.0, f"{here}: mass", f"found {mass:g}", "0 or above")
             found += [links[name](mass, com)] if mass else []
     return found
 
@@ -209,15 +207,14 @@ def _add_chain(builder: RobotBuilder, chain: Iterable[tuple[_UrdfJoint, bool]], 
         here = f"{place}: joint {joint.name!r}"
         tags = [child.tag for child in joint.element if isinstance(child.tag, str)]
         for tag in tags:  # of a misspelt or doubled element a default or the first would take the place
-            inputs.expect(tag not in _CHILDREN or tags.count(tag) == 1, here, f"two elements <{tag}>", "one")
+            expect(tag not in _CHILDREN or tags.count(tag) == 1, here, f"two elements <{tag}>", "one")
             if tag not in _CHILDREN and (hint := did_you_mean(tag, _CHILDREN)):
                 raise InputError(here, f"element <{tag}>", hint=hint)
         if joint.element.get("type") == "fixed":
             builder.add_constant_frame(joint.origin, backwards=backwards)
             continue
         moving = _moving_joint(joint, here)
-        if zeros and moving.prismatic:
-            raise InputError(here, "a slide, with estimate: zeros", "joints that turn", _ROWS)
+        expect(not (zeros and moving.prismatic), here, "a slide, with estimate: zeros", "joints that turn", _ROWS)
         builder.add_urdf_joint(moving, joint.origin, _axis(joint, here), backwards=backwards, zero=zeros)
         n_joints += 1
     return n_joints
@@ -305,7 +302,7 @@ def _parse(data: bytes, place: str) -> tuple[str, etree._Element]:
     types: Any = root.getroottree().docinfo.internalDTD
     if types is not None and (types.system_url or types.entities()):
         raise InputError(place, "a <!DOCTYPE> with entities or of another file", _NO_ENTITIES)
-    inputs.expect(root.tag == "robot", place, f"root element <{root.tag}>", "<robot>")
+    expect(root.tag == "robot", place, f"root element <{root.tag}>", "<robot>")
     return etree.tostring(root.getroottree(), encoding="unicode"), root
 
 
@@ -313,14 +310,13 @@ def _read_joints(root: etree._Element, place: str) -> list[_UrdfJoint]:
     """All joints, each with a name of its own, an origin, a parent and a child."""
     joints: dict[str, _UrdfJoint] = {}
     for joint in root.findall("joint"):
-        name, links = joint.get("name"), []
+        name, links = joint.get("name", ""), []
         here = f"{place}:{joint.sourceline}: joint {name!r}"
-        if not name:
-            raise InputError(f"{place}:{joint.sourceline}", "a joint without a name")
-        inputs.expect(name not in joints, here, "a second joint of this name", "different names")
+        expect(name, f"{place}:{joint.sourceline}", "a joint without a name")
+        expect(name not in joints, here, "a second joint of this name", "different names")
         for end in ("parent", "child"):
             links.append(_attribute(joint, end, "link", ""))
-            inputs.expect(links[-1], here, f"no <{end}>", f'<{end} link="..."/>')
+            expect(links[-1], here, f"no <{end}>", f'<{end} link="..."/>')
         joints[name] = _UrdfJoint(joint, name, links[0], links[1], _origin(joint, here))
     return list(joints.values())
 
@@ -361,15 +357,14 @@ def _figures(text: str) -> list[float]:
 def _moving_joint(joint: _UrdfJoint, place: str) -> Joint:
     """The joint with its limits; URDF's missing limit is 0, and two zeros are none at all."""
     kind, mimic = joint.element.get("type"), joint.element.find("mimic")
-    if kind not in _MOVING:
-        raise InputError(place, f"type {shown(kind)}", "revolute, continuous, prismatic or fixed on the chain")
+    expect(kind in _MOVING, place, f"type {shown(kind)}", "revolute, continuous, prismatic or fixed on the chain")
     if mimic is not None:
         found = f"mimics joint {shown(mimic.get('joint', ''))}"
         raise InputError(place, found, "joints on the chain that move by themselves")
     (lower,), (upper,) = (_numbers(joint.element, "limit", end, "0", place) for end in ("lower", "upper"))
     if kind == "continuous" or lower == upper == 0.0:
         return Joint(joint.name, kind == "prismatic")
-    inputs.expect(lower < upper, f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
+    expect(lower < upper, f"{place}: limit", f"lower {lower:g}, upper {upper:g}", "lower below upper")
     return Joint(joint.name, kind == "prismatic", lower, upper)
 
 
@@ -377,7 +372,7 @@ def _axis(joint: _UrdfJoint, place: str) -> NDArray[np.float64]:
     """The joint's unit axis, shape (3,); x where the file says none."""
     axis = np.array(_numbers(joint.element, "axis", "xyz", "1 0 0", place))
     length = math.hypot(*axis)
-    inputs.expect(length >= LEAST_SIZE, f"{place}: axis", f"found {axis.tolist()}", "a direction of three numbers")
+    expect(length >= LEAST_SIZE, f"{place}: axis", f"found {axis.tolist()}", "a direction of three numbers")
     return axis / length
 
 
@@ -395,14 +390,13 @@ class _Tree:
 
     def known(self, link: str) -> str:
         """`link`, if there is such a link."""
-        if link not in self.links:
-            hint = did_you_mean(link, self.links, NEAR)
-            raise InputError(self._place, f"no link {link!r}", inputs.known_names(self.links, 40), hint)
+        hint = did_you_mean(link, self.links, NEAR)
+        expect(link in self.links, self._place, f"no link {link!r}", inputs.known_names(self.links, 40), hint)
         return link
 
     def root(self) -> str:
         """The only link without a parent."""
-        inputs.expect(self.links, self._place, "no links and joints", "<link> and <joint> within <robot>")
+        expect(self.links, self._place, "no links and joints", "<link> and <joint> within <robot>")
         return self._only([link for link in self.links if self.up(link) == [link]], "root", "base_link")
 
     def leaf(self, base: str) -> str:
@@ -425,14 +419,13 @@ class _Tree:
         while links[-1] in self._above:
             links.append(self._above[links[-1]].parent)
             circle = " below ".join(links[links.index(links[-1]) :])
-            inputs.expect(links[-1] not in links[:-1], self._place, f"links in a circle: {circle}", "a tree of links")
+            expect(links[-1] not in links[:-1], self._place, f"links in a circle: {circle}", "a tree of links")
         return links
 
     def _only(self, found: list[str], what: str, key: str) -> str:
-        if len(found) != 1:
-            option = f"--{key.replace('_', '-')}"
-            hint = f"name one as {key}: {{urdf: {self._place}, {key}: ...}} in a file, {option} of observe"
-            raise InputError(self._place, f"{len(found)} {what} links ({', '.join(found)})", "one", hint)
+        option = f"--{key.replace('_', '-')}"
+        hint = f"name one as {key}: {{urdf: {self._place}, {key}: ...}} in a file, {option} of observe"
+        expect(len(found) == 1, self._place, f"{len(found)} {what} links ({', '.join(found)})", "one", hint)
         return found[0]
 
 
@@ -546,9 +539,9 @@ class _Link(Schema):
             InputError: b is no unit vector, or too near to -z.
         """
         length, found = math.hypot(*self.b), f"found {list(self.b)}, for which R(b) is any"
-        inputs.expect(abs(length - 1.0) <= UNIT, f"{place}: b", f"length {length:.9g}", f"1 within {UNIT:g}")
+        expect(abs(length - 1.0) <= UNIT, f"{place}: b", f"length {length:.9g}", f"1 within {UNIT:g}")
         hint = "take the next axis the other way, bz >= 0 with `sign: -1`; behind the last joint turn `tool`"
-        inputs.expect(self.b[2] >= UNIT - 1.0, f"{place}: b", found, "bz above -1", hint)
+        expect(self.b[2] >= UNIT - 1.0, f"{place}: b", found, "bz above -1", hint)
         beta = rotations.rotation_of(_si("beta", self.beta, units, place), 0.0, 0.0)
         R = rotations.least_rotation(np.array(self.b) / length) @ beta
         return np.vstack([np.column_stack([R, R @ self.l * units.factor("m")]), np.eye(4)[3]])
@@ -600,7 +593,7 @@ def read_robot(
     if path.suffix.lower() == ".urdf":
         return read_urdf(path, base_link=base_link, tip_link=tip_link, estimate=estimate)
     hint = f"`xacro {path.name} > {path.name.removesuffix(path.suffix).removesuffix('.urdf')}.urdf` writes one"
-    inputs.expect(path.suffix.lower() != ".xacro", path.name, "a file of xacro", "a URDF", hint)
+    expect(path.suffix.lower() != ".xacro", path.name, "a file of xacro", "a URDF", hint)
     mapping, links = read_yaml(path), {"base_link": base_link, "tip_link": tip_link}
     name = {} if "urdf" in mapping else {"name": path.stem}
     given = name | mapping | {key: link for key, link in links.items() if link is not None}
@@ -648,7 +641,7 @@ def _build_rows(file: _DhRobot | _PoeRobot, place: str, estimate: Sequence[str])
         if name in names[:i]:
             raise InputError(f"{here}: name", f"found {name!r}, the name of joint {names.index(name) + 1}", "another")
         lower, upper = row.limits
-        inputs.expect(lower < upper, f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
+        expect(lower < upper, f"{here}: limits", f"found {shown([lower, upper])}", "lower below upper")
         factor = file.units.factor("m" if row.type == "prismatic" else "rad")
         joint = Joint(name, row.type == "prismatic", lower * factor, upper * factor)
         if isinstance(row, _ScrewRow):
@@ -665,14 +658,14 @@ def _values(row: _Row, convention: str, units: Units, place: str) -> dict[str, f
     """The values of a row by kind, [m] and [rad]."""
     kinds = model.CONVENTIONS[convention]
     found, expected = f"found {row.beta!r}", f"none: the convention {convention} has no beta"
-    inputs.expect("beta" in kinds or not row.beta, f"{place}: beta", found, expected, f"{convention}-hayati has")
+    expect("beta" in kinds or not row.beta, f"{place}: beta", found, expected, f"{convention}-hayati has")
     if missing := [kind for kind in kinds if getattr(row, kind) is None]:
         raise InputError(place, f"missing key {missing[0]!r}")
     return {kind: _si(kind, getattr(row, kind), units, place) for kind in kinds}
 
 
 def _add_screw(builder: RobotBuilder, joint: Joint, row: _ScrewRow, units: Units, place: str) -> None:
-    inputs.expect(row.point or joint.prismatic, place, "missing key 'point'")
+    expect(row.point or joint.prismatic, place, "missing key 'point'")
     point = [one * units.factor("m") for one in row.point or (0.0, 0.0, 0.0)]
     if joint.prismatic and (row.x or row.y):
         raise InputError(place, "x or y of a slide", "pitch and roll: it has a direction alone")
@@ -808,7 +801,7 @@ def require_same_chain(robot: Robot, written: Robot, place: str) -> None:
     for one, other in zip(robot.elements, written.elements, strict=same):
         same &= replace(one, constant=other.constant) == other and abs(one.constant - other.constant) <= ROUNDING
     expected = "base, joints of one convention or a URDF's, tool: all that a robot file can say"
-    inputs.expect(same, place, "the robot has elements or parameters of its own", expected)
+    expect(same, place, "the robot has elements or parameters of its own", expected)
 
 
 def _row(robot: Robot, index: int, units: Units) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib import inputs, measurements, parallel
-from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked, pl, within
+from fg_calib.inputs import Booleans, Floats, FrozenArrays, InputError, Integers, Model, Record, checked, expect, pl
 from fg_calib.io.atomic import decoded, read_bytes, write_text
 from fg_calib.io.yaml import ANGLES, LENGTHS, Number, Schema, Units, number_hint, shown
 from fg_calib.measurements import GENERIC_COLUMNS, INSTRUMENTS, Groups, Labels, Measurements, Noise, Pairs
@@ -137,7 +137,7 @@ class Table(Record):
         except (Exception, pl.exceptions.PanicException) as error:  # of a frame's objects polars may raise anything
             first = str(error).strip().partition("\n")[0]
             raise InputError(name, f"no table: {first or type(error).__name__}") from None
-        inputs.expect(found.n_rows, name, "no rows", "at least one")
+        expect(found.n_rows, name, "no rows", "at least one")
         return replace(found, columns=tuple(names), renamed=dict(columns or {}))
 
     @property
@@ -172,8 +172,7 @@ class Table(Record):
         """
         values = np.empty((self.n_rows, len(columns)))
         for k, column in enumerate(columns):
-            if column not in self.frame.columns:
-                raise InputError(self.name, f"no column {column}", hint=f"it has {', '.join(self.columns)}")
+            expect(column in self.columns, self.name, f"no column {column}", hint=f"it has {', '.join(self.columns)}")
             cells = self.frame[column]
             if cells.dtype == pl.String:
                 texts = self.texts(column)
@@ -254,9 +253,8 @@ def _read_file(path: Path, skip_lines: int) -> Table:
     ending = path.suffix.lower()
     if ending == ".csv":
         return _read_csv(path.name, decoded(read_bytes(path), path.name, "cp1252"), skip_lines)
-    if ending not in (".parquet", ".pq"):
-        hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
-        raise InputError(path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
+    hint = "save the sheet as CSV" if ending in (".xlsx", ".xls", ".ods") else ""
+    expect(ending in (".parquet", ".pq"), path.name, f"ending {path.suffix!r}", "one of .csv, .parquet, .pq", hint)
     return Table(path.name, (), pl.read_parquet(BytesIO(read_bytes(path))))
 
 
@@ -269,15 +267,12 @@ def _read_csv(name: str, text: str, skip_lines: int) -> Table:
     Raises:
         InputError: The file is empty, a quote is not closed on its line, or a row's cells do not match the header.
     """
-    inputs.expect(text.strip(" \t\r\n,;"), f"{name}:1", "an empty file", "a header and rows")
+    expect(text.strip(" \t\r\n,;"), f"{name}:1", "an empty file", "a header and rows")
     read = partial(pl.read_csv, has_header=False, infer_schema=False)
     content = text.replace("\r\n", "\n").replace("\r", "\n").encode()
     every = read(content, separator="\x1f", quote_char=None, new_columns=["line"]).with_row_index("number", 1)
     lines = every.filter((pl.col("line").str.strip_chars(" \t,;") != "") & (pl.col("number") > skip_lines))
-    if lines.is_empty():
-        raise InputError(
-            f"{name}: skip_lines", f"found {skip_lines}", f"fewer than the {every.height} lines of the file"
-        )
+    expect(len(lines), f"{name}: skip_lines", f"found {skip_lines}", f"fewer than the {every.height} lines of the file")
     unquoted = lines["line"].str.replace_all('"[^"]*"', "") if '"' in text else lines["line"]
     separator = max(",;\t", key=unquoted[0].count)
     header = next(csv.reader([lines["line"][0].removeprefix("#")], delimiter=separator))  # as numpy writes it
@@ -286,7 +281,7 @@ def _read_csv(name: str, text: str, skip_lines: int) -> Table:
     if misfits.any():
         row = int(np.argmax(misfits))
         place, n = f"{name}:{lines['number'][row]}", n_cells[row]
-        inputs.expect('"' not in unquoted[row], place, "a quote that is not closed", "whole cells in quotes, or none")
+        expect('"' not in unquoted[row], place, "a quote that is not closed", "whole cells in quotes, or none")
         found = f"{n} cell{'s' * (n != 1)}"
         raise InputError(place, found, f"{len(header)} as in the header", _SKIP * (row == 1))
     if lines.height < every.height:
@@ -339,7 +334,7 @@ def _as_polars(table: Any, name: str) -> "pl.DataFrame":
         columns = frame if isinstance(frame, Mapping) else (frame.reset_index() if named else frame).to_dict("list")
         inputs.check_different(name, columns)
         frame = pl.DataFrame({str(key): _series(values) for key, values in columns.items()})
-    inputs.expect(frame.columns, name, "a frame without columns", "a frame with rows")
+    expect(frame.columns, name, "a frame without columns", "a frame with rows")
     return frame.with_columns(pl.selectors.float().fill_nan(None))
 
 
@@ -419,7 +414,7 @@ def read_measurements(
     readings = read_readings(table, find_joint_columns(table, robot), robot, units)
     between = None if pairs is None else Table.read(pairs, "frame of pairs", names_of(OF_PAIRS.values()))
     found = measurements_of(table, readings, between, units, noise, model)
-    with within(table.name):
+    with inputs.within(table.name):
         return replace(found, context=_read_context(table, robot, readings, units, needed=True))
 
 
@@ -487,7 +482,7 @@ def read_table(
 
     def note(names: Sequence[str]) -> Floats:
         taken = sorted((others | joints).intersection(names))
-        inputs.expect(not taken, robot.name, f"effects by {', '.join(taken)}", "columns of nothing else", hint)
+        expect(not taken, robot.name, f"effects by {', '.join(taken)}", "columns of nothing else", hint)
         known.update(names)
         return np.full((1, len(names)), np.nan)
 
@@ -685,9 +680,8 @@ def _measured(table: Table, known: Iterable[str], units: Units, noise: Noise) ->
 def _one_of(table: Table, columns: Iterable[str], present: Container[str]) -> str | None:
     """The column that is present of several that say the same; None of none."""
     given = [name for name in columns if name in present]
-    if len(given) > 1:
-        both = [" ".join(OF_CONFIGURATIONS[name].names) for name in given]
-        raise InputError(table.name, f"both {both[0]} and {both[1]}", "one of the two")
+    both = " and ".join(" ".join(OF_CONFIGURATIONS[name].names) for name in given[:2])
+    expect(len(given) < 2, table.name, f"both {both}", "one of the two")
     return given[0] if given else None
 
 

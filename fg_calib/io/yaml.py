@@ -131,11 +131,10 @@ def _options(misfit: ErrorDetails) -> list[str]:
 
 
 def _expected(misfit: ErrorDetails) -> str:
-    context = misfit.get("ctx", {})
     if misfit["type"] == "literal_error":
         return "one of " + ", ".join(_options(misfit))
     words = _EXPECTED.get(misfit["type"])
-    return misfit["msg"] if words is None else words.format(**context)
+    return misfit["msg"] if words is None else words.format(**misfit.get("ctx", {}))
 
 
 _EXPECTED = {
@@ -179,10 +178,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise InputError(place, error.problem or "not YAML", hint=error.context or "") from None
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(path.name, f"not YAML: {error}") from None
-    if not isinstance(mapping, dict):
-        found = "an empty file" if mapping is None else f"found {shown(mapping)}"
-        hint = "is it a URDF? its name ends in .urdf" if text.lstrip().startswith("<") else ""
-        raise InputError(path.name, found, "a mapping, key: value", hint)
+    found = "an empty file" if mapping is None else f"found {shown(mapping)}"
+    hint = "is it a URDF? its name ends in .urdf" if text.lstrip().startswith("<") else ""
+    inputs.expect(isinstance(mapping, dict), path.name, found, "a mapping, key: value", hint)
     return mapping
 
 
