@@ -3,7 +3,7 @@
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
-from simulated import measure, true_robot
+from simulated import measure_drawn
 
 from fg_calib.io import read_robot, write_csv
 
@@ -35,8 +35,7 @@ def ur5e(folder, **changes):
 
 def measured(robot, seed=0, *, placed=None, n=50, n_test=0, readings=None):
     """What is measured of a robot whose errors are those its tolerances say."""
-    rng = np.random.default_rng(seed)
-    return measure(true_robot(robot, rng), n, rng, sigma=SIGMA, frame=placed, n_test=n_test, readings=readings)
+    return measure_drawn(robot, n, seed, sigma=SIGMA, frame=placed, n_test=n_test, readings=readings)
 
 
 def write_job(folder, measurements, *, angles=None, **keys):

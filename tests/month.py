@@ -45,14 +45,6 @@ def seen(true, spots, rng, n, ids):
     return Table(replace(rows, labels={"target": Labels(tuple(spots), of)}), "position")
 
 
-def slipped(true, **changes):
-    """The arm with some parameters changed."""
-    values = true.nominal.copy()
-    for name, change in changes.items():
-        values[true.index(name.replace("tool_", "tool."))] += change
-    return true.with_values(values)
-
-
 def calibrated(seed=0, *, n=40, unknown=False, model="pose", robot=None, sigma=SIGMA, **options):
     """The calibration, the true arm, and a generator to go on with."""
     rng = np.random.default_rng(seed)

@@ -87,6 +87,14 @@ def errors_of_all(solution, true: Robot):
     return solution.parameters[places] - true.nominal[places], solution.system.full_root[columns]
 
 
+def with_changes(robot: Robot, /, **changes) -> Robot:
+    """The robot with some parameters changed."""
+    values = robot.nominal
+    for name, change in changes.items():
+        values[robot.index(name)] += change
+    return robot.with_values(values)
+
+
 def plus(array, rows, amount):
     """A copy of an array with something added at some rows."""
     changed = array.copy()
@@ -116,6 +124,12 @@ def measure(true, n, rng, *, sigma=(1e-3, 2e-4), sigma_joint=0.0, frame=None, n_
     rotation = (turn * Rotation.from_matrix(at.rotation) * noise).as_matrix()
     sigmas = (*(np.full((total, 3), one) for one in sigma), np.full(true.n_joints, sigma_joint))
     return Measurements(q, np.arange(total).astype(str), np.arange(total) >= n, position, rotation, *sigmas)
+
+
+def measure_drawn(robot: Robot, n, seed, **how) -> Measurements:
+    """Poses of a true robot that is drawn first."""
+    rng = np.random.default_rng(seed)
+    return measure(true_robot(robot, rng), n, rng, **how)
 
 
 def write_job(folder, robot: Robot, m: Measurements, /, **job):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from refusals import refusal
 from scipy.spatial.transform import Rotation
-from simulated import TOOL, measure, small_arm, true_robot
+from simulated import TOOL, measure, measure_drawn, small_arm
 
 from fg_calib import Calibration, Measurements, Options, ProblemError, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics.multistart import multistart
@@ -30,10 +30,8 @@ CASES = {
 
 def given(name, n=25):
     settings, of_robot = CASES[name]
-    rng = np.random.default_rng(7)
     robot = small_arm(**of_robot)
-    frame = FRAME if "frame" in name else None
-    return robot, measure(true_robot(robot, rng), n, rng, frame=frame, n_test=5), settings
+    return robot, measure_drawn(robot, n, seed=7, frame=FRAME if "frame" in name else None, n_test=5), settings
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,12 @@ import pytest
 from oracle import central_differences, tool_pose
 from refusals import refusal
 from scipy.spatial.transform import Rotation
-from simulated import measure, paper_robot, planar_robot, small_arm, true_robot
+from simulated import measure, measure_drawn, pairs_between, paper_robot, planar_robot, plus, small_arm
 from tolerances import NEGLIGIBLE, rounding, sigmas_apart
 
 from fg_calib import InputError, Measurements, Pairing, SolverOptions, Table, assess, build_problem, solve
 from fg_calib.baseline import least_squares
-from fg_calib.measurements import Pairs, build_dataset, form_pairs
-from fg_calib.robot import pose, rotation_angle
+from fg_calib.measurements import build_dataset, form_pairs
 
 PAPERS = ["distance", "distance-rotation", "pose"]
 TO_THE_END = SolverOptions(decrement=1e-9)
@@ -34,8 +33,7 @@ def apart(fit, values):
 
 def simulated(robot, model, seed=1, *, sigma=NOISE, sigma_joint=0.0, n=80):
     """Measurements whose rows all have one weight, metres and radians alike, the pairs' far from 0 and half a turn."""
-    rng = np.random.default_rng(seed)
-    measurements = measure(true_robot(robot, rng), n, rng, sigma=(sigma, sigma), sigma_joint=sigma_joint)
+    measurements = measure_drawn(robot, n, seed, sigma=(sigma, sigma), sigma_joint=sigma_joint)
     if model in ("pose", "position", "orientation"):
         return measurements
     pairs = form_pairs(measurements, Pairing("random", 150))
@@ -95,9 +93,8 @@ def test_weighted_by_joint_noise_it_is_the_graph(model, lacking):
 @pytest.mark.parametrize("model", ["pose", "position", "orientation"])
 def test_an_unknown_frame_is_the_graphs(model):
     robot = small_arm()
-    rng = np.random.default_rng(3)
-    turn, shift = Rotation.from_euler("ZYX", [0.4, 1.2, 0.2]), np.array([7.0, -3.0, 2.0])
-    measurements = measure(true_robot(robot, rng), 60, rng, sigma=(1e-4, 1e-4), frame=(turn, shift))
+    frame = Rotation.from_euler("ZYX", [0.4, 1.2, 0.2]), np.array([7.0, -3.0, 2.0])
+    measurements = measure_drawn(robot, 60, seed=3, sigma=(1e-4, 1e-4), frame=frame)
     problem = build_problem(robot, measurements, model=model, frame="unknown", gauge="keep")
     solution = solve(problem, TO_THE_END)
     start = {"start": np.array([*robot.nominal, 6.9, -3.1, 2.05, 0.4, 1.2, 0.25]), "frame": "unknown"}
@@ -161,8 +158,7 @@ def planar_measurements(offsets):
     q = np.array([[0.0, 0.0], [0.0, np.pi]] * (n // 2))
     reach = np.where(q[:, 1] == 0.0, 3.0, 1.0)
     position = np.stack([reach + offsets, np.zeros(n), np.zeros(n)], axis=1)
-    sigma = np.full((n, 3), 2e-3)
-    return Measurements(q, np.arange(n).astype(str), np.zeros(n, bool), position, None, sigma, None, np.zeros(2))
+    return Measurements.from_arrays(q, position=position, sigma_position=2e-3)
 
 
 def test_unweighted_it_claims_what_the_residuals_say_and_weighted_what_the_noise_says():
@@ -194,15 +190,11 @@ def test_what_the_measurements_leave_open_has_no_sigma():
 
 
 def test_pairs_of_one_configuration_and_test_rows_take_no_part():
-    robot = planar_robot()
+    robot, rng = planar_robot(), np.random.default_rng(0)
     q = np.array([[0.0, 0.0], [0.0, 0.0], [0.3, 0.5], [1.0, -2.0], [2.0, 1.0]])
-    at = pose(robot, q)
-    a, b = np.array([0, 0, 2, 2]), np.array([1, 2, 3, 4])
-    distance = np.linalg.norm(at.position[b] - at.position[a], axis=1)
-    angle = rotation_angle(np.swapaxes(at.rotation[a], 1, 2) @ at.rotation[b])[0]
-    angle[2], sigma = np.nan, np.full(4, 1e-3)
-    pairs = Pairs(a, b, distance, angle, sigma, sigma, np.array([False, False, False, True]))
-    measurements = replace(measure(robot, 5, np.random.default_rng(0), readings=q), pairs=pairs)
+    pairs = pairs_between(robot, q, (np.array([0, 0, 2, 2]), np.array([1, 2, 3, 4])), rng)
+    pairs = replace(pairs, angle=plus(pairs.angle, 2, np.nan), test=np.arange(4) == 3)
+    measurements = replace(measure(robot, 5, rng, readings=q), pairs=pairs)
     fit = fit_least_squares(robot, measurements, model="distance-rotation", names=["a2"], weighted=True)
     assert fit.n_rows == 3
 

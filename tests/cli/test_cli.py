@@ -12,7 +12,7 @@ import pytest
 from exported import TREE
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
-from simulated import measure, write_job
+from simulated import measure, with_changes, write_job
 from tolerances import rounding
 from typer.testing import CliRunner
 
@@ -198,8 +198,7 @@ def test_a_urdf_gives_a_calibrated_urdf_that_reads_back_to_the_estimates(fg_cali
     (tmp_path / "arm.urdf").write_text(TREE)
     nominal = read_robot(tmp_path / "arm.urdf", tip_link="tip")
     rng = np.random.default_rng(5)
-    error = {"swivel.x": 0.002, "swivel.roll": 0.003, "turn.z": -0.001}
-    true = nominal.with_values([p.nominal + error.get(p.name, 0.0) for p in nominal.parameters])
+    true = with_changes(nominal, **{"swivel.x": 0.002, "swivel.roll": 0.003, "turn.z": -0.001})
     lower, upper = np.nan_to_num(nominal.limits, neginf=-2.5, posinf=2.5).T
     q = rng.uniform(lower, upper, (42, nominal.n_joints))
     rows = measure(true, 40, rng, readings=q[:40], sigma=(1e-4, 1e-4))

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import yaml
 from exported import UR10, off, ur10
-from month import placed, slipped
-from simulated import TOOL, measure, write_job
+from month import placed
+from simulated import TOOL, measure, with_changes, write_job
 from sparing import as_case
 
 from fg_calib import Calibration, Robot, calibrate, export, read_robot
@@ -76,7 +76,8 @@ ZEROS = np.deg2rad([0.5, -0.3, 0.8, -1.0, 0.4, 6.2])
 def test_zeros_that_cannot_be_told_stay_0_and_what_takes_them_up_is_named(form, fg_calib, tmp_path):
     """Joint 1 from the unknown frame and joint 6 from the tool; the others are found, and nothing else moves."""
     nominal, rng = ur10("dh"), np.random.default_rng(1)
-    data = measure(slipped(nominal, **{f"theta{i}": z for i, z in enumerate(ZEROS, 1)}), 30, rng, frame=placed(rng))
+    true = with_changes(nominal, **dict(zip(nominal.zero_names, ZEROS, strict=True)))
+    data = measure(true, 30, rng, frame=placed(rng))
     robot = {}
     if form == "urdf":
         export(nominal, "urdf").write(tmp_path / "arm.urdf")

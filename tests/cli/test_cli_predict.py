@@ -5,7 +5,7 @@ import json
 import numpy as np
 import polars as pl
 import pytest
-from simulated import LARGE, measure, small_arm, true_robot
+from simulated import LARGE, measure_drawn, small_arm
 
 from fg_calib import Calibration, calibrate
 from fg_calib.prediction import workspace
@@ -16,9 +16,8 @@ JOINTS = ["q1", "q2", "q3", "q4"]
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     """The folder of a small arm's result."""
-    folder, rng = tmp_path_factory.mktemp("result"), np.random.default_rng(1)
-    robot = small_arm(tolerance=LARGE)
-    calibrate(robot, measure(true_robot(robot, rng), 20, rng, sigma=(1e-4, 1e-4)), model="pose").save(folder)
+    folder, robot = tmp_path_factory.mktemp("result"), small_arm(tolerance=LARGE)
+    calibrate(robot, measure_drawn(robot, 20, seed=1, sigma=(1e-4, 1e-4)), model="pose").save(folder)
     return folder
 
 

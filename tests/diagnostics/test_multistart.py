@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from instruments import TOLERANCE
 from scipy.stats import chi2
-from simulated import nees, small_arm, true_robot
+from simulated import nees, small_arm, true_robot, with_changes
 from touches import reach_faces
 
 from fg_calib import Job, Measurements, Options, Pairing, Robot, Table, assess, build_problem, calibrate, solve
@@ -20,9 +20,8 @@ def pointer(*, nominal, true, tolerance=0.02, model="distance"):
     """A job on a pointer, 100 mm long, its tip `true` aside: distances see its radius, so the square of that."""
     robot = Robot.from_dh([[0.1, np.pi / 2, 0, 0], [0, 0, nominal, 0]], "dh", tolerance={"d2": tolerance})
     robot, rng = robot.with_estimated(["d2"]), np.random.default_rng(0)
-    q, values = rng.uniform(-np.pi, np.pi, (40, 2)), robot.nominal
-    values[robot.index("d2")] = true
-    position = pose(robot.with_values(values), q).position + SIGMA * rng.normal(size=(40, 3))
+    q, there = rng.uniform(-np.pi, np.pi, (40, 2)), with_changes(robot, d2=true - nominal)
+    position = pose(there, q).position + SIGMA * rng.normal(size=(40, 3))
     m = Measurements.from_arrays(q, position=position, sigma_position=SIGMA)
     return Job(None, robot, m, Options(model, pairing=Pairing("chain"), gauge="prior"))
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from jobs import PLACED, ur5e
-from simulated import TOOL, measure, pairs_between, true_robot
+from simulated import TOOL, measure, pairs_between, true_robot, with_changes
 from sparing import diagonal
 
 from fg_calib import Table, build_problem, solve
@@ -64,9 +64,8 @@ def test_another_tool_is_said_of_the_tables_that_disagree(tmp_path):
     rng = np.random.default_rng(5)
     robot = ur5e(tmp_path, estimate=TOOL, tolerance=TOLERANCE)
     true = true_robot(robot, rng)
-    values = true.nominal
-    values[[true.index(f"tool.{k}") for k in "xyz"]] += [0.06, -0.02, 0.03]
-    arms = {"one.csv": true, "other.csv": true.with_values(values)}
+    other = with_changes(true, **{"tool.x": 0.06, "tool.y": -0.02, "tool.z": 0.03})
+    arms = {"one.csv": true, "other.csv": other}
     tables = [Table(replace(tracker(arm, rng), source=name), "position") for name, arm in arms.items()]
     found = said(robot, tables, (0, 1))
     assert {text.partition(":")[0] for text in found} == set(arms)

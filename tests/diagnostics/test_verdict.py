@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from simulated import LARGE, measure, plus, small_arm, true_robot
+from simulated import LARGE, measure, measure_drawn, plus, small_arm, true_robot
+from systematic import PLACED
 
 from fg_calib import assess, build_problem, solve
 from fg_calib.diagnostics import SetupCheck
@@ -15,9 +15,6 @@ from fg_calib.diagnostics.unmodelled_effects import Change, Systematic
 from fg_calib.diagnostics.verdict import Case, check_chi_square
 from fg_calib.robot import pose
 from fg_calib.statistics import ChiSquare, GrossErrors, estimate_noise
-
-FRAME = (Rotation.from_rotvec([0.3, 0.2, -0.5]), np.array([1.0, 2.0, 3.0]))
-
 
 # --- test rows ------------------------------------------------------------------------------------------------------
 
@@ -108,9 +105,8 @@ def test_gross_errors_are_not_all_that_is_wrong_beside_a_change_or_an_effect(mor
 
 
 def test_tolerances_specified_too_small_for_all_are_a_finding():
-    rng = np.random.default_rng(33)
     robot, loose = (small_arm(tolerance={k: f * v for k, v in LARGE.items()}) for f in (1.0, 2.5))
-    m = measure(true_robot(loose, rng), 30, rng, sigma=(1e-4, 1e-4))
+    m = measure_drawn(loose, 30, seed=33, sigma=(1e-4, 1e-4))
     found = assess(solve(build_problem(robot, m, model="pose")))
     assert found.fit.priors.chi2 > 2 * found.fit.priors.expected
     assert any("specified too small" in finding for finding in found.verdict.errors)
@@ -127,7 +123,7 @@ def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(choices, error):
     nominal = small_arm(tolerance=LARGE)
     true = true_robot(nominal, rng)
     robot = nominal.with_values(true.nominal + error * (nominal.nominal - true.nominal))
-    frame = FRAME if "frame" in choices else None
+    frame = PLACED if "frame" in choices else None
     m = measure(true, 0, rng, sigma=(3e-4, 2e-4), sigma_joint=1e-4, frame=frame, n_test=15)
     found = assess(solve(build_problem(robot, m, **choices)))
     assert found.robot.nominal.tolist() == robot.nominal.tolist()
@@ -138,9 +134,8 @@ def test_a_table_of_test_rows_alone_evaluates_the_arm_as_it_is(choices, error):
 
 def test_noise_estimated_as_large_as_the_motions_is_no_noise():
     """Orientations that were never measured: all are the same."""
-    rng = np.random.default_rng(0)
     robot = small_arm(tolerance=LARGE)
-    m = measure(true_robot(robot, rng), 40, rng)
+    m = measure_drawn(robot, 40, seed=0)
     m = replace(m, rotation=np.tile(np.eye(3), (40, 1, 1)))
     found = assess(estimate_noise(build_problem(robot, m, model="pose")))
     assert any(text.startswith("the noise estimated of orientation is") for text in found.verdict.errors)

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import yaml
 from exported import ARMS, TREE, UR10, matrix, off, seven, ur10, yourdfpy_poses
-from month import slipped
 from oracle import frame
 from refusals import refusal
 from scipy.spatial.transform import Rotation
-from simulated import measure
+from simulated import measure, with_changes
 from sparing import as_case
 
 from fg_calib import Robot, calibrate, export, read_robot
@@ -247,7 +246,7 @@ def test_zeros_are_the_best_there_are():
 def test_a_joint_takes_up_the_zeros_that_angles_do_not_tell_from_its_own(tolerance):
     """Of parallel axes only the sum of their turns is seen, whatever priors make of its parts."""
     nominal = Robot.from_dh([row[:4] for row in UR10], "dh", estimate=["zeros"], tolerance=tolerance)
-    true = slipped(nominal, theta2=0.01, theta3=0.02, theta4=-0.05)
+    true = with_changes(nominal, theta2=0.01, theta3=0.02, theta4=-0.05)
     data = measure(true, 30, np.random.default_rng(0), sigma=(1e-4, 1e-4))
     zeros = export(calibrate(nominal, data, model="rotation"), "zeros").details["zeros"]
     assert zeros["q4"]["note"] == "sum with q2, q3"

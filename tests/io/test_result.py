@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exported import column
-from simulated import measure, small_arm, true_robot
+from simulated import measure, measure_drawn, small_arm
 
 from fg_calib import Calibration, InputError, Pairing, calibrate
 from fg_calib.robot.model import Axis, Element
@@ -32,10 +32,8 @@ PROMISED = {
 @pytest.fixture(scope="module")
 def calibrations():
     def found(settings):
-        rng = np.random.default_rng(5)
         robot = small_arm(TOLERANCE)
-        m = measure(true_robot(robot, rng), 20, rng, n_test=4, sigma_joint=1e-4)
-        return calibrate(robot, m, **settings)
+        return calibrate(robot, measure_drawn(robot, 20, seed=5, n_test=4, sigma_joint=1e-4), **settings)
 
     return {name: found(settings) for name, settings in CASES.items()}
 

@@ -10,6 +10,7 @@ from exported import TREE, yourdfpy_poses
 from lxml import etree
 from oracle import tool_pose
 from refusals import refusal
+from simulated import with_changes
 from tolerances import rounding
 
 from fg_calib.inputs import InputError
@@ -41,10 +42,7 @@ def test_changed_parameters_of_a_reversed_chain_are_those_of_the_file(tree, tmp_
 
 def test_only_origins_of_moving_joints_are_rewritten(tree, tmp_path):
     robot = read_urdf(tree, base_link="tip", tip_link="gate")
-    values = robot.nominal
-    values[robot.index("gate.z")] = 0.1
-    values[robot.index("turn.yaw")] = 1 / 3
-    write_urdf(tmp_path / "out.urdf", robot.with_values(values))
+    write_urdf(tmp_path / "out.urdf", with_changes(robot, **{"gate.z": 0.1, "turn.yaw": 1 / 3}))
     expected = (
         TREE.replace('<joint name="gate" type="continuous">\n    ', '<joint name="gate" type="continuous">\n    '
                  '<origin xyz="0.0 0.0 0.1"/>\n    ')

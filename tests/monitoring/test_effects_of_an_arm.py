@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated import arm_with, measure_points, within_tolerance
+from simulated import arm_with, measure_points, with_changes, within_tolerance
 
 from fg_calib import calibrate
 from fg_calib.robot import Compliance, ErrorCurve, Mass
@@ -21,9 +21,7 @@ def month():
     robot = arm_with(*EFFECTS)
     true = within_tolerance(robot, rng)
     calibration = calibrate(robot, measured(true, 80, rng), model="position", gauge="prior")
-    values = true.nominal
-    values[true.index("theta3.compliance")] += 5e-5
-    return calibration, true, true.with_values(values), rng
+    return calibration, true, with_changes(true, **{"theta3.compliance": 5e-5}), rng
 
 
 def test_a_stiffness_that_changed_is_named(month):

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from month import arm, calibrated, measured, placed, seen, slipped
+from month import arm, calibrated, measured, placed, seen
 from refusals import refusal
-from simulated import true_robot
+from simulated import true_robot, with_changes
 
 from fg_calib import Measurements, Table, calibrate, export
 
@@ -14,10 +14,13 @@ FINE = (5e-8, 1e-7)
 """Noise so small that all is linear: a thousandth of an instrument's."""
 
 
-def tables_of(sigma, unknown, model, rng, true, n=(30, 12)):
-    frames = [placed(rng) if unknown else None for _ in n]
-    rows = [measured(true, k, rng, frame=f, sigma=sigma, ids=i) for k, f, i in zip(n, frames, "ab", strict=True)]
-    return [Table(m, model, frame="unknown" if unknown else "known") for m in rows]
+def drawn(seed=0, unknown=False, model="pose"):
+    """A robot, the true one, tables of a first and a second time, and a generator to go on with."""
+    rng, robot, frame = np.random.default_rng(seed), fine_arm(), "unknown" if unknown else "known"
+    true = true_robot(robot, rng)
+    frames = [placed(rng) if unknown else None for _ in range(2)]
+    rows = [measured(true, n, rng, frame=f, sigma=FINE, ids=i) for n, f, i in zip((30, 12), frames, "ab", strict=True)]
+    return robot, true, [Table(m, model, frame=frame) for m in rows], rng
 
 
 def difference(updated, batch):
@@ -32,9 +35,7 @@ def difference(updated, batch):
 @pytest.mark.parametrize("gauge", ["prior", "keep"])
 @pytest.mark.parametrize(("unknown", "model"), [(False, "pose"), (True, "pose"), (False, "distance-rotation")])
 def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
-    rng = np.random.default_rng(0)
-    robot = fine_arm()
-    old, new = tables_of(FINE, unknown, model, rng, true_robot(robot, rng))
+    robot, _, (old, new), _ = drawn(0, unknown, model)
     updated = calibrate(robot, old, gauge=gauge).update(new)
     off, of_sigma = difference(updated, calibrate(robot, [old, new], gauge=gauge))
     assert off < 1e-6
@@ -43,9 +44,7 @@ def test_an_update_is_a_calibration_of_all_rows(unknown, model, gauge):
 
 
 def test_a_second_update_counts_what_was_known_once():
-    rng, robot = np.random.default_rng(0), fine_arm()
-    true = true_robot(robot, rng)
-    old, new = tables_of(FINE, False, "pose", rng, true)
+    robot, true, (old, new), rng = drawn()
     more = Table(measured(true, 12, rng, sigma=FINE, ids="c"), "pose")
     twice = calibrate(robot, old).update(new).update(more)
     assert max(difference(twice, calibrate(robot, [old, new, more]))) < 1e-5
@@ -54,9 +53,7 @@ def test_a_second_update_counts_what_was_known_once():
 @pytest.mark.parametrize("unknown", [False, True])
 def test_without_a_gauge_what_no_rows_determine_is_refused(unknown):
     """Linearised at the old estimate, d2, d3 and d4 of parallel axes went off by metres, theta2 by 70 sigma."""
-    rng = np.random.default_rng(1)
-    robot = fine_arm()
-    old, new = tables_of(FINE, unknown, "pose", rng, true_robot(robot, rng))
+    robot, _, (old, new), _ = drawn(1, unknown)
     said = refusal(calibrate(robot, old, gauge="none").update, new)
     assert "update: gauge none, and rows that do not determine" in said
 
@@ -89,7 +86,7 @@ def fine_arm(**more):
 def test_an_update_at_odds_with_what_was_known_points_to_the_check():
     """After a slip that nobody declared; not to the convention, which fitted before."""
     calibration, true, rng = calibrated(78)
-    updated = calibration.update(measured(slipped(true, theta3=1e-3), 8, rng))
+    updated = calibration.update(measured(with_changes(true, theta3=1e-3), 8, rng))
     assert "see `fg-calib check`" in updated.findings[0]
     assert not any("parallel" in text for text in updated.findings)
 
@@ -97,7 +94,7 @@ def test_an_update_at_odds_with_what_was_known_points_to_the_check():
 def test_a_joint_of_fixed_parameters_has_no_zero_to_change():
     """Other joints change, and zeros fitted to the arm are exported, its own too."""
     calibration, true, rng = calibrated(1, robot=arm(fixed=["a1", "alpha1", "d1", "theta1"]))
-    rows = measured(slipped(true, theta3=2e-3), 10, rng, ids="new")
+    rows = measured(with_changes(true, theta3=2e-3), 10, rng, ids="new")
     changed = calibration.update(rows, changed="theta3").parameters["theta3"]
     assert abs(changed.estimate - true.nominal[true.index("theta3")] - 2e-3) < 4.0 * changed.sigma
     assert "changed" in refusal(calibration.update, rows, changed="q1.zero")
@@ -133,11 +130,14 @@ def reasons(calibration):
     return [lost.reason for lost in calibration.assessment.identifiability.lost]
 
 
-def with_still_joint(model, n, rng, true, joint=5):
-    """Rows in which one joint stands still, so that some parameters are never seen apart."""
-    q = rng.uniform(-2.5, 2.5, (n, 6))
-    q[:, joint] = 0.3
-    return Table(measured(true, n, rng, q=q), model)
+def with_still_joint(model, seed):
+    """Tables of a first and a second time in which joint 6 stands still: some parameters are never seen apart."""
+    rng = np.random.default_rng(seed)
+    true = true_robot(arm(), rng)
+    for n in (30, 10):
+        q = rng.uniform(-2.5, 2.5, (n, 6))
+        q[:, 5] = 0.3
+        yield Table(measured(true, n, rng, q=q), model)
 
 
 @pytest.mark.sampled(1)
@@ -145,9 +145,7 @@ def with_still_joint(model, n, rng, true, joint=5):
 def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
     """At the old estimate lost directions have turned a little: theta2, theta3 and theta4 were called relative there,
     and what parallel axes do `no simple cause found`."""
-    rng = np.random.default_rng(0)
-    true = true_robot(arm(), rng)
-    old, new = (with_still_joint(model, n, rng, true) for n in (30, 10))
+    old, new = with_still_joint(model, seed=0)
     updated, batch = calibrate(arm(), old).update(new), calibrate(arm(), [old, new])
     assert classes(updated) == classes(batch)
     assert reasons(updated) == reasons(batch)
@@ -157,9 +155,7 @@ def test_classes_and_reasons_of_an_update_are_those_of_all_rows(model):
 @pytest.mark.parametrize("change", [{"growth": {"theta": 1e-9, "d": 1e-9}}, {"changed": ["theta3"]}])
 def test_what_tolerances_alone_say_is_no_data_of_an_update(change):
     """With growth the tolerances are part of what is known: d2, d3 and d4 of parallel axes were called independent."""
-    rng = np.random.default_rng(2)
-    true = true_robot(arm(), rng)
-    old, new = (with_still_joint("pose", n, rng, true) for n in (30, 10))
+    old, new = with_still_joint("pose", seed=2)
     updated = calibrate(arm(), old).update(new, date="2100-01-01", **change)
     assert classes(updated) == classes(calibrate(arm(), [old, new]))
 
@@ -179,14 +175,14 @@ def test_a_limit_without_test_rows_is_judged_by_how_the_arm_before_predicts_the_
 
 def test_a_limit_that_the_arm_before_misses_is_not_evaluated():
     calibration, true, rng = calibrated(11, accept=ACCEPT)
-    rows = measured(slipped(true, theta3=2e-3), 8, rng)
+    rows = measured(with_changes(true, theta3=2e-3), 8, rng)
     assert "the arm before this update misses it" in calibration.update(rows).not_accepted[0]
     assert "no measurement of any position was held out" in calibration.update(rows, changed="theta3").not_accepted[0]
 
 
 def test_after_a_change_limits_are_judged_by_folds_of_the_new_rows():
     calibration, true, rng = calibrated(11, accept=ACCEPT, folds=4)
-    rows = measured(slipped(true, theta3=2e-3), 8, rng)
+    rows = measured(with_changes(true, theta3=2e-3), 8, rng)
     found = calibration.update(rows, changed="theta3").result
     assert found.acceptance.verdict == "pass"
     assert found.folds.kinds["position"].n == 8

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from jobs import UR5E, ur5e
-from simulated import measure, small_arm, true_robot
+from simulated import measure, small_arm, true_robot, with_changes
 
 from fg_calib import Robot, assess, build_problem, read_robot, solve
 from fg_calib.observability import missing_motions
@@ -87,9 +87,8 @@ def test_what_the_convention_lacks_is_an_error_only_where_it_explains_the_misfit
 
 def test_a_base_whose_turn_alone_is_estimated_is_named_where_it_is_pitched_by_a_quarter_turn():
     robot = small_arm(estimate=[f"base.{angle}" for angle in ("roll", "pitch", "yaw")])
-    pitched = robot.nominal
-    pitched[robot.index("base.pitch")] = QUARTER
-    (found,) = missing_motions(robot.with_values(pitched))
+    pitch = QUARTER - robot.nominal[robot.index("base.pitch")]
+    (found,) = missing_motions(with_changes(robot, **{"base.pitch": pitch}))
     assert (found.axes, found.frame) == ((0, 1), "the frame base")
 
 

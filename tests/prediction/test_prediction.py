@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from oracle import central_differences
 from refusals import refusal
-from simulated import measure, small_arm, true_robot
+from simulated import measure, measure_drawn, small_arm, true_robot
 from tolerances import rounding
 
 from fg_calib import Robot, build_problem, calibrate, predict, solve
@@ -18,9 +18,8 @@ JOINTS = np.array([1e-4, 2e-4, 5e-5, 3e-4])
 
 @pytest.fixture(scope="module")
 def calibrated():
-    rng = np.random.default_rng(1)
     robot = small_arm(tolerance=LARGE)
-    m = measure(true_robot(robot, rng), 40, rng, sigma=(1e-4, 1e-4))
+    m = measure_drawn(robot, 40, seed=1, sigma=(1e-4, 1e-4))
     return calibrate(robot, m, model="pose"), m
 
 

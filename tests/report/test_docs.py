@@ -11,7 +11,7 @@ import month
 import numpy as np
 import pytest
 import typer
-from simulated import measure, small_arm, true_robot
+from simulated import measure, small_arm, true_robot, with_changes
 
 import fg_calib as package
 from fg_calib import Robot, Table, calibrate, read_job, read_robot, simulate
@@ -162,7 +162,7 @@ def run_python(text, folder, fg_calib):
         np.save(folder / "p.npy", m.position)
     if "calibration.check" in text:
         calibration, true, more = month.calibrated(1)
-        names |= {"calibration": calibration, "rows": month.measured(month.slipped(true, theta3=2e-3), 10, more)}
+        names |= {"calibration": calibration, "rows": month.measured(with_changes(true, theta3=2e-3), 10, more)}
     if '"result"' in text and "save" not in text:
         calibrate(robot, measure(true_robot(robot, rng), 20, rng), model="position").save(folder / "result")
         (folder / "program.csv").write_text("q1,q2,q3,q4\n0.1,0.2,0.3,0.4\n")

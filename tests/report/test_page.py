@@ -9,7 +9,7 @@ import pytest
 from instruments import measured_by
 from lxml import html
 from scipy.spatial.transform import Rotation
-from simulated import measure, plus, small_arm, tool_points, true_robot
+from simulated import measure, measure_drawn, plus, small_arm, tool_points
 
 from fg_calib import Calibration, Job, Options, calibrate, calibrate_job
 from fg_calib.calibration import write_report
@@ -33,13 +33,10 @@ TOLERANCE = {"a": 1e-3, "d": 1e-3, "theta": 1e-3, "alpha": 1e-3}
 
 
 def calibrated(robot=None, **options):
-    rng = np.random.default_rng(3)
     robot = robot or small_arm(TOLERANCE)
-    m = measure(true_robot(robot, rng), 30, rng, n_test=10)
-    position = m.position.copy()
-    position[4] += 0.02
+    m = measure_drawn(robot, 30, seed=3, n_test=10)
     given = {"model": "position", "frame": "unknown", "accept": {"position": 1e-3}} | options
-    return calibrate(robot, replace(m, position=position), **given)
+    return calibrate(robot, replace(m, position=plus(m.position, 4, 0.02)), **given)
 
 
 @pytest.fixture(scope="module")

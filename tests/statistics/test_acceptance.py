@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from refusals import refusal
-from simulated import measure, small_arm, true_robot, write_job
+from simulated import measure, measure_drawn, small_arm, true_robot, write_job
 
 from fg_calib import Limits, Options, calibrate
 
@@ -16,8 +16,7 @@ ROBOT = small_arm(tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.01), e
 
 
 def measured(n_test=20):
-    rng = np.random.default_rng(0)
-    return measure(true_robot(ROBOT, rng), 40, rng, sigma=(1e-4, 1e-4), n_test=n_test)
+    return measure_drawn(ROBOT, 40, seed=0, sigma=(1e-4, 1e-4), n_test=n_test)
 
 
 def calibrated(n_test=20, wrong=0.0, **options):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from simulated import measure, paper_robot, small_arm, true_robot
+from simulated import measure_drawn, paper_robot, small_arm, with_changes
 from tolerances import rounding
 
 from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
@@ -18,8 +18,8 @@ def sigma_of(uncertainty):
 
 
 def test_without_priors_only_determined_parameters_have_a_sigma():
-    rng, robot = np.random.default_rng(1), paper_robot()
-    m = measure(true_robot(robot, rng), 100, rng)
+    robot = paper_robot()
+    m = measure_drawn(robot, 100, seed=1)
     uncertainty = assess(solve(build_problem(robot, m, model="distance-rotation")))
     # Table 4 of Jia et al. (2019)
     ineffective = ["a1", "alpha1", "d1", "theta1", "beta6", "theta7", "beta7"]
@@ -40,9 +40,8 @@ def test_without_priors_only_determined_parameters_have_a_sigma():
 
 
 def test_a_direction_held_by_its_prior_has_the_priors_sigma():
-    rng = np.random.default_rng(2)
     robot = paper_robot(tolerance={"theta": 0.002, "beta": 0.002, "a": 1e-3, "d": 1e-3, "alpha": 0.002})
-    measurements = measure(true_robot(robot, rng), 100, rng, sigma=(1e-5, 1e-6))
+    measurements = measure_drawn(robot, 100, seed=2, sigma=(1e-5, 1e-6))
     uncertainty = assess(solve(build_problem(robot, measurements, model="distance-rotation")))
     sigma = sigma_of(uncertainty)
     for name in ("theta1", "beta6", "theta7", "beta7"):
@@ -61,8 +60,8 @@ def test_bounds_of_chi_square_hold_its_distribution_and_a_factor_of_two():
 
 @pytest.mark.parametrize("model", ["pose", "distance-rotation"])
 def test_residual_table_holds_every_row_before_and_after(model):
-    rng, robot = np.random.default_rng(7), small_arm()
-    m = measure(true_robot(robot, rng), 20, rng, n_test=10)
+    robot = small_arm()
+    m = measure_drawn(robot, 20, seed=7, n_test=10)
     solution = solve(build_problem(robot, m, model=model, pairing=Pairing("chain")))
     table = assess(solution).fit.residuals
     assert table.n == (30 * 6 if model == "pose" else 2 * (19 + 9))
@@ -83,14 +82,12 @@ def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
     types = ["revolute", "revolute", "prismatic", "revolute"]
     arm = Robot.from_dh(rows, types=types, tolerance={"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3})
     errors = {"alpha1": 1.6e-3, "alpha2": 9e-4, "alpha3": 6e-4, "theta2": 1e-3, "a1": 4e-4}
-    at = [[p.name for p in arm.parameters].index(name) for name in errors]
-    values = arm.nominal.copy()
-    values[at] += list(errors.values())
-    z = []
+    at = [arm.index(name) for name in errors]
+    true, z = with_changes(arm, **errors), []
     for seed in range(12):
         rng = np.random.default_rng(seed)
         q = rng.uniform(-1.8, 1.8, (40, 4)) * [1.0, 1.0, 0.17, 1.0]
-        there = pose(arm.with_values(values), q)
+        there = pose(true, q)
         targets = np.add(rng.uniform(-0.3, 0.3, (3, 3)), [0.0, 0.0, 0.8])
         seen = (there.position[:, None] + np.einsum("nij,kj->nki", there.rotation, targets)).reshape(-1, 3)
         measured = Measurements.from_arrays(
@@ -99,7 +96,7 @@ def test_the_height_of_a_scaras_targets_is_in_the_sigmas_of_what_follows_it():
         )  # fmt: skip
         solution = solve(build_problem(arm, measured, model="position", frame="unknown"))
         sigma = sigma_of(assess(solution))
-        z.append((solution.parameters[at] - values[at]) / [sigma[name] for name in errors])
+        z.append((solution.parameters[at] - true.nominal[at]) / [sigma[name] for name in errors])
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all(rms < 1.0 + 3.0 / np.sqrt(24.0))  # three standard errors of 12 draws
     assert np.all(rms > 0.4)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from refusals import refusal
-from simulated import measure, small_arm, true_robot
+from simulated import measure_drawn, small_arm
 from touches import corners, touch
 
 from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, Table, calibrate
@@ -24,9 +24,8 @@ def cross_validate(job, *given, **more):
 
 
 def poses(seed=0, n=40, n_test=0, tolerance=LARGE, **more):
-    rng = np.random.default_rng(seed)
     robot = small_arm(tolerance=tolerance, estimate=TOOL)
-    return robot, measure(true_robot(robot, rng), n, rng, sigma=(1e-4, 1e-4), n_test=n_test, **more)
+    return robot, measure_drawn(robot, n, seed, sigma=(1e-4, 1e-4), n_test=n_test, **more)
 
 
 def job_of(robot, *tables, **options):

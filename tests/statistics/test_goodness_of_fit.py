@@ -7,7 +7,7 @@ import pytest
 from oracle import central_differences
 from reported import format_report
 from scipy.stats import kstest
-from simulated import LARGE, measure, pairs_between, plus, small_arm, true_robot
+from simulated import LARGE, measure, measure_drawn, pairs_between, plus, small_arm, true_robot
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import Pairing, Table, assess, build_problem, calibrate, solve
@@ -33,9 +33,8 @@ def factors_of(solution):
 
 def test_leverages_are_those_of_the_hat_matrix():
     """Independent rows without priors: H = J (J^T W J)^+ J^T W, whose trace is the rank."""
-    rng = np.random.default_rng(2)
     robot = small_arm()
-    m = measure(true_robot(robot, rng), 20, rng, n_test=4)
+    m = measure_drawn(robot, 20, seed=2, n_test=4)
     solution = solve(build_problem(robot, m, model="pose"))
     uncertainty = assess(solution)
     table, goodness = uncertainty.fit.residuals, uncertainty.fit.goodness
@@ -59,9 +58,8 @@ def test_leverages_are_those_of_the_hat_matrix():
 
 def test_a_row_beyond_noise_that_is_specified_too_large_is_suspect():
     """2 mm where the noise is 0.4 mm and 1 mm was specified: two sigma as specified, five of the others' noise."""
-    rng = np.random.default_rng(1)
     robot = small_arm(tolerance=LARGE)
-    m = measure(true_robot(robot, rng), 40, rng, sigma=(4e-4, 5e-4))
+    m = measure_drawn(robot, 40, seed=1, sigma=(4e-4, 5e-4))
     m = replace(m, position=plus(m.position, (17, 0), 2e-3), sigma_position=2.5 * m.sigma_position)
     found = calibrate(robot, m, model="pose")
     suspects = found.residuals.filter(found.residuals["suspect"])
@@ -71,8 +69,8 @@ def test_a_row_beyond_noise_that_is_specified_too_large_is_suspect():
 
 def test_a_kind_with_too_little_left_keeps_its_specified_noise(monkeypatch):
     monkeypatch.setattr(noise, "LEAST_REDUNDANCY", 11.0)
-    rng, robot = np.random.default_rng(10), small_arm(tolerance=LARGE)
-    m = measure(true_robot(robot, rng), 16, rng, sigma=(1e-3, 5e-4))
+    robot = small_arm(tolerance=LARGE)
+    m = measure_drawn(robot, 16, seed=10, sigma=(1e-3, 5e-4))
     twice = replace(m, sigma_position=2.0 * m.sigma_position, sigma_orientation=2.0 * m.sigma_orientation)
     solution = estimate_noise(build_problem(robot, twice, model="distance-rotation"))
     assert "distance" not in factors_of(solution)
@@ -85,9 +83,8 @@ def test_a_kind_with_too_little_left_keeps_its_specified_noise(monkeypatch):
 
 
 def test_kept_parameters_are_estimated_with_estimated_noise_too():
-    rng = np.random.default_rng(12)
     robot = small_arm()
-    m = measure(true_robot(robot, rng), 40, rng)
+    m = measure_drawn(robot, 40, seed=12)
     m = replace(m, sigma_position=2 * m.sigma_position, sigma_orientation=2 * m.sigma_orientation)
     solution = estimate_noise(build_problem(robot, m, model="pose", gauge="keep"))
     assert factors_of(solution) == pytest.approx({"orientation": 0.5, "position": 0.5}, rel=0.2)
@@ -122,9 +119,8 @@ def test_a_same_point_that_is_not_is_suspect():
 
 
 def test_robust_weights_count_rows_and_flag_outliers():
-    rng = np.random.default_rng(17)
     robot = small_arm(tolerance=LARGE)
-    m = measure(true_robot(robot, rng), 30, rng)
+    m = measure_drawn(robot, 30, seed=17)
     m = replace(m, position=plus(m.position, 5, 0.05))
     problem = build_problem(robot, m, model="pose")
     state = NoiseState(weights=(np.where(np.arange(30) == 5, 0.0, 1.0),))
