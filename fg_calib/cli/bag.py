@@ -77,8 +77,7 @@ def _report(name: str, topics: dict[str, Any], stops: "importers.Stops") -> Grou
 
 
 def _clocks(stops: "importers.Stops") -> list[str]:
-    offset = stops.offset
-    if offset is None:
+    if (offset := stops.offset) is None:
         return [f"offset {stops.applied:.6g} s as specified"]
     return [
         f"poses are stamped {offset.seconds:+.2f} s against the joints, which is taken out",

@@ -23,7 +23,7 @@ COMMANDS = (
 """The commands in the order of the help: each is the function of that name."""
 
 MODULES = {
-    **{"report": "calibrate", "correct": "predict", "compare": "inspect", "observe": "inspect"},
+    **{"report": "calibrate", "convert": "export", "correct": "predict", "compare": "inspect", "observe": "inspect"},
     **{"update": "check", "history": "check", "simulate": "init", "example": "init"},
 }
 """The modules of commands that are not in that of their name."""

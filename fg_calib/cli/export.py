@@ -1,8 +1,8 @@
-"""`fg-calib export`."""
+"""`fg-calib export` and `convert`: an arm as others read it."""
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import typer
 
@@ -12,6 +12,7 @@ from fg_calib.cli.output import BaseLink, Json, TipLink, argument, end, option, 
 from fg_calib.inputs import ExportFormat, InputError, ToolOfZeros, UrBase, escaped
 
 At = Literal["workspace", "measured"]
+Description = Literal["dh", "mdh", "mdh-hayati", "dh-hayati", "poe", "cpc", "urdf"]
 
 
 def export(
@@ -43,12 +44,22 @@ def export(
     if at == "measured" and q is None:
         raise InputError(str(arm), "no configurations.csv", "what `fg-calib calibrate --out` wrote")
     made = fg_calib.export(found, to, nominal=before, configurations=q, tool=tool, **choices)  # type: ignore[arg-type]
-    show_export(made, out, as_json)
+    _show_export(made, out, as_json)
     end(made.findings, not_accepted=made.not_accepted)
 
 
-def show_export(made: Any, out: Path | None, as_json: bool) -> None:
-    """Write an `Export` to a new file, or print it; its notes on stderr where they are not in what is printed."""
+def convert(
+    robot: Annotated[Path, argument("ROBOT", "robot.yaml or a URDF.")],
+    to: Annotated[Description, option("--to", None, "The convention.")],
+    out: Annotated[Path | None, option("--out", "FILE", "A new file; on stdout if not given.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Describe a robot by another convention, and say how exactly."""
+    _show_export(fg_calib.export(io.read_robot(robot), "hayati" if to == "dh-hayati" else to), out, as_json)
+
+
+def _show_export(made: "exports.Export", out: Path | None, as_json: bool) -> None:
+    """Write an export to a new file, or print it; its notes on stderr where they are not in what is printed."""
     if out is not None:
         made.write(out)
         say(f"wrote {out}")
