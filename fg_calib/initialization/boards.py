@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib.initialization.camera import Camera
 from fg_calib.initialization.hand_eye import Frame
 from fg_calib.inputs import Booleans, Floats, optimize
-from fg_calib.robot import left_jacobian
+from fg_calib.robot import left_jacobian, rotations
 
 LEAST_CORNERS = 4
 """Points of a board that an image must show."""
@@ -57,8 +57,7 @@ def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None
     seen, there = undistorted(camera, image[:, :2])
     if not _spread(image[there, 2:]) or not np.ptp(seen[there], axis=0).any():
         return []
-    focal = np.array([camera.fx, camera.fy])
-    H = _homography(image[there, 2:], seen[there], focal * weight[there])
+    H = _homography(image[there, 2:], seen[there], weight[there] * [camera.fx, camera.fy])
     if H is None:
         return []
     starts = _two_poses(H, image[there, 2:], seen[there])
@@ -126,7 +125,8 @@ def _two_poses(H: Floats, points: Floats, seen: Floats) -> list[Frame]:
     at = H @ np.append(points.mean(axis=0), 1.0)
     v = at[:2] / at[2]
     J = (H[:2, :2] - np.outer(v, H[2, :2])) / at[2]  # of x / z and y / z in the board's x and y, at its middle
-    towards = _turned_towards(np.append(v, 1.0))
+    ahead = np.append(v, 1.0)
+    towards = rotations.least_rotation(ahead / np.linalg.norm(ahead))
     U, s, Vt = np.linalg.svd(np.linalg.solve(towards[:2, :2] - np.outer(v, towards[2, :2]), J))
     share, found = s[1] / s[0], []
     for side in (1.0, -1.0):
@@ -134,13 +134,6 @@ def _two_poses(H: Floats, points: Floats, seen: Floats) -> list[Frame]:
         R = towards @ np.column_stack([columns, np.cross(columns[:, 0], columns[:, 1])])
         found.append(Frame(R, _place(R, points, seen)))
     return found
-
-
-def _turned_towards(direction: Floats) -> Floats:
-    """The rotation that takes z to a direction ahead, shape (3, 3)."""
-    angle = np.arctan2(np.linalg.norm(direction[:2]), direction[2])
-    axis = np.array([-direction[1], direction[0], 0.0]) / max(float(np.linalg.norm(direction[:2])), 1e-300)
-    return Rotation.from_rotvec(angle * axis).as_matrix()
 
 
 def _place(R: Floats, points: Floats, seen: Floats) -> Floats:
