@@ -256,13 +256,13 @@ def average_stops(
     hint = f"the longest pause is {max(b - a for a, b in pauses):.2g} s" if pauses else ""
     expected = "the arm at rest for a while, several times"
     expect(spans, f"topic {joints.source.topic}", f"no standstill of {still:g} s", expected, hint)
-    estimate = None if offset is not None else estimate_offset(joints, poses, robot)
-    if estimate is not None and most_offset is not None and abs(estimate.seconds) > most_offset:
-        found = f"an offset of {estimate.seconds:.4g} s against the joints' clock"
-        raise InputError(f"topic {poses.source.topic}", found, f"at most {most_offset:g} s")
-    applied = offset if estimate is None else estimate.seconds
-    assert applied is not None
-    stops, reasons = _centre(joints, poses, np.array(spans), applied)
+    estimate = None
+    if offset is None:
+        estimate = estimate_offset(joints, poses, robot)
+        offset, most = estimate.seconds, np.inf if most_offset is None else most_offset
+        found = f"an offset of {offset:.4g} s against the joints' clock"
+        expect(abs(offset) <= most, f"topic {poses.source.topic}", found, f"at most {most:g} s")
+    stops, reasons = _centre(joints, poses, np.array(spans), offset)
     skipped = tuple(Skipped(f"stop{k + 1}", spans[k][0] - float(joints.time[0]), reasons[k]) for k in sorted(reasons))
     good = [k for k in stops if k not in reasons]
     hint = "; ".join(f"{s.id}: {s.reason}" for s in skipped[:3])
@@ -272,7 +272,7 @@ def average_stops(
     ids, interval = tuple(f"stop{k + 1}" for k in good), np.array([spans[k] for k in good])
     samples = np.array([float(len(one)) for one in residuals["position"]])
     mean = {kind: np.array(each) for kind, each in means.items()}
-    return Stops(ids, interval, samples, mean, sigmas, skipped, estimate, applied, scatter)
+    return Stops(ids, interval, samples, mean, sigmas, skipped, estimate, offset, scatter)
 
 
 def find_standstills(joints: JointStream, robot: Robot, still: float) -> list[tuple[float, float]]:
@@ -450,6 +450,9 @@ MAX_BACK_S = 1.0
 Sample = tuple[int, int, Sequence[float]]
 """Stamp and time of receipt of a message, [ns], and its values."""
 
+Topic = tuple[str, str]
+"""Name of a topic, and the type of its messages."""
+
 
 @checked
 def read_bag(
@@ -503,8 +506,8 @@ def read_bag(
     return JointStream((stamps - stamps[0]) * 1e-9, readings, source), poses
 
 
-def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...], what: str) -> tuple[str, str]:
-    """The topic of a name, or the only one with messages of these types; and its type.
+def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...], what: str) -> Topic:
+    """The topic of a name, or the only one with messages of these types.
 
     Raises:
         InputError: There is none, or there are several.
@@ -521,7 +524,7 @@ def _choose_topic(reader: Any, bag: str, name: str | None, kinds: tuple[str, ...
     raise InputError(bag, f"no topic {name or ''} for --{what}", hint=f"the bag has {listed or 'nothing'}")
 
 
-def _messages(reader: Any, topic: tuple[str, str]) -> Iterator[tuple[int, Any]]:
+def _messages(reader: Any, topic: Topic) -> Iterator[tuple[int, Any]]:
     """Times of receipt, [ns], and messages of a topic, in the order in which they were received."""
     connections = [c for c in reader.connections if (c.topic, c.msgtype) == topic]
     for connection, received, raw in reader.messages(connections):
@@ -533,7 +536,7 @@ def _stamp(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def _read_joints(reader: Any, topic: tuple[str, str], wanted: tuple[str, ...], bag: str) -> tuple[Any, Floats, Source]:
+def _read_joints(reader: Any, topic: Topic, wanted: tuple[str, ...], bag: str) -> tuple[Any, Floats, Source]:
     """Stamps, [ns], and readings of the joints wanted, shape (n, n_joints), in order of time."""
     samples, present, n = list[Sample](), dict[str, None](), 0
     for received, m in _messages(reader, topic):
@@ -548,9 +551,7 @@ def _read_joints(reader: Any, topic: tuple[str, str], wanted: tuple[str, ...], b
     return _sort(samples, topic, {"without the robot's joints left out": n - len(samples)}, bag)
 
 
-def _read_poses(
-    reader: Any, topic: tuple[str, str], frames: tuple[str | None, str | None], origin: int, bag: str
-) -> PoseStream:
+def _read_poses(reader: Any, topic: Topic, frames: tuple[str | None, str | None], origin: int, bag: str) -> PoseStream:
     """The poses of one frame in another; without rotations where all are the same."""
     place, samples = f"{bag}: topic {topic[0]}", dict[tuple[str, str], list[Sample]]()
     for received, message in _messages(reader, topic):
@@ -579,9 +580,7 @@ def _read_poses(
     return PoseStream((stamps - origin) * 1e-9, values[:, :3], rotation, source)
 
 
-def _sort(
-    samples: Sequence[Sample], topic: tuple[str, str], counts: Mapping[str, int], bag: str
-) -> tuple[Any, Floats, Source]:
+def _sort(samples: Sequence[Sample], topic: Topic, counts: Mapping[str, int], bag: str) -> tuple[Any, Floats, Source]:
     """Stamps, ascending, [ns], with what belongs to them, shape (n, k), and where they are from.
 
     Raises:

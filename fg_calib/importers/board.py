@@ -38,6 +38,9 @@ from fg_calib.inputs import Floats, InputError, Integers, Record, check, expect
 
 Image = NDArray[np.uint8]
 
+Size = tuple[int, int]
+"""Width and height of images, [px]."""
+
 _SEARCHED = 1600
 """Longest side, [px], to which an image is reduced before a checkerboard is searched in it: in 12 megapixels without a
 board the search takes seconds, or minutes where there is much texture."""
@@ -252,7 +255,7 @@ def in_order(image: Image, grid: Floats) -> Floats:
     return grid
 
 
-def estimate_camera(points: Sequence[Floats], uv: Sequence[Floats], size: tuple[int, int]) -> Camera:
+def estimate_camera(points: Sequence[Floats], uv: Sequence[Floats], size: Size) -> Camera:
     """The camera that explains views of a plane best (Zhang 2000, *A flexible new technique for camera calibration*).
 
     Args:
@@ -360,7 +363,7 @@ class BoardFit(Record):
     """
 
     board: CalibrationBoard
-    size: tuple[int, int]
+    size: Size
     camera: Camera
     camera_sigma: Mapping[str, float] | None
     views: tuple[View, ...]
@@ -392,9 +395,7 @@ class _Fit(NamedTuple):
     second: float = np.inf
 
 
-def fit_board(
-    board: CalibrationBoard, found: Sequence[Corners], size: tuple[int, int], camera: Camera | None = None
-) -> BoardFit:
+def fit_board(board: CalibrationBoard, found: Sequence[Corners], size: Size, camera: Camera | None = None) -> BoardFit:
     """Poses of a board, each with its covariance, and with `camera` None the camera too.
 
     Each image's corners have a sigma of their own, from its residuals and, with the weight of some, those of all
@@ -529,9 +530,7 @@ def image_files(given: Sequence[Path]) -> list[Path]:
     return list(names.values())
 
 
-def read_corners(
-    files: Sequence[Path], board: CalibrationBoard
-) -> tuple[list[Corners], dict[str, str], tuple[int, int]]:
+def read_corners(files: Sequence[Path], board: CalibrationBoard) -> tuple[list[Corners], dict[str, str], Size]:
     """Corners of a board in images.
 
     Returns:
