@@ -166,8 +166,7 @@ def _columns_by_name(variables: Variables, unknowns: Landmarks) -> dict[tuple[st
     own = (*variables.items, *(v for v in variables.nuisance if v.kind == "curve"))
     found = {("", v.symbol): np.arange(v.columns.start, v.columns.stop) for v in own}
     for letter, name in unknowns.keys:
-        place = coordinates_of(variables, unknowns, (letter, name))
-        if place is not None:
+        if (place := coordinates_of(variables, unknowns, (letter, name))) is not None:
             found[letter, name] = variables.columns_at(place)
     return found
 
@@ -189,9 +188,8 @@ def draw_groups(scenario: Scenario, n: int, generator: np.random.Generator) -> d
     draw, robot = simulation.draw_candidates, scenario.robot
     found = {name: draw(robot, of, generator, n, "candidates") for name, of in groups.items()}
     for one in found.values():
-        if not len(one.readings):
-            hint = "is the base itself in a box of keep_out?" * (one.rejected.get("in keep_out") == one.asked)
-            raise InputError("candidates", f"none in {one.reasons()}", "some that the arm can take", hint)
+        hint = "is the base itself in a box of keep_out?" * (one.rejected.get("in keep_out") == one.asked)
+        expect(len(one.readings), "candidates", f"none in {one.reasons()}", "some that the arm can take", hint)
     return found
 
 
@@ -214,13 +212,10 @@ def build_pool(
     gauge: Gauge = "none" if scenario.job.get("gauge") == "none" or scenario.job.get("prior") is False else "prior"
     options = Options(tables[0].model or "pose", gauge=gauge) if before is None else before.options
     problem = true_problem(scenario.robot, tables, options, None if before is None else places_of(before, before.start))
-    data = problem.data
-    if not problem.rows.parts:
-        n = data.n_configurations
-        reason = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
-        raise InputError("candidates", reason, "more configurations")
-    n_given = 0 if given is None else len(given)
-    names = [_split_name(name) for name in data.names[: data.n_configurations]]
+    n, n_given = problem.data.n_configurations, 0 if given is None else len(given)
+    reason = "one, of which no pair is made" if n == 1 else f"{n}, at none of which anything is measured"
+    expect(problem.rows.parts, "candidates", reason, "more configurations")
+    names = [_split_name(name) for name in problem.data.names[:n]]
     among_given = np.array([name == "" and k < n_given for name, k in names])
     if n_given and not among_given.any():
         raise InputError("given", "configurations at which nothing is measured", "a job with what was touched")

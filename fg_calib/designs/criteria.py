@@ -35,10 +35,9 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
 from fg_calib.designs.information import System
-from fg_calib.inputs import Floats
+from fg_calib.inputs import Booleans, Floats
 
 Criterion = Literal["I", "D", "A", "E", "O1", "O2", "O3", "O4", "O5"]
 
@@ -89,7 +88,7 @@ class Measure:
         half = scipy.linalg.solve_triangular(np.linalg.cholesky(information), self._P.T, lower=True)
         return float(self._formula(half.T @ half))
 
-    def best(self, information: Floats, allowed: NDArray[np.bool_]) -> tuple[int, float]:
+    def best(self, information: Floats, allowed: Booleans) -> tuple[int, float]:
         """The candidate that makes the criterion smallest, and its value with that.
 
         Args:

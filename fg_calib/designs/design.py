@@ -240,7 +240,7 @@ def design_from_pool(
     configurations = _configurations_of(pool, ordered, tables)
     data = pool.problem.data
     names, readings = [data.names[k] for k in configurations], data.readings[configurations]
-    ids = names if pool.scenario is None else _new_names(len(names), pool)
+    ids = np.array(names if pool.scenario is None else _new_names(len(names), pool))
     expected, curve = posterior.error(task), chooser.curve(found, generator, len(pool.references))
     error = np.inf if expected.position is None else expected.position
     before = pool.posterior(pool.given).error(task) if len(pool.given) or after else None
@@ -252,9 +252,7 @@ def design_from_pool(
     asked = (n if target is None else None, target, target is None or error <= target * _JUST)
     group, known = pool.groups_of(configurations), (posterior.observability, chooser.system.unknown)
     travel = (joint_travel(pool.robot, readings), joint_travel(pool.robot, pool.readings[chosen]))
-    return Design(
-        pool, measured, criterion, task, readings, np.array(ids), group, *errors, curve, *asked, *known, *travel
-    )
+    return Design(pool, measured, criterion, task, readings, ids, group, *errors, curve, *asked, *known, *travel)
 
 
 def _error_of_formed_pairs(pool: Pool, task: Task, measurable: Integers) -> Callable[[Integers], float] | None:

@@ -50,8 +50,7 @@ class Calibrated(inputs.Record):
     @cached_property
     def information(self) -> graph.Knowledge | None:
         """Information of the rows, and tolerances about the nominal values as rows of their own."""
-        known = self.knowledge
-        if known is None or not self.options.has_priors:
+        if (known := self.knowledge) is None or not self.options.has_priors:
             return known
         of = {p.name: p.tolerance for p in self.robot.parameters if p.estimated}
         parameters = tuple(replace(p, tolerance=of.get(p.name)) for p in known.robot.parameters)
@@ -76,10 +75,8 @@ class Calibrated(inputs.Record):
         Args:
             like: Of each table the name of the calibration's table that it is like.
         """
-        factors: dict[graph.NoiseName, float] = {}
         of_tables = {name: kinds for name, kinds in self.noise.items() if name}
-        if "joint" in self.noise.get("", {}):
-            factors[graph.JOINT_NOISE] = self.noise[""]["joint"]
+        factors = {(graph.JOINT_NOISE[0], kind): factor for kind, factor in self.noise.get("", {}).items()}
         for number, name in enumerate(like):
             kinds = of_tables.get(name) or (next(iter(of_tables.values())) if len(of_tables) == 1 else {})
             factors |= {(number, kind): factor for kind, factor in kinds.items()}
@@ -122,8 +119,7 @@ def at_nominal(problem: graph.Problem, before: inputs.Floats) -> tuple[graph.Pro
     known, v, x = problem.knowledge.nominal, problem.variables, before.copy()
     x[v.robot_span] = known.robot.nominal
     for name in known.unknowns:
-        place = _place(problem, name)
-        if place is not None:
+        if (place := _place(problem, name)) is not None:
             x[place] = known.place(name)
     return replace(problem, knowledge=known), x
 
@@ -151,7 +147,7 @@ def _known_at(problem: graph.Problem, x: inputs.Floats, *, with_loss: bool) -> g
     return graph.Knowledge.of_rows(robot, [*places, *unseen], np.concatenate(at), left.A, left.b)
 
 
-def _place(problem: graph.Problem, name: graph.Name) -> NDArray[np.int64] | None:
+def _place(problem: graph.Problem, name: graph.Name) -> inputs.Integers | None:
     return graph.coordinates_of(problem.variables, problem.data.landmarks, name)
 
 

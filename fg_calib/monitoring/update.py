@@ -40,8 +40,7 @@ def updated(
         ProblemError: The rows lack what their model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    known = calibrated.knowledge
-    if known is None:
+    if (known := calibrated.knowledge) is None:
         found = "a calibration that does not hold what its rows say"
         raise InputError("update", found, "one that this version of fg-calib wrote, with an arm that was estimated")
     known = known.about([name for name in known.unknowns if name[0] == measurements.TARGET.letter or anchors_stay])

@@ -1,6 +1,5 @@
 """The report of `fg-calib design`, and the tables and the job that it writes: what to measure, and what to expect."""
 
-import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -100,7 +99,7 @@ def _notes(design: Design) -> Iterator[str]:
     for name in sorted(set(design.pool.found).difference(design.group.tolist(), [""])):
         yield f"{name}: none of its own poses was chosen, and it gets no table"
     yield from map(str, observability.missing_motions(design.pool.robot))
-    travel = math.degrees(design.travel), math.degrees(design.travel_before)
+    travel = np.rad2deg(design.travel), np.rad2deg(design.travel_before)
     yield f"joint travel along the poses {travel[0]:.0f} deg, {travel[1]:.0f} unordered"
     if lost := len(design.observability.lost):
         yield f"not identifiable: {lost} directions; fg-calib observe says which and why"
@@ -108,10 +107,10 @@ def _notes(design: Design) -> Iterator[str]:
         yield "more poses (--n, --candidates), lower noise, other measurements or a wider range of poses would reach it"
     if design.asked is not None and design.n < design.asked:
         yield f"no more than {design.n} poses were found of {design.asked}: --candidates draws more"
-    if (design.known_tool.position or math.inf) < 0.5 * (design.expected.position or math.inf):
+    if (design.known_tool.position or np.inf) < 0.5 * (design.expected.position or np.inf):
         remedy = "measure its own point (leave `target` empty), or specify a smaller prior sigma"
         yield f"most of it is the tool: were it known, {_pose(design.known_tool)}; {remedy}"
-    if design.after_fit is not None and (design.after_fit.position or math.inf) < 0.5 * (design.expected.position or 0):
+    if design.after_fit is not None and (design.after_fit.position or np.inf) < 0.5 * (design.expected.position or 0):
         best_fit = f"after the best rigid fit {_pose(design.after_fit)}"
         yield f"most of it is the position of the base: {best_fit}; --error fitted chooses for that"
 

@@ -160,9 +160,8 @@ def size_table(found: PredictedErrors) -> Table:
     rows: list[tuple[Any, ...]] = []
     for frame, of in errors.items():
         sizes = [] if of is None else [summed_up(column) for column in of.T]
-        rows += [
-            (name, unit, *size.values()) for name, unit, size in zip((frame, ""), ("m", "rad"), sizes, strict=False)
-        ]
+        for name, unit, size in zip((frame, ""), POSE_KINDS.values(), sizes, strict=False):
+            rows.append((name, unit, *size.values()))
     return table_of(("", "|unit", "RMS|q", "median|q", "95 % below|q", "largest|q"), rows)
 
 
@@ -184,8 +183,7 @@ def _percent(share: float) -> str:
 
 
 def _worst_in_words(found: PredictedErrors, robot: Robot, names: Sequence[str]) -> Iterator[str]:
-    worst = found.worst
-    if worst is None:
+    if (worst := found.worst) is None:
         return
     x, y, z = (f"{v:.4f}" for v in worst.errors.position[0])
     at = "" if worst.row is None else f"{names[worst.row]}: "

@@ -227,8 +227,7 @@ def _prediction(result: Result) -> Iterator[Content]:
 
 def _cross_validation(result: Result) -> list[Section]:
     """How well configurations are predicted by calibrations without them, and how parameters spread."""
-    found = result.folds
-    if found is None:
+    if (found := result.folds) is None:
         return []
     kinds = {kind: found.kinds[kind] for kind in in_order(found.kinds)}
     rows = [(kind, result.unit_of(kind), held.n, held.before, held.after, held.noise) for kind, held in kinds.items()]

@@ -76,7 +76,6 @@ orthogonal; sockets, and anchors in contact, where the nominal arm has its tool 
 nominal arm's tool point: mean, and root mean square distance from it.
 """
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import field, fields, replace
@@ -318,7 +317,7 @@ class BoardViews(Conditions):
     height: PositiveLength = 0.5
     radius: PositiveLength = 0.5
     distance: tuple[PositiveLength, PositiveLength] | None = None
-    cone: PositiveAngle = math.pi / 3.0
+    cone: PositiveAngle = np.pi / 3.0
     roll: Annotated[Angle | None, BeforeValidator(lambda given: None if given == "random" else given)] = None
     self_motion: Literal["random", "held"] = "random"
     field_of_view: AngleFromZero = 0.0
@@ -328,7 +327,7 @@ class BoardViews(Conditions):
         _require_order(self.distance or (0.0, 0.0))
         for key in ("cone", "field_of_view"):
             angle = getattr(self, key)
-            _require(angle <= 0.5 * math.pi + 1e-9, key, f"found {angle:g} rad", "at most a quarter turn")
+            _require(angle <= 0.5 * np.pi + 1e-9, key, f"found {angle:g} rad", "at most a quarter turn")
 
 
 @schema
@@ -349,13 +348,13 @@ class TargetViews(Conditions):
     target: Point = Field(default_factory=lambda: np.zeros(3))
     count: CountFromOne = 50
     axis: Direction = Field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    acceptance: PositiveAngle = math.pi / 6.0
-    distance: tuple[LengthFromZero, Annotated[io.Bound, _scale("m")]] = (0.0, math.inf)
+    acceptance: PositiveAngle = np.pi / 6.0
+    distance: tuple[LengthFromZero, Annotated[io.Bound, _scale("m")]] = (0.0, np.inf)
     region: Box | None = None
 
     def __post_init__(self) -> None:
         _require(bool(self.axis.any()), "axis", "found 0, 0, 0", "a direction")
-        _require(self.acceptance <= math.pi, "acceptance", f"found {self.acceptance:g} rad", "at most half a turn")
+        _require(self.acceptance <= np.pi, "acceptance", f"found {self.acceptance:g} rad", "at most half a turn")
         _require_order(self.distance)
 
 

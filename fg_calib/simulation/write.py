@@ -1,6 +1,5 @@
 """Simulations, written as calibration jobs that run as they are; tables of instruments, in the units of a file."""
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -169,7 +168,7 @@ def _job_text(simulation: Simulation, units: Units) -> str:
 
 
 def _yaml(document: Mapping[str, Any]) -> str:
-    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=math.inf)
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, allow_unicode=True, width=np.inf)
 
 
 def joint_noise(sigma: inputs.Floats, robot: Robot, units: Units) -> float | list[float]:
