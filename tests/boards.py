@@ -40,9 +40,8 @@ def render(board, R, t, rng, *, camera=CAMERA, size=SIZE, noise=2.0, blur=0.7):
     image = np.full(size[::-1], 170.0, dtype=np.float32)
     part = _part(board, R, t, camera, size)
     x, y = (r[_enlarged(part)] for r in _rays(camera, size))
-    H = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t])).astype(
-        np.float32
-    )  # of normalised coordinates to the board's plane
+    # of normalised coordinates to the board's plane
+    H = np.linalg.inv(np.column_stack([R[:, 0], R[:, 1], t])).astype(np.float32)
     a, b, c = (H[i, 0] * x + H[i, 1] * y + H[i, 2] for i in range(3))
     fine = cv2.remap(drawing, a / c * scale + origin, b / c * scale + origin, cv2.INTER_LINEAR, borderValue=170.0)
     image[part] = fine.reshape(fine.shape[0] // _FINE, _FINE, -1, _FINE).mean(axis=(1, 3))

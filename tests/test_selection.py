@@ -53,9 +53,8 @@ def test_errors_are_within_their_sigmas_with_an_estimated_prior_of_curves():
     for seed in range(n_draws):
         robot = with_prior(arm_with(ErrorCurve([2, 3], 20)), SIGMA)
         true = drawn(robot, seed)
-        solution = estimate_curve_sigma(
-            build_problem(with_prior(robot, SIGMA / 10.0), measured(true, seed), Options(model="position"))
-        )
+        problem = build_problem(with_prior(robot, SIGMA / 10.0), measured(true, seed), Options(model="position"))
+        solution = estimate_curve_sigma(problem)
         e, root = errors_of_all(solution, true)
         C, n = root @ root.T, solution.problem.variables.n_columns
         squares.append([e[k] @ np.linalg.solve(C[k, k], e[k]) / len(e[k]) for k in (slice(n), slice(n, None))])

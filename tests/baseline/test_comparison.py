@@ -172,9 +172,8 @@ def test_real_errors_are_those_of_the_tool_poses():
     T, T_true = (np.array([tool_pose(r, row) for row in q]) for r in (robot, true))
     distance = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
     angle = Rotation.from_matrix(np.swapaxes(T[:, :3, :3], 1, 2) @ T_true[:, :3, :3]).magnitude()
-    assert found.base_frame.max == pytest.approx(distance.max(), rel=rounding(1, 10), abs=0)
-    assert found.base_frame.mean == pytest.approx(distance.mean(), rel=rounding(1, 10), abs=0)
-    assert found.base_frame.rms == pytest.approx(np.sqrt(np.mean(distance**2)), rel=rounding(1, 10), abs=0)
+    off, expected = found.base_frame, [distance.max(), distance.mean(), np.sqrt(np.mean(distance**2))]
+    assert [off.max, off.mean, off.rms] == pytest.approx(expected, rel=rounding(1, 10), abs=0)
     assert found.base_frame.orientation_rms == pytest.approx(np.sqrt(np.mean(angle**2)), rel=1e-6)
     points, onto = T[:, :3, 3], T_true[:, :3, 3]
     turn, rssd = Rotation.align_vectors(onto - onto.mean(axis=0), points - points.mean(axis=0))

@@ -24,9 +24,8 @@ def near(n):
 
 def test_targets_in_their_units_become_commands_in_the_same(result, fg_calib, tmp_path):
     """In mm and degrees, with roll, pitch and yaw and names; read again and held to 4x4 products."""
-    found = Calibration.load(result)
-    nominal = found.robot.with_values([p.nominal for p in found.result.parameters])
-    q = near(5)
+    found, q = Calibration.load(result), near(5)
+    nominal = found.nominal
     T = np.array([tool_pose(nominal, row) for row in q])
     angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=True)
     columns = {"id": [f"hole {i}" for i in range(5)]}
@@ -59,10 +58,9 @@ def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
     assert document["n_reached"] == document["n_targets"] == 3
     assert "nothing is written" in ended.err
     found = Calibration.load(result)
-    nominal = found.robot.with_values([p.nominal for p in found.result.parameters])
     for target, row in zip(document["targets"], q, strict=True):
         there = tool_pose(found.robot, target["readings"])
-        assert np.abs(there - tool_pose(nominal, row)).max() < 1e-9
+        assert np.abs(there - tool_pose(found.nominal, row)).max() < 1e-9
         away = np.linalg.norm((tool_pose(found.robot, row) - there)[:3, 3])
         assert target["uncorrected"]["position"] == pytest.approx(away, rel=1e-6)
 

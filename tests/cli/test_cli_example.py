@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from simulated import nees
 
 from fg_calib import calibrate_job, cli, read_robot, simulate
 from fg_calib.cli.init import EXAMPLES
@@ -40,9 +41,7 @@ def test_an_example_is_its_scenario_simulated(name, tmp_path):
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_an_example_calibrates_to_the_true_arm(name):
     found = calibrate_job(cli.EXAMPLES / name / "calibration.yaml")
-    true = {p.name: p.nominal for p in read_robot(cli.EXAMPLES / name / "robot_true.yaml").parameters}
-    off = np.array([found.parameters[n].estimate - true[n] for n in found.assessment.names])
-    nees = off @ np.linalg.solve(found.covariance(), off)
-    low, high = chi2.interval(0.999, len(off))
+    squares, n = nees(found.assessment, read_robot(cli.EXAMPLES / name / "robot_true.yaml"))
+    low, high = chi2.interval(0.999, n)
     assert not found.assessment.verdict.errors
-    assert low < nees < high
+    assert low < squares < high

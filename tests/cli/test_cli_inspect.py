@@ -16,13 +16,6 @@ def width(monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
 
 
-def changed(folder, **keys):
-    """The example's job with some keys changed."""
-    path = folder / JOB
-    path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | keys))
-    return path
-
-
 @pytest.mark.slow
 def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, whole_example):
     ended = fg_calib("inspect", whole_example / JOB)
@@ -44,8 +37,9 @@ def test_a_healthy_job_ends_with_0_and_its_verdict_stands_first(fg_calib, whole_
 
 @pytest.mark.slow
 def test_a_mistake_in_units_ends_with_3_and_one_line(fg_calib, example):
-    units = {"length": "mm", "angle": "deg"}
-    ended = fg_calib("inspect", changed(example, units=units, noise={"position": 1, "orientation": 0.01}))
+    changes = {"units": {"length": "mm", "angle": "deg"}, "noise": {"position": 1, "orientation": 0.01}}
+    (example / JOB).write_text(yaml.safe_dump(yaml.safe_load((example / JOB).read_text()) | changes))
+    ended = fg_calib("inspect", example / JOB)
     assert ended.code == 3
     assert ended.err.startswith("look at this first: distance residuals fall from")
     assert ended.err.count("\n") == 1

@@ -19,9 +19,10 @@ def test_structure_prints_the_papers_table(fg_calib, example):
     assert "rank 23 of 30" in ended.out
 
 
-@pytest.mark.parametrize(("model", "rank"), [("pose", 29), ("rotation", 11)])
-def test_json_has_every_key_of_its_schema(fg_calib, example, model, rank):
-    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, "--json")
+@pytest.mark.parametrize(("words", "rank"), [("pose", 29), ("pose --frame unknown", 25), ("rotation", 11)])
+def test_json_has_every_key_of_its_schema(fg_calib, example, words, rank):
+    model, *frame = words.split()
+    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", model, *frame, "--json")
     found = json.loads(ended.out)
     assert found["schema"] == "fg-calib/observability/1"
     assert (found["model"], found["kind"], found["rank"], found["n_parameters"]) == (model, "structural", rank, 35)
@@ -41,10 +42,8 @@ def test_json_has_every_key_of_its_schema(fg_calib, example, model, rank):
 @pytest.mark.slow
 def test_configurations_give_sigmas_and_files(fg_calib, example, tmp_path):
     folder = tmp_path / "seen"
-    ended = fg_calib(
-        *("observe", example / "robot_nominal.yaml", "--configurations", example / "poses.csv", "--angle", "deg"),
-        *("--orientation-noise", 0.01, "--joint-noise", 0.005, "--out", folder, "--json"),
-    )
+    words = "observe", example / "robot_nominal.yaml", "--configurations", example / "poses.csv", "--angle", "deg"
+    ended = fg_calib(*words, "--orientation-noise", 0.01, "--joint-noise", 0.005, "--out", folder, "--json")
     assert ended.code == 0
     found = json.loads(ended.out)
     assert json.loads((folder / "observability.json").read_text()) == found
@@ -52,17 +51,10 @@ def test_configurations_give_sigmas_and_files(fg_calib, example, tmp_path):
     assert set(found["sigma"]) == set(found["kept"])
     assert found["weak"][0]["signal_to_noise"] < 10
     assert all(abs(pair["correlation"]) > 0.9 for pair in found["correlations"])
-    finer = fg_calib(
-        *("observe", example / "robot_nominal.yaml", "--configurations", example / "poses.csv", "--angle", "deg"),
-        *("--orientation-noise", 0.005, "--position-noise", 0.0005, "--joint-noise", 0.0025, "--json"),
-    )
+    noise = "--orientation-noise", 0.005, "--position-noise", 0.0005, "--joint-noise", 0.0025
+    finer = fg_calib(*words, *noise, "--json")
     halved = json.loads(finer.out)["sigma"]
     assert halved["a2"] == pytest.approx(found["sigma"]["a2"] / 2, rel=1e-3)
-
-
-def test_a_frame_may_be_unknown(fg_calib, example):
-    ended = fg_calib("observe", example / "robot_nominal.yaml", "--model", "pose", "--frame", "unknown", "--json")
-    assert json.loads(ended.out)["rank"] == 25
 
 
 def test_links_of_a_urdf_are_named(fg_calib, tmp_path):

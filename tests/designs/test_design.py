@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import refusal
-from scenarios import INSTRUMENTS, SIGMA, TOLERANCE, WALL, scenario
+from scenarios import INSTRUMENTS, SIGMA, TOLERANCE, scenario
 from simulated import small_arm
+from sparing import as_case
 
 from fg_calib import Job, Options, Pairing, build_problem, calibrate_job, simulate, solve
 from fg_calib.designs.design import design
@@ -33,6 +34,9 @@ EXPECTED = {name: INSTRUMENTS[name] for name in
     "all formed pairs": replace(STAR, pairing=Pairing("all")),
     "pixels": INSTRUMENTS["pixels"],
 }  # fmt: skip
+
+Q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
+"""Configurations of jobs that are designed further."""
 
 SAME = 1e-6
 """Share by which expected errors may differ: so near is an estimate from exact values to the nominal arm."""
@@ -124,21 +128,18 @@ def job_of(instrument, configurations, stated=NOISE, **changes):
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["pixels", "planes", "faces", "board", "sockets"])
 def test_more_of_every_instrument_is_planned(kind):
-    rng = np.random.default_rng(4)
-    q = rng.uniform(-1.5, 1.5, (80 if kind in ("board", "pixels") else 30, 4))
+    job = job_of(INSTRUMENTS[kind], GivenReadings(Q[: 80 if kind in ("board", "pixels") else 30]))
     # An arm of four joints cannot look at the middle of a board: it sees what it sees.
-    plan = design(job_of(INSTRUMENTS[kind], GivenReadings(q)), n=4, n_candidates=80, candidates=RandomReadings(1))
+    plan = design(job, n=4, n_candidates=80, candidates=RandomReadings(1))
     assert plan.n == 4
     assert 0.0 < plan.expected.position <= plan.before.position
 
 
 def test_a_camera_is_to_see_the_whole_board_where_it_saw_corners_wherever_the_boards_origin_is():
-    q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
-    job = job_of(INSTRUMENTS["pixels"], GivenReadings(q))
+    job = job_of(INSTRUMENTS["pixels"], GivenReadings(Q))
     table, m = job.tables[0], job.tables[0].measurements
-    moved = replace(
-        job, measurements=(replace(table, measurements=replace(m, image=m.image + np.array([0, 0, 0.1, 0.2]))),)
-    )
+    shifted = replace(m, image=m.image + np.array([0, 0, 0.1, 0.2]))
+    moved = replace(job, measurements=(replace(table, measurements=shifted),))
     here, there = (scenario_of(solve_for_design(one)).instruments[0].configurations for one in (job, moved))
     assert np.allclose([*there.board.position, *there.board_size], [*here.board.position, *here.board_size], atol=1e-6)
     seen = np.abs(m.image[:, :2] - [table.camera.cx, table.camera.cy]) / [table.camera.fx, table.camera.fy]
@@ -146,8 +147,7 @@ def test_a_camera_is_to_see_the_whole_board_where_it_saw_corners_wherever_the_bo
 
 
 def test_a_board_seen_from_below_is_seen_from_below_again():
-    q = np.random.default_rng(4).uniform(-1.5, 1.5, (80, 4))
-    job = job_of(Instrument(model="board", name="it", boards=WALL), GivenReadings(q))
+    job = job_of(INSTRUMENTS["board"], GivenReadings(Q))
     m = job.tables[0].measurements
     flip = np.diag([1.0, -1.0, -1.0])
     below = replace(job, measurements=(replace(job.tables[0], measurements=replace(m, rotation=m.rotation @ flip)),))
@@ -157,12 +157,11 @@ def test_a_board_seen_from_below_is_seen_from_below_again():
 
 
 def test_rows_of_a_job_are_chosen_among_themselves():
-    q = np.random.default_rng(4).uniform(-1.5, 1.5, (30, 4))
-    job = job_of(Instrument(model="pose", name="it", frame="unknown"), GivenReadings(q))
+    job = job_of(Instrument(model="pose", name="it", frame="unknown"), GivenReadings(Q[:30]))
     plan = design(job, n=8, candidates="rows")
     names = job.tables[0].measurements.ids.tolist()
     rows = np.array([names.index(name) for name in plan.ids.tolist()])
-    assert np.abs(plan.readings - q[rows]).max() == 0.0
+    assert np.abs(plan.readings - Q[rows]).max() == 0.0
     assert plan.before is None
     table = replace(job.tables[0], measurements=job.tables[0].measurements.select(np.sort(rows)))
     expected = error_of(job.robot, [table], plan.task)
@@ -184,8 +183,7 @@ def test_the_tool_is_planned_beside_targets_and_boxes_stay_free():
 
 def test_given_configurations_of_a_star_count():
     """The first of them is the reference pose."""
-    star = Instrument(model="distance-rotation", name="it", pairing=Pairing("star"))
-    plan = design(scenario(star, n=20, noise=NOISE), n=6, given=GIVEN, n_candidates=40)
+    plan = planned(STAR, n=6, given=GIVEN)
     assert plan.expected.position < plan.before.position
     assert (plan.readings[0] == GIVEN[0]).all()
     assert not (plan.readings[1:, None] == GIVEN).all(axis=2).any()
@@ -197,29 +195,21 @@ def test_given_configurations_that_are_not_used_are_refused():
     assert "given" in refusal(design, of, n=6, given=GIVEN, n_candidates=40)
 
 
-def said_by_all_rows(job, plan):
-    """Expected error over the plan's task of one job of all rows."""
-    every = solve_for_design(replace(job, measurements=(*job.tables, *plan.tables)))
-    return Posterior(every, square_root(every, every.start)[:, :-1]).error(plan.task).position
-
-
-@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 5])
-def test_a_plan_of_touches_expects_what_a_job_of_all_rows_says_of_itself(n):
-    """Distances between sockets that the plan asks for count, and no others."""
-    job = job_of(Instrument(model="distance", name="it", sockets=5), RandomReadings(12))
-    plan = design(job, n=n, n_candidates=40)
-    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
-
-
 LENGTHS = Instrument(model="anchor", name="it", anchors={"a": Spot([1.0, -2.0, 0.5]), "b": Spot([-1.5, 1.0, 1.0])})
+TOUCHES = Instrument(model="distance", name="it", sockets=5)
 FACES = Instrument(model="plane", name="it", planes={"floor": Plane([0, 0, 1], -1.0), "wall": Plane([1, 0.1, 0], 2.0)})
 
 
-@pytest.mark.parametrize(("instrument", "n"), [(LENGTHS, 5), (FACES, 3)], ids=["two anchors", "planes"])
-def test_a_plan_expects_what_a_job_of_all_rows_says_of_itself(instrument, n):
-    job = job_of(instrument, RandomReadings(30))
+@pytest.mark.parametrize(("instrument", "n_given", "n"), [
+    (LENGTHS, 30, 5), (FACES, 30, 3), (TOUCHES, 12, 5), as_case((TOUCHES, 12, 1), is_slow=True)
+])  # fmt: skip
+def test_a_plan_expects_what_a_job_of_all_rows_says_of_itself(instrument, n_given, n):
+    """Of distances between sockets those count that the plan asks for, and no others."""
+    job = job_of(instrument, RandomReadings(n_given))
     plan = design(job, n=n, n_candidates=40)
-    assert plan.expected.position == pytest.approx(said_by_all_rows(job, plan), rel=1e-6)
+    every = solve_for_design(replace(job, measurements=(*job.tables, *plan.tables)))
+    said = Posterior(every, square_root(every, every.start)[:, :-1]).error(plan.task).position
+    assert plan.expected.position == pytest.approx(said, rel=1e-6)
 
 
 def test_more_rows_are_as_noisy_as_those_of_the_job_were_found_to_be():
@@ -291,9 +281,8 @@ def test_what_prior_sigmas_alone_determine_is_not_lost_at_tiny_noise(criterion):
 
 
 def test_noise_is_written_with_the_digits_of_a_person():
-    made = simulate(
-        scenario(INSTRUMENTS["pose"], n=3, noise=Noise(2.9999999999999995e-05, 2e-4, 9.999999999999999e-05))
-    )
+    noise = Noise(2.9999999999999995e-05, 2e-4, 9.999999999999999e-05)
+    made = simulate(scenario(INSTRUMENTS["pose"], n=3, noise=noise))
     text = job_text("", {}, made.tables, made.robot, Units("mm", "rad"))
     assert "joint: [0.0001, 0.0001, 0.1, 0.0001]\n" in text
     assert "noise: {position: 0.03, orientation: 0.0002}" in text

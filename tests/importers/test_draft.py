@@ -20,19 +20,25 @@ JOB = "calibration.yaml"
 
 @pytest.fixture
 def folder(tmp_path):
-    """A folder with a robot, and positions of 40 configurations: `write(**changes)` of their columns by name."""
+    """A folder with a robot."""
     (tmp_path / "robot.yaml").write_text(yaml.safe_dump(UR5E))
+    return tmp_path
+
+
+@pytest.fixture
+def write(folder):
+    """Positions of 40 configurations as a table, with other names or units of some columns."""
     rng = np.random.default_rng(0)
     q = rng.uniform(-2.0, 2.0, (40, 6))
-    p = pose(true_robot(read_robot(tmp_path / "robot.yaml"), rng), q).position
+    p = pose(true_robot(read_robot(folder / "robot.yaml"), rng), q).position
     columns = {f"q{i + 1}": q[:, i] for i in range(6)} | dict(zip("xyz", p.T, strict=True))
 
     def write(names=None, factors=None, name="poses.csv"):
         names, factors = names or {}, factors or {}
-        write_csv(tmp_path / name, {names.get(c, c): v * factors.get(c, 1.0) for c, v in columns.items()})
-        return tmp_path / name
+        write_csv(folder / name, {names.get(c, c): v * factors.get(c, 1.0) for c, v in columns.items()})
+        return folder / name
 
-    return tmp_path, write
+    return write
 
 
 def drafted(fg_calib, folder, *files):
@@ -66,8 +72,7 @@ def test_a_job_for_the_tables_of_every_instrument_is_ready(fg_calib, tmp_path, n
 DEGREES = {f"q{i}": 180 / np.pi for i in range(1, 7)} | dict.fromkeys("xyz", 1e3)
 
 
-def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
-    folder, write = folder
+def test_columns_of_other_names_and_units_are_explained(fg_calib, folder, write):
     names = {f"q{i}": f"J{i} [°]" for i in range(1, 7)} | {"x": "X (mm)", "y": "Y_mm", "z": "pos_z [mm]"}
     given = drafted(fg_calib, folder, folder / "robot.yaml", write(names, DEGREES))
     assert given["units"] == {"length": "mm", "angle": "deg"}
@@ -80,9 +85,8 @@ def test_columns_of_other_names_and_units_are_explained(fg_calib, folder):
     assert mine.readings == pytest.approx(plain.readings, abs=1e-12)
 
 
-def test_a_protocol_of_an_instrument_is_read_as_it_is(fg_calib, folder):
+def test_a_protocol_of_an_instrument_is_read_as_it_is(fg_calib, folder, write):
     """A preamble, a row of units, semicolons with decimal commas, other words, bytes of Windows."""
-    folder, write = folder
     text = pl.read_csv(write()).with_row_index("Punkt", 1).with_columns(Reflektor=pl.lit("groß"))
     text = text.write_csv(separator=";", decimal_comma=True)
     (folder / "poses.csv").write_bytes(f"Gerät 7;,\n2026-11-28;14:05\nmm{';mm' * 10}\n{text}".encode("cp1252"))
@@ -99,16 +103,14 @@ def test_a_protocol_of_an_instrument_is_read_as_it_is(fg_calib, folder):
     assert "tail.csv:42: 1 cell, expected 9 as in the header" in ended.err
 
 
-def test_units_that_no_header_specifies_are_guessed_from_the_values(fg_calib, folder):
-    folder, write = folder
+def test_units_that_no_header_specifies_are_guessed_from_the_values(fg_calib, folder, write):
     given = drafted(fg_calib, folder, folder / "robot.yaml", write(factors=DEGREES))
     assert given["units"] == {"length": "mm", "angle": "deg"}
     assert "# DECIDE where headers do not say: they are guessed from the values' sizes" in (folder / JOB).read_text()
     assert given["noise"]["position"] == 0.1
 
 
-def test_several_tables_have_entries_and_units_of_their_own(fg_calib, folder):
-    folder, write = folder
+def test_several_tables_have_entries_and_units_of_their_own(fg_calib, folder, write):
     mm = write({"x": "x [mm]", "y": "y [mm]", "z": "z [mm]"}, dict.fromkeys("xyz", 1e3), "monday.csv")
     header = ",".join(["anchor", "distance [m]", *(f"q{i}" for i in range(1, 7))])
     (folder / "tuesday.csv").write_text(f"{header}\n" + "bolt,1,0,0,0,0,0,1\n" * 3)
@@ -121,8 +123,7 @@ def test_several_tables_have_entries_and_units_of_their_own(fg_calib, folder):
     assert (folder / JOB).read_text().count("# offset: estimate  # DECIDE whether the instrument adds a constant") == 1
 
 
-def test_sigmas_in_a_table_need_no_value_of_noise(fg_calib, folder):
-    folder, write = folder
+def test_sigmas_in_a_table_need_no_value_of_noise(fg_calib, folder, write):
     table = pl.read_csv(write()).with_columns(pl.lit(5e-5).alias("sigma_position"))
     table.write_parquet(folder / "poses.parquet")
     given = drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.parquet")
@@ -133,8 +134,7 @@ def test_sigmas_in_a_table_need_no_value_of_noise(fg_calib, folder):
     assert drafted(fg_calib, folder, folder / "robot.yaml", folder / "poses.parquet")["noise"]["joint"] == 1e-4
 
 
-def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
-    folder, write = folder
+def test_what_only_the_user_knows_is_asked_for(fg_calib, folder, write):
     robot = {key: value for key, value in UR5E.items() if key != "tolerance"}
     (folder / "robot.yaml").write_text(yaml.safe_dump(robot))
     drafted(fg_calib, folder, folder / "robot.yaml", write())
@@ -145,8 +145,7 @@ def test_what_only_the_user_knows_is_asked_for(fg_calib, folder):
     assert (ended.code, ended.err) == (1, f"error: {folder / JOB}: is there already, expected a folder without it\n")
 
 
-def test_a_job_of_a_urdf_has_prior_sigmas_as_the_draft_says(fg_calib, folder):
-    folder, write = folder
+def test_a_job_of_a_urdf_has_prior_sigmas_as_the_draft_says(fg_calib, folder, write):
     fg_calib("export", folder / "robot.yaml", "--to", "urdf", "--out", folder / "arm.urdf")
     drafted(fg_calib, folder, folder / "arm.urdf", write())
     text = (folder / JOB).read_text()
@@ -171,8 +170,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_used_is_refused_in_one_line(fg_calib, folder, case):
-    folder, write = folder
+def test_what_cannot_be_used_is_refused_in_one_line(fg_calib, folder, write, case):
     write()
     q, zeros = ",".join(f"q{i}" for i in range(1, 7)), ",".join("0" * 6)
     (folder / "other.yaml").write_text((folder / "robot.yaml").read_text())

@@ -34,11 +34,8 @@ def photographed(folder, rng, n=28):
     (folder / "images").mkdir()
     for k in reached:
         cv2.imwrite(str(folder / "images" / f"c{k}.png"), render(BOARD, R[k], t[k], rng))
-    write_csv(
-        folder / "readings.csv",
-        {"id": [f"c{k}" for k in reached]}
-        | {f"q{i + 1}": np.rad2deg(q) for i, q in enumerate(inverse.readings[reached].T)},
-    )
+    readings = {f"q{i + 1}": np.rad2deg(q) for i, q in enumerate(inverse.readings[reached].T)}
+    write_csv(folder / "readings.csv", {"id": [f"c{k}" for k in reached]} | readings)
     (folder / "board.yaml").write_text("{type: checkerboard, columns: 9, rows: 6, square: 20, units: {length: mm}}")
     (folder / "camera.yaml").write_text(yaml.safe_dump(asdict(CAMERA)))
     return robot, true

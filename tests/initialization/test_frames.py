@@ -19,11 +19,9 @@ FAR = [
 
 def flange_poses(n=12, seed=0, axis=None):
     rng = np.random.default_rng(seed)
-    turns = (
-        Rotation.random(n, random_state=seed)
-        if axis is None
-        else Rotation.from_rotvec(rng.uniform(-3, 3, (n, 1)) * axis)
-    )
+    turns = Rotation.random(n, random_state=seed)
+    if axis is not None:
+        turns = Rotation.from_rotvec(rng.uniform(-3, 3, (n, 1)) * axis)
     return turns.as_matrix(), rng.uniform(-1, 1, (n, 3))
 
 

@@ -5,18 +5,16 @@ import json
 import math
 import shutil
 import warnings
-from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 
-import fg_calib
 from fg_calib import Calibration, InputError, Robot, calibrate_job, read_job, read_robot
+from fg_calib.cli import EXAMPLES
 from fg_calib.io import read_measurements, read_result
 from fg_calib.simulation import read_scenario
 
-BUNDLED = Path(fg_calib.__file__).parent / "examples"
 URDF = """<?xml version="1.0"?><robot name="r"><link name="a"/><link name="b"/>
 <joint name="j" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 1" rpy="0 0 0"/><axis xyz="0 0 1"/>
 <limit lower="-1" upper="1"/></joint></robot>"""
@@ -48,12 +46,9 @@ READERS = {
 def folder(tmp_path_factory):
     """A folder with a whole file for each reader."""
     folder = tmp_path_factory.mktemp("fuzz")
-    example = next(BUNDLED.rglob("calibration.yaml")).parent
-    for file in example.iterdir():
-        if file.is_file():
-            shutil.copy(file, folder)
-    shutil.copy(example / "robot_nominal.yaml", folder / "robot.yaml")
-    shutil.copy(BUNDLED.parent / "scenarios" / "space-robot" / "scenario.yaml", folder)
+    shutil.copytree(EXAMPLES / "space-robot", folder, dirs_exist_ok=True)
+    shutil.copy(folder / "robot_nominal.yaml", folder / "robot.yaml")
+    shutil.copy(EXAMPLES.parent / "scenarios" / "space-robot" / "scenario.yaml", folder)
     (folder / "arm.urdf").write_text(URDF)
     calibrate_job(folder / "calibration.yaml").save(folder)
     (folder / "rows.csv").write_text(POSES)

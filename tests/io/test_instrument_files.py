@@ -6,11 +6,13 @@ import yaml
 from instruments import CAMERA, measured_by
 from refusals import refusal
 from scipy.spatial.transform import Rotation
+from simulated import small_arm
 
 from fg_calib import Noise, calibrate, calibrate_job, read_job
 from fg_calib.io import read_measurements, write_csv, write_robot
 from fg_calib.measurements.kinds.board import COVARIANCE
 
+ROBOT = small_arm()
 INTRINSICS = {name: getattr(CAMERA, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2")}
 KEYS = {
     "targets known": {"frame": "unknown", "targets": {"t0": {"x": 300, "y": 100, "z": -200}}},
@@ -94,16 +96,14 @@ def test_every_form_of_a_camera(top, entry, fixed, tmp_path):
 
 
 def test_a_table_of_poses_takes_rotation_vectors(tmp_path):
-    robot, _, _ = measured_by("anchors", np.random.default_rng(23))
     (tmp_path / "poses.csv").write_text("q1,q2,q3,q4,x,y,z,rx,ry,rz\n0,0,0,0,1,2,3,0.1,-0.2,0.3\n")
-    found = read_measurements(tmp_path / "poses.csv", robot).rotation
+    found = read_measurements(tmp_path / "poses.csv", ROBOT).rotation
     assert found[0] == pytest.approx(Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix())
 
 
 def test_a_column_that_another_model_uses_means_nothing(tmp_path):
-    robot, _, _ = measured_by("anchors", np.random.default_rng(24))
     (tmp_path / "poses.csv").write_text("q1,q2,q3,q4,x,y,z,anchor,distance,u\n0,0,0,0,1,2,3,,far,left\n")
-    found = read_measurements(tmp_path / "poses.csv", robot, model="position")
+    found = read_measurements(tmp_path / "poses.csv", ROBOT, model="position")
     assert found.labels == {}
     assert found.value("distance") is None
 
@@ -125,19 +125,17 @@ CASES = [
 
 @pytest.mark.parametrize(("model", "text", "message"), CASES)
 def test_a_cell_that_cannot_be_used_is_named(model, text, message, tmp_path):
-    robot, _, _ = measured_by("anchors", np.random.default_rng(25))
     (tmp_path / "t.csv").write_text(text)
-    assert refusal(read_measurements, tmp_path / "t.csv", robot, model=model, noise=Noise(distance=1e-3)) == message
+    assert refusal(read_measurements, tmp_path / "t.csv", ROBOT, model=model, noise=Noise(distance=1e-3)) == message
 
 
 @pytest.mark.parametrize(("column", "word"), [("anchor", "NA"), ("plane", "nan"), ("station", "-"), ("target", "None")])
 def test_a_word_for_nothing_is_no_name(column, word, tmp_path):
     """R writes NA where there is none, Python nan or None: an unknown of that name would take the row's error up."""
-    robot, _, _ = measured_by("anchors", np.random.default_rng(29))
     (tmp_path / "t.csv").write_text(f"{HEAD},x,y,z,{column},distance\n0,0,0,0,1,2,3,{word},1\n")
     model = column if column in ("anchor", "plane") else "position"
     empty = ", or an empty cell" * (column != "station")
-    error = refusal(read_measurements, tmp_path / "t.csv", robot, model=model)
+    error = refusal(read_measurements, tmp_path / "t.csv", ROBOT, model=model)
     article = "an" if column == "anchor" else "a"
     expected = f"the name of {article} {column}{empty}"
     assert error == f"t.csv:2: {column}: found {word!r}, expected {expected}"

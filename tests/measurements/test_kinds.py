@@ -156,11 +156,8 @@ def seen_by_camera(n, rng):
     R = Rotation.random(n, random_state=rng.integers(1000)).as_matrix()
     p, ahead = rng.normal(size=(n, 3)), np.column_stack([0.3 * rng.normal(size=(n, 2)), rng.uniform(3, 4, n)])
     data = np.hstack([rng.uniform(0, 1000, (n, 2)), rng.uniform(-0.2, 0.2, (n, 2))])
-    return (
-        Frames(R[:, None], p[:, None]),
-        data,
-        np.hstack([rng.normal(size=(n, 3)), p + (R @ ahead[:, :, None])[..., 0]]),
-    )
+    board = np.hstack([rng.normal(size=(n, 3)), p + (R @ ahead[:, :, None])[..., 0]])
+    return Frames(R[:, None], p[:, None]), data, board
 
 
 def test_pixels_have_the_derivatives_of_central_differences():

@@ -96,19 +96,11 @@ def test_the_slope_of_an_angle_is_that_of_its_mean(f):
     assert of_angle(f, 4e-4, 4e-4)[1] == pytest.approx((up - down) / (2 * h), abs=2e-5)
 
 
-def test_what_has_no_noise_is_left_as_it_is():
-    f = np.array([0.0, 1e-9, 1.0, np.pi])
-    zero = np.zeros(4)
-    for moments in (length_moments(f, zero, zero, zero), angle_moments(f, zero, zero, zero)):
-        assert np.all(moments.excess == 0.0)
-        assert np.all(moments.slope == 1.0)
-        assert np.all(moments.variance == 0.0)
-
-
-def test_an_error_of_the_instrument_alone_changes_nothing_far_from_0_and_half_a_turn():
-    f = np.array([0.01, 1.0, 3.0])
-    own, zero = np.full(3, 1e-6), np.zeros(3)
-    for moments in (length_moments(f, zero, zero, own), angle_moments(f, zero, zero, own)):
-        assert np.all(moments.excess == 0.0)
-        assert np.all(moments.slope == 1.0)
-        assert np.all(moments.variance == own)
+@pytest.mark.parametrize("moments", [length_moments, angle_moments])
+@pytest.mark.parametrize(("f", "own"), [([0.0, 1e-9, 1.0, np.pi], 0.0), ([0.01, 1.0, 3.0], 1e-6)])
+def test_no_noise_changes_nothing_and_that_of_the_instrument_none_far_from_0_and_half_a_turn(moments, f, own):
+    zero = np.zeros(len(f))
+    found = moments(np.array(f), zero, zero, zero + own)
+    assert np.all(found.excess == 0.0)
+    assert np.all(found.slope == 1.0)
+    assert np.all(found.variance == own)

@@ -176,14 +176,13 @@ def run_python(text, folder, fg_calib):
     exec(text, names)
 
 
+def show_text(text, folder, fg_calib):
+    """What a calibration of a bundled example prints."""
+    run_console(f"$ fg-calib calibrate demo/calibration.yaml\n{text}", folder, fg_calib, "ur10-tracker")
+
+
 RUN = {"yaml": read_yaml, "csv": read_csv, "bash": parse_commands, "sh": parse_commands, "console": run_console}
-RUN |= {
-    "python": run_python,
-    "diff": lambda *_: None,  # see `measurements/test_extensions.py`
-    "text": lambda text, *others: run_console(
-        f"$ fg-calib calibrate demo/calibration.yaml\n{text}", *others, "ur10-tracker"
-    ),
-}
+RUN |= {"python": run_python, "text": show_text, "diff": lambda *_: None}  # see `measurements/test_extensions.py`
 FAST = ("bash", "sh", "csv", "yaml", "diff")
 EVERY_SNIPPET = [
     pytest.param(page, n, id=f"{page}-{n}", marks=() if language in FAST else pytest.mark.slow)
