@@ -21,21 +21,12 @@ MAX_ROWS = 12
 CODE = re.compile(r" \([^()]*`[^()]*\)")
 """Keys and commands in a statement, which the first page leaves out."""
 
-EXPLANATIONS = {
-    text.PARAMETERS: "Dots are corrections, estimate minus nominal, with 1 sigma to both sides; the pale band is the"
-    " prior sigma, cut at 1.5 times the largest of these. Orange: the uncertainty is unknown.",
-    text.CURVES: "What joints turn beyond their readings, with a band of 2 sigma to both sides. Dots on the axis are"
-    " readings of fitted rows: where there are none, the band is as wide as the prior.",
-    "Compliance of joints": "What a joint would have to turn for the tool to be where it was measured, over the torque"
-    " of gravity: blue as calibrated, orange without the joint's compliance (the line).",
-    "Studentised residuals": "Residuals in their own standard deviations: noise as specified follows the curve, and 1"
-    " in 370 is beyond 3.",
-    "Error over joint space": "Predicted minus measured; of positions the component along the joint's own motion: a"
-    " sine is an error of that joint once a turn. A trend shows an unmodelled effect of it.",
-    "Correlations": "Strong colours: errors of the two parameters go together.",
-    WORKSPACE: "RMS error of the tool's position expected from the covariance. Unmodelled effects are not included.",
+SECTIONS = {
+    **{"parameters": text.PARAMETERS, "curves": text.CURVES, "compliances": "Compliance of joints"},
+    **{"residuals": "Studentised residuals", "joints": "Error over joint space", "correlations": "Correlations"},
+    "workspace": WORKSPACE,
 }
-"""How to read the figures of each section: of the report, or of the page alone after them."""
+"""The section that each figure is in: one of the report, or of the page alone after them."""
 
 
 @cache
@@ -61,8 +52,7 @@ def build_page(data: text.ReportData) -> str:
     """The page of a calibration, as HTML."""
     result, charts, space = data.result, figures_of(data), data.workspace
     sections = sorted(text.build_sections(data, MAX_ROWS), key=lambda one: one.title != text.NOTES)
-    drawn = zip(EXPLANATIONS.items(), charts.values(), strict=True)
-    figures = {title: (about, of) for (title, about), of in drawn if of}
+    figures = {SECTIONS[name]: (name, of) for name, of in charts.items() if of}
     sections += [Section(title) for title in figures if title not in {one.title for one in sections}]
     if charts["workspace"] and space is not None:
         sections[-1:] = section(WORKSPACE, size_table(space), *percentages(space))
