@@ -138,9 +138,8 @@ def estimate_offset(joints: JointStream, poses: PoseStream, robot: Robot) -> Clo
     path = forward(build_chain(robot, {}), robot.trig(joints.readings)).position
     by_joints = _speed(joints.time, path, begin + LAG_STEP_S * np.arange(n))
     by_poses = _speed(poses.time, poses.position, begin + first + LAG_STEP_S * np.arange(n + n_lags))
-    lagged = sliding_window_view(by_poses, n)
     with np.errstate(invalid="ignore"):  # of what does not move
-        correlation = np.nan_to_num([np.corrcoef(by_joints, one)[0, 1] for one in lagged])
+        correlation = np.nan_to_num([np.corrcoef(by_joints, one)[0, 1] for one in sliding_window_view(by_poses, n)])
     best = int(np.argmax(correlation))
     if correlation[best] < MIN_CORRELATION:
         place = f"topics {joints.source.topic} and {poses.source.topic}"
@@ -421,11 +420,8 @@ def write_stops(path: Path | str, stops: Stops, robot: Robot) -> None:
     begin, seconds = np.round(stops.interval[:, 0], 3), np.round(np.diff(stops.interval, axis=1)[:, 0], 3)
     columns: dict[str, Any] = {"id": np.array(stops.ids), "begin": begin, "seconds": seconds}
     columns |= {"samples": stops.samples.astype(np.int64)}
-    for names, kind in ((io.joint_columns(robot), "joint"), ("xyz", "position")):
-        columns |= dict(zip(names, stops.means[kind].T, strict=True))
-    if "orientation" in stops.means:
-        quaternion = Rotation.from_matrix(stops.means["orientation"]).as_quat(canonical=True)
-        columns |= dict(zip(("qx", "qy", "qz", "qw"), quaternion.T, strict=True))
+    means = stops.means
+    columns |= io.pose_columns(robot, means["joint"], means["position"], means.get("orientation"), io.Units())
     for kind, prefix in (("position", "sigma_"), ("orientation", "sigma_r")):
         if kind in stops.sigmas:
             columns |= {f"{prefix}{axis}": stops.sigmas[kind][:, k] for k, axis in enumerate("xyz")}

@@ -502,6 +502,26 @@ def joint_columns(robot: Robot) -> tuple[str, ...]:
     return names if plain and not clashing else tuple(f"q{i + 1}" for i in range(robot.n_joints))
 
 
+def pose_columns(
+    robot: Robot, readings: Floats, position: Floats, rotation: Floats | None, units: Units
+) -> dict[str, Floats]:
+    """Columns to be written: joint readings, positions and, if there are any, orientations.
+
+    Args:
+        robot: Whose joints they are of.
+        readings: Shape (n, n_joints), [rad] (prismatic: [m]).
+        position: Shape (n, 3), [m].
+        rotation: Shape (n, 3, 3); None where there are none.
+        units: Of the table.
+    """
+    q = readings / [units.factor(joint.unit) for joint in robot.joints]
+    columns = dict(zip((*joint_columns(robot), *"xyz"), (*q.T, *position.T / units.factor("m")), strict=True))
+    if rotation is not None:
+        quaternions = Rotation.from_matrix(rotation.copy()).as_quat(canonical=True)
+        columns |= dict(zip(OF_CONFIGURATIONS["qx"].names, quaternions.T, strict=True))
+    return columns
+
+
 def find_joint_columns(table: Table, robot: Robot) -> tuple[str, ...]:
     """The columns of joint readings, in chain order: all by the joints' names, or all by their numbers."""
     names = () if _NOT_JOINTS & {joint.name for joint in robot.joints} else tuple(joint.name for joint in robot.joints)

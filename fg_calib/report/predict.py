@@ -11,7 +11,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from fg_calib.inputs import Floats, shorten
-from fg_calib.io import Result, Units, fill_folder, joint_columns, require_absent, write_csv
+from fg_calib.io import Result, Units, fill_folder, pose_columns, require_absent, write_csv
 from fg_calib.prediction import Correction, PredictedErrors, ToolErrors, summed_up
 from fg_calib.report import tables
 from fg_calib.report.charts import standalone
@@ -111,12 +111,8 @@ def write_prediction(
         InputError: The folder cannot be written.
     """
     errors = found.errors
-    readings = errors.readings / [units.factor(joint.unit) for joint in robot.joints]
-    columns: dict[str, Any] = {
-        "id": np.array(_names(found, ids), dtype=np.str_),
-        **dict(zip(joint_columns(robot), readings.T, strict=True)),
-        **dict(zip("xyz", errors.position.T / units.factor("m"), strict=True)),
-    }
+    columns: dict[str, Any] = {"id": np.array(_names(found, ids), dtype=np.str_)}
+    columns |= pose_columns(robot, errors.readings, errors.position, None, units)
     for name, of in _frames(errors).items():
         for column, (kind, unit) in zip(() if of is None else of.T, POSE_KINDS.items(), strict=False):
             columns[f"{name}_{kind}_{tables.shown_in(unit).unit}"] = column * tables.shown_in(unit).factor
@@ -209,8 +205,7 @@ def _configurations(found: PredictedErrors, robot: Robot, names: Sequence[str]) 
     error = np.where(np.isnan(found.expected[:, 0]), np.inf, found.expected[:, 0])
     near = np.where(found.far, "no", "yes").tolist()
     rows = [(names[k], *found.errors.readings[k], *found.expected[k], near[k]) for k in np.argsort(-error).tolist()]
-    columns = ("", *tables.joint_columns(robot, ":.2f"), "mm|m", "deg|rad", "near|>")
-    return table_of(columns, rows, most=MAX_LISTED)
+    return table_of(("", *tables.joint_columns(robot, ":.2f"), "mm|m", "deg|rad", "near|>"), rows, most=MAX_LISTED)
 
 
 def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
@@ -224,11 +219,6 @@ def _prediction_notes(found: PredictedErrors, robot: Robot) -> Iterator[str]:
         yield "Nothing was measured in the base frame: errors count after the best rigid fit to all measurements."
     if found.errors.joint_noise is None:
         yield "The job specifies no joint noise: the repeatability of the arm is not in these errors."
-
-
-def _quaternions(correction: Correction) -> Floats:
-    """Orientations to command, shape (n, 4), x y z w."""
-    return np.asarray(Rotation.from_matrix(correction.rotation.copy()).as_quat(canonical=True))
 
 
 def _errors(correction: Correction) -> dict[str, dict[str, Floats]]:
@@ -246,7 +236,8 @@ def correction_document(name: str, ids: Sequence[str], correction: Correction) -
         correction: The commands.
     """
     keys = ("reached", "readings", "nominal_readings", "position")
-    quaternion, errors = _quaternions(correction), _errors(correction)
+    quaternion = Rotation.from_matrix(correction.rotation.copy()).as_quat(canonical=True)
+    errors = _errors(correction)
     targets = [
         {"id": target, **{key: getattr(correction, key)[i] for key in keys}, "quaternion_xyzw": quaternion[i]}
         | {of: {kind: values[i] for kind, values in kinds.items()} for of, kinds in errors.items()}
@@ -288,8 +279,7 @@ def _commands(ids: Sequence[str], correction: Correction, robot: Robot) -> Table
     """Joint positions and errors of the targets."""
     before, after = correction.uncorrected[:, 0], np.hypot(correction.missed[:, 0], correction.expected[:, 0])
     rows = [(*of, b, a) for *of, b, a in zip(ids, *correction.readings.T, before, after, strict=True)]
-    columns = ("target", *tables.joint_columns(robot), "before mm|m|-", "after mm|m|-")
-    return table_of(columns, rows, most=MAX_LISTED)
+    return table_of(("target", *tables.joint_columns(robot), "before mm|m|-", "after mm|m|-"), rows, most=MAX_LISTED)
 
 
 def _assumed(robot: Robot, known: Collection[str]) -> Iterator[str]:
@@ -332,14 +322,8 @@ def write_commands(path: Path, ids: tuple[str, ...], correction: Correction, rob
     Raises:
         InputError: The table cannot be written, or is there already.
     """
-    readings = correction.readings / [units.factor(joint.unit) for joint in robot.joints]
-    columns: dict[str, Any] = {
-        "id": np.array(ids, dtype=np.str_),
-        "reached": np.where(correction.reached, "yes", "no"),
-        **dict(zip(joint_columns(robot), readings.T, strict=True)),
-        **dict(zip("xyz", correction.position.T / units.factor("m"), strict=True)),
-        **dict(zip(("qx", "qy", "qz", "qw"), _quaternions(correction).T, strict=True)),
-    }
+    columns: dict[str, Any] = {"id": np.array(ids, dtype=np.str_), "reached": np.where(correction.reached, "yes", "no")}
+    columns |= pose_columns(robot, correction.readings, correction.position, correction.rotation, units)
     for of, kinds in _errors(correction).items():
         columns |= {f"{of}_{kind}": values / units.factor(POSE_KINDS[kind]) for kind, values in kinds.items()}
     require_absent(path.parent, [path.name])
