@@ -55,19 +55,17 @@ def _report(tables: "importers.BoardTables") -> Group:
     images, camera = [], []
     for view in fit.views:
         turn, shift = (np.sqrt(np.linalg.eigvalsh(C)[-1]) for C in (view.covariance[:3, :3], view.covariance[3:, 3:]))
-        remark = "two poses" if view.ambiguous else ""
         values = view.rms, view.sigma, float(np.linalg.norm(view.position)), shift, turn
-        images.append((view.name, len(view.corners), *values, remark))
+        images.append((view.name, len(view.corners), *values, "two poses" if view.ambiguous else ""))
     for name, sigma in (fit.camera_sigma or {}).items():
         unit, decimals = ("px", 3) if name in importers.INTRINSICS[:4] else ("", 6)
         camera.append((name, f"{getattr(fit.camera, name):.{decimals}f}", f"{sigma:.{decimals}f}", unit))
     pose = ("distance mm|m:.1f", "sigma mm|m", "sigma deg|rad")
-    columns = ("Image", "corners|d", "RMS px|.3f", "sigma px|.3f", *pose, "")
     return report.report(
         report.line(f"{board.type} {size}: {seen}"),
         *(report.line(f"DOUBTFUL: {finding}", "bold red") for finding in fit.findings),
         report.line(f"RMS of residuals {fit.rms:.3f} px, sigma of a corner {fit.sigma:.3f} px"),
-        report.table_of(columns, images),
+        report.table_of(("Image", "corners|d", "RMS px|.3f", "sigma px|.3f", *pose, ""), images),
         *report.section("Camera (1 sigma)", report.table_of(("", "estimate|>", "sigma|>", ""), camera)),
         *report.section("Notes", *_notes(tables)),
     )

@@ -77,5 +77,4 @@ def _growth(given: Sequence[str], units: Mapping[str, str]) -> dict[str, float]:
 def history(result: ResultFolder, as_json: Json = False) -> None:
     """Show the runs that a calibration came from."""
     found = io.read_result(result)
-    runs = (*found.history, found.run)
-    show_result(as_json, report.history_document, report.build_history, found.robot, runs)
+    show_result(as_json, report.history_document, report.build_history, found.robot, (*found.history, found.run))

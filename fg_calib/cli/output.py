@@ -35,11 +35,8 @@ def option(name: str, metavar: str | None, about: str, **limits: Any) -> Any:
 
 def quantity(name: str, unit: Literal["m", "rad"], about: str) -> Any:
     """An option that takes a number with its unit."""
-
-    def read(text: str) -> float:
-        return io.quantity(text, unit, None, name)
-
-    return option(name, {"m": "LENGTH", "rad": "ANGLE"}[unit], about, parser=read)
+    metavar = {"m": "LENGTH", "rad": "ANGLE"}[unit]
+    return option(name, metavar, about, parser=lambda text: io.quantity(text, unit, None, name))
 
 
 Json = Annotated[bool, option("--json", None, "Print the result as JSON on stdout, and nothing else there.")]

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, field, fields
+from dataclasses import asdict, field
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fg_calib import __version__, inputs
+from fg_calib import __version__, inputs, report
 from fg_calib.calibration import Calibration
 from fg_calib.exports import dh
 from fg_calib.exports.poe import link_content, screw_content
@@ -84,9 +84,8 @@ class Export(Record):
 
         with errors as in `PoseErrors`; SI.
         """
-        document = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "details"}
-        lists = {name: list(value) for name, value in document.items() if isinstance(value, tuple)}
-        return {"schema": "fg-calib/export/1", "version": __version__, **document, **lists, **self.details}
+        keys = "to robot text notes findings not_accepted effects"
+        return report.document_of("export", self, keys, **self.details)
 
     def __str__(self) -> str:
         return self.text

@@ -297,8 +297,7 @@ def _table(entry: _Entry, place: str, file: _JobKeys, robot: Robot, folder: Path
 
 def _known_points(file: Any, model: Model, place: str) -> dict[str, KnownPoint]:
     """Targets or anchors, whatever a model has, that the job says something of."""
-    key = INSTRUMENTS[model].key
-    if not key:
+    if not (key := INSTRUMENTS[model].key):
         return {}
     found, shared = {}, getattr(file.tolerance, key)
     for name, point in getattr(file, key).items():

@@ -530,8 +530,7 @@ def _shapes(result: Result) -> Iterator[tuple[str, Any, Any]]:
     seen = result.observability.observability
     yield "observability: classes", len(seen.classes), len(seen.names)
     of_groups = {name for one in seen.relative for name in (*one.parameters, *one.keep)}
-    named = of_groups.union(seen.sigma, *seen.lost)
-    yield "observability: unknown names", sorted(named.difference(seen.names)), []
+    yield "observability: unknown names", sorted(of_groups.union(seen.sigma, *seen.lost).difference(seen.names)), []
     yield "observability: directions lost", len(seen.lost), len(seen.names) - seen.rank
     if result.posterior is not None:  # version 1 did not list them
         yield "observability: lost", len(result.observability.lost), len(seen.lost)

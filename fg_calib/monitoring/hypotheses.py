@@ -273,8 +273,7 @@ def _refined(found: HypothesisTest, calibrated: Calibrated, rows: Rows) -> Hypot
             there = linearise_new_data(place_new_data(calibrated, rows, values))
         except CalibrationError:
             return found
-        again = fit_change(replace(found.hypothesis, columns=there.of_arm @ D), there, found.n)
-        if again is None:
+        if (again := fit_change(replace(found.hypothesis, columns=there.of_arm @ D), there, found.n)) is None:
             return found
         step = again
         if np.all(np.abs(step.change) <= SETTLED * np.nan_to_num(step.sigma, nan=np.inf)):

@@ -25,6 +25,7 @@ from .predict import (
 )
 from .tables import (
     WIDTH,
+    document_of,
     in_order,
     line,
     plain,
@@ -54,6 +55,7 @@ __all__ = [
     "comparison_document",
     "correction_document",
     "design_document",
+    "document_of",
     "draw",
     "format_result",
     "history_document",

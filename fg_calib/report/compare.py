@@ -18,9 +18,7 @@ from fg_calib.report import tables
 from fg_calib.report.tables import figure, in_words, line, section, table_of
 
 ERRORS = {"max": "m", "mean": "m", "rms": "m", "orientation_rms": "rad"}
-PREDICTED = {"predicted_position_rms": "m", "predicted_position_rms_fitted": "m"}
-EFFORT = {"n_estimated": "", "iterations": "", "seconds": "s"}
-"""Units of quantities of an estimate in the document."""
+"""Units of errors in the document."""
 
 
 def build_comparison_report(comparison: Comparison) -> Group:
@@ -49,15 +47,14 @@ def _quantities(comparison: Comparison) -> Iterator[Sequence[str | Text]]:
     groups: list[tuple[str, tuple[str, ...], Mapping[str, str]]] = [
         ("Real error in the base frame", ("errors", "base_frame"), ERRORS),
         ("Real error after the best rigid fit", ("errors", "best_rigid_fit"), ERRORS),
-        ("Error predicted by its sigmas", (), PREDICTED),
+        ("Error predicted by its sigmas", (), {"predicted_position_rms": "m", "predicted_position_rms_fitted": "m"}),
         *((f"Residuals, {split} rows (RMS)", ("residual_rms", split), kinds) for split in ("train", "test")),
-        ("Effort", (), EFFORT),
+        ("Effort", (), {"n_estimated": "", "iterations": "", "seconds": "s"}),
     ]
     for title, path, quantities in groups:
         found = [reduce(lambda of, key: (of or {}).get(key), path, e) or {} for e in estimates]
         values = {key: [of.get(key) for of in found] for key in quantities}
-        known = {key: row for key, row in values.items() if any(value is not None for value in row)}
-        if known:
+        if known := {key: row for key, row in values.items() if any(value is not None for value in row)}:
             yield line(title, "bold"), *[""] * (len(estimates) + 1)
         for key, row in known.items():
             unit = quantities[key]

@@ -178,8 +178,7 @@ class Measuring:
         return np.full(shape, sigma)
 
     def _value(self, noise: Noise, kind: str) -> float:
-        value = noise.get(kind)
-        if value is None:
+        if (value := noise.get(kind)) is None:
             raise InputError(f"{self.place}: noise: {kind}", "found none", f"1 sigma, for model {self.model}")
         return float(value)
 
@@ -280,8 +279,7 @@ class Measuring:
             measured["position"] = seen + self.noise("position", len(k), 3)
             measured["sigma_position"] = self.sigma("position", len(k), 3)
         if rotated:
-            noise = Rotation.from_rotvec(self.noise("orientation", len(k), 3)).as_matrix()
-            measured["rotation"] = X @ R @ noise
+            measured["rotation"] = X @ R @ Rotation.from_rotvec(self.noise("orientation", len(k), 3)).as_matrix()
             measured["sigma_orientation"] = self.sigma("orientation", len(k), 3)
         if targets:
             labels["target"] = Labels(tuple(targets), which - i.tool_too)
@@ -333,9 +331,8 @@ class Measuring:
         else:
             length = np.linalg.norm(self.at().position - places, axis=1)
             length = np.abs(length + (i.offset or 0.0) + self.noise("distance", n))
-        labels = {"anchor": Labels(tuple(anchors), which)}
         sigmas = {"distance": self.sigma("distance", len(which))}
-        m = self.rows(labels=labels, columns={"distance": length}, sigmas=sigmas)
+        m = self.rows(labels={"anchor": Labels(tuple(anchors), which)}, columns={"distance": length}, sigmas=sigmas)
         table = Table(m, "anchor", known=self.known(anchors), offset=i.offset is not None)
         return table, {"anchors": anchors, "offsets": {} if i.offset is None else {self.name: i.offset}}
 
@@ -384,8 +381,7 @@ class Measuring:
         rotation = Rotation.from_rotvec(self.noise("orientation", n, 3)).as_matrix() @ R[k, which]
         position = b[k, which] + self.noise("position", n, 3)
         sigmas = {f"sigma_{kind}": self.sigma(kind, n, 3) for kind in ("orientation", "position")}
-        labels = {"board": Labels(tuple(boards), which)}
-        m = self.rows(k, labels=labels, rotation=rotation, position=position, **sigmas)
+        m = self.rows(k, labels={"board": Labels(tuple(boards), which)}, rotation=rotation, position=position, **sigmas)
         return Table(m, "board"), {"boards": boards}
 
     def pixels(self) -> tuple[Table, Truth]:
@@ -560,8 +556,7 @@ def simulate(scenario: Scenario, seed: int = 0, *, exact: bool = False) -> Simul
         if instrument.configurations is not None:
             own = _visit(scenario, instrument.configurations, seed, f"instruments: {instrument.name}", exact)
             visits = [own._replace(ids=np.array([f"{instrument.name} {name}" for name in own.ids])), *common[1:]]
-        measuring = Measuring(scenario, instrument, true_robot, Visits.joined(visits), frame, seed, exact)
-        table, truth = measuring.measure()
+        table, truth = Measuring(scenario, instrument, true_robot, Visits.joined(visits), frame, seed, exact).measure()
         if instrument is default:
             table, truth = replace(table, model=scenario.job.get("model"), pairing=scenario.pairing), {}
         tables.append(table)
