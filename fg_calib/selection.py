@@ -8,9 +8,10 @@ covariance C of the coefficients c, integrated over all else, and n of them, Mac
 gamma the number of directions that the data determine. Its own sigma is about s / sqrt(2 gamma). A linearised fit gives
 C and c for every s, so that the fixed point is found between fits.
 
-Effects are tried one by one in the order of `EFFECTS`, each next to all that are kept, until nothing changes: some
-are of use only after others, and some no longer. Rows are linearised once, where the geometry alone is estimated, for
-effects are small; noise and s are estimated anew each time. An effect is kept if
+Effects are tried one by one in the order of `EFFECTS`, each next to all that are kept, else in place of one of them,
+until nothing changes: some are of use only after others, some no longer, and some mimic others. Rows are linearised
+once, where the geometry alone is estimated, for effects are small; noise and s are estimated anew each time. An effect
+is kept if
 
 1. there is evidence: of error curves a ratio of marginal likelihoods, of others an F test of their coefficients;
 2. rows held out by blocks, the quarters of each joint's readings in turn, are predicted better;
@@ -183,9 +184,15 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
     for _ in range(N_PASSES):
         before = kept
         for i in sorted({i for i, _ in choice.groups}, key=lambda i: order.index(type(effects[i]))):
-            others = frozenset(group for group in kept if group[0] != i)
-            found[i], more = choice.test(others, frozenset(group for group in choice.groups if group[0] == i))
+            mine = frozenset(group for group in choice.groups if group[0] == i)
+            others = kept - mine
+            found[i], more = choice.test(others, mine)
             kept = others | more
+            for j in {j for j, _ in others} if not more else ():
+                fewer = frozenset(group for group in others if group[0] != j)
+                test, more = choice.test(fewer, mine)
+                if more and choice.prefers(fewer | more, kept):
+                    found[i], kept = test, fewer | more
         if kept == before:
             break
     return _with_effects(job, kept), tuple(found.values())
@@ -251,6 +258,14 @@ class _Choice:
         self.held = [(j, rows, self.rows[rows].T @ self.rows[rows]) for j, rows in held]
         self.gram = self.rows.T @ self.rows
         self.fit, self.held_out = cache(self._fit), cache(self._held_out)
+
+    def prefers(self, new: frozenset[_Group], old: frozenset[_Group]) -> bool:
+        """Whether there is more evidence for some effects than for others, and held-out rows are predicted better."""
+        return self.fit(new)[3] > self.fit(old)[3] and self.error(new) < self.error(old)
+
+    def error(self, kept: frozenset[_Group]) -> float:
+        """Sum of the squares of `_held_out`."""
+        return float(np.sum(self.held_out(kept) ** 2))
 
     def _columns(self, kept: Collection[_Group]) -> Booleans:
         """Columns of some groups."""
@@ -318,7 +333,7 @@ class _Choice:
         blocks = ((j + 1, change[j, rows]) for j, rows, _ in self.held)
         worse = [j for j, d in blocks if d.mean() > MAX_SCORE * d.std() / np.sqrt(len(d))]
         reason = f"a block of joint {worse[0]} is predicted worse than by the geometry alone" if worse else ""
-        if np.sum(new**2) > (1.0 - LEAST_GAIN) ** 2 * np.sum(old**2):
+        if self.error(kept | added) > (1.0 - LEAST_GAIN) ** 2 * self.error(kept):
             reason = "held-out blocks are not predicted better"
         reason = reason if p_value < MAX_P_VALUE else "no evidence"
         name = next(key for key, of in EFFECTS.items() if of is type(effect))

@@ -144,6 +144,9 @@ def test_effects_are_tried_until_nothing_changes(monkeypatch):
             useful = of_use.get(name, lambda kept: False)({i for i, _ in kept})
             return EffectTest(name, (), 1.0, 1.0, 1.0, useful), added if useful else frozenset()
 
+        def prefers(self, new, old):
+            return False
+
     monkeypatch.setattr(selection, "_Choice", Scripted)
     job = Job(None, choosing(arm_with(*LISTED)), measured(arm_with(), 0), Options(model="position"))
     assert select_effects(job, solve_job)[0].robot.effects == LISTED[1::2]
@@ -211,6 +214,17 @@ def test_an_effect_of_some_joints_is_kept_on_these():
     chosen, (test,) = select_effects(job, solve_job)
     assert (test.kept, test.joints) == (True, (3,))
     assert chosen.robot.effects == (kept,)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_an_effect_that_another_mimics_takes_its_place(seed):
+    """Harmonics are tried before gains."""
+    true = arm_with(Gain())
+    true = true.with_values([3e-4 if p.kind == "gain" else p.nominal for p in true.parameters])
+    job = Job(None, choosing(arm_with(*LISTED[::2])), measured(true, seed, n=40), Options(model="position"))
+    chosen, tests = select_effects(job, solve_job)
+    assert chosen.robot.effects == (Gain([1, 2, 3, 4]),)
+    assert [one.effect for one in tests if one.kept] == ["gain"]
 
 
 def test_few_rows_are_no_evidence():
