@@ -8,7 +8,7 @@ import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
 
-from fg_calib import Calibration
+from fg_calib import Calibration, read_robot
 
 JOINTS = [f"q{i + 1}" for i in range(7)]
 
@@ -25,7 +25,7 @@ def near(n):
 def test_targets_in_their_units_become_commands_in_the_same(result, fg_calib, tmp_path):
     """In mm and degrees, with roll, pitch and yaw and names; read again and held to 4x4 products."""
     found, q = Calibration.load(result), near(5)
-    nominal = found.nominal
+    nominal = read_robot(result.parent / "robot_nominal.yaml")
     T = np.array([tool_pose(nominal, row) for row in q])
     angles = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz", degrees=True)
     columns = {"id": [f"hole {i}" for i in range(5)]}
@@ -57,10 +57,10 @@ def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
     document = json.loads(ended.out)
     assert document["n_reached"] == document["n_targets"] == 3
     assert "nothing is written" in ended.err
-    found = Calibration.load(result)
+    found, nominal = Calibration.load(result), read_robot(result.parent / "robot_nominal.yaml")
     for target, row in zip(document["targets"], q, strict=True):
         there = tool_pose(found.robot, target["readings"])
-        assert np.abs(there - tool_pose(found.nominal, row)).max() < 1e-9
+        assert np.abs(there - tool_pose(nominal, row)).max() < 1e-9
         away = np.linalg.norm((tool_pose(found.robot, row) - there)[:3, 3])
         assert target["uncorrected"]["position"] == pytest.approx(away, rel=1e-6)
 
