@@ -1,11 +1,11 @@
-"""A UR5e, and jobs on it as files."""
+"""A UR5e, and what is measured of it."""
 
 import numpy as np
 import yaml
 from scipy.spatial.transform import Rotation
 from simulated import measure_drawn
 
-from fg_calib.io import read_robot, write_csv
+from fg_calib.io import read_robot
 
 SIGMA = (5e-5, 1e-4)
 """1 sigma of a position, [m], and of an orientation, [rad]."""
@@ -36,23 +36,6 @@ def ur5e(folder, **changes):
 def measured(robot, seed=0, *, placed=None, n=50, n_test=0, readings=None):
     """What is measured of a robot whose errors are those its tolerances say."""
     return measure_drawn(robot, n, seed, sigma=SIGMA, frame=placed, n_test=n_test, readings=readings)
-
-
-def write_job(folder, measurements, *, angles=None, **keys):
-    """A job on what was measured, in m and rad; `angles` are written as roll, pitch, yaw instead of quaternions."""
-    m = measurements
-    columns = {f"q{i + 1}": q for i, q in enumerate(m.readings.T)}
-    columns |= dict(zip("xyz", m.position.T, strict=True))
-    if angles is None:
-        columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(m.rotation.copy()).as_quat().T, strict=True))
-    else:
-        columns |= dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
-    write_csv(folder / "poses.csv", columns)
-    job = {"robot": "robot.yaml", "measurements": "poses.csv", "units": {"length": "m", "angle": "rad"}}
-    job["noise"] = {"position": SIGMA[0], "orientation": SIGMA[1]}
-    path = folder / "job.yaml"
-    path.write_text(yaml.safe_dump(job | keys))
-    return path
 
 
 def only(joint, figure, other=0.0):

@@ -126,6 +126,19 @@ def measure(true, n, rng, *, sigma=(1e-3, 2e-4), sigma_joint=0.0, frame=None, n_
     return Measurements(q, np.arange(total).astype(str), np.arange(total) >= n, position, rotation, *sigmas)
 
 
+def specified(m: Measurements, own, joint=1.0) -> Measurements:
+    """Measurements whose noise is specified so many times as large."""
+    changes = {name: getattr(m, name) for name in ("sigma_position", "sigma_orientation")}
+    changes = {name: own * sigma for name, sigma in changes.items() if sigma is not None}
+    changes["sigmas"] = {name: own * sigma for name, sigma in m.sigmas.items()}
+    if m.pairs is not None:
+        changes["pairs"] = replace(m.pairs, sigma_distance=own * m.pairs.sigma_distance)
+    if m.groups is not None:
+        pairs = m.groups.pairs
+        changes["groups"] = replace(m.groups, pairs=replace(pairs, sigma_distance=own * pairs.sigma_distance))
+    return replace(m, sigma_joint=joint * m.sigma_joint, **changes)
+
+
 def measure_drawn(robot: Robot, n, seed, **how) -> Measurements:
     """Poses of a true robot that is drawn first."""
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from simulated import measure, true_robot
+from simulated import measure, specified, true_robot
 
 from fg_calib import Pairing, Robot, build_problem
 
@@ -42,9 +42,7 @@ def measured(name, rng, *, n=60, n_test=0, effect=None, unit=1.0):
     q = rng.uniform(-most, most, (n + n_test, robot.n_joints))
     moved = q + (0.0 if effect is None else effect(true, q))
     m = measure(true, n, rng, sigma=SIGMA, sigma_joint=SIGMA_JOINT, frame=PLACED, n_test=n_test, readings=moved)
-    specified = (m.sigma_position * unit, m.sigma_orientation * unit, m.sigma_joint * unit)
-    specified = dict(zip(("sigma_position", "sigma_orientation", "sigma_joint"), specified, strict=True))
-    return robot, replace(m, readings=q, **specified)
+    return robot, replace(specified(m, unit, unit), readings=q)
 
 
 def problem_of(robot, m, model):

@@ -151,15 +151,6 @@ def test_json_puts_the_result_and_nothing_else_on_stdout(fg_calib, example):
     assert printed == written
 
 
-def test_a_failure_leaves_an_existing_folder_as_it_was(fg_calib, example):
-    out = example / "result"
-    out.mkdir()
-    (out / "result.json").write_text("old")
-    (example / POSES).unlink()
-    assert fg_calib("calibrate", example / JOB, "--out", out).code == 1
-    assert [(f.name, f.read_text()) for f in out.iterdir()] == [("result.json", "old")]
-
-
 def test_noise_specified_too_small_by_5_is_exit_code_3_with_the_reason_and_results(fg_calib, example):
     text = (example / JOB).read_text()
     (example / JOB).write_text(re.sub("noise: .*", "noise: {position: 0.0002, orientation: 0.002, joint: 0.001}", text))

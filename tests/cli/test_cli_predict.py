@@ -27,15 +27,11 @@ def few(monkeypatch):
     monkeypatch.setattr(workspace, "N_DRAWN", 400)
 
 
-def in_degrees(q, robot):
-    """As a table of degrees and metres has it."""
-    return q * [1.0 if joint.prismatic else 180.0 / np.pi for joint in robot.joints]
-
-
 def test_configurations_in_their_units_get_a_row_each(result, fg_calib, tmp_path):
     found = Calibration.load(result)
     q = np.random.default_rng(2).uniform(-1.0, 1.0, (3, 4))
-    columns = {"id": ["a", "b", "b"]} | dict(zip(JOINTS, in_degrees(q, found.robot).T, strict=True))
+    in_degrees = q * [1.0 if joint.prismatic else 180.0 / np.pi for joint in found.robot.joints]
+    columns = {"id": ["a", "b", "b"]} | dict(zip(JOINTS, in_degrees.T, strict=True))
     pl.DataFrame(columns).write_csv(tmp_path / "program.csv")
     out = tmp_path / "out"
     ended = fg_calib("predict", result, "--at", tmp_path / "program.csv", "--angle", "deg", "--out", out, "--json")

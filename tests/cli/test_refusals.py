@@ -46,6 +46,7 @@ def nothing(_folder):
 INPUT = {
     "no job": (without(JOB), CALIBRATE, "calibration.yaml: no such file"),
     "no table": (without(POSES), CALIBRATE, "poses.csv: no such file"),
+    "no table, over a result": (without(POSES), (*CALIBRATE[:-1], "result"), "poses.csv: no such file"),
     "an unknown key": (replaced(JOB, "^pairing", "pairng"), CALIBRATE, "unknown key 'pairng', expected one of pairs,"),
     "degrees read as radians": (replaced(JOB, "angle: deg", "angle: rad"), CALIBRATE,
                                 "poses.csv:2: q1 = 75.6136 rad is outside [-3.14159, 3.14159]; is it in deg?"),

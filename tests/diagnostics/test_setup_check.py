@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from jobs import PLACED, SIGMA, measured, only, ur5e, write_job
+from jobs import PLACED, SIGMA, measured, only, ur5e
 from oracle import random_robot
 from scipy.spatial.transform import Rotation
 from simulated import TOOL, measure, paper_robot, small_arm, true_robot
 
-from fg_calib import SolverError, assess, build_problem, read_job, solve
+from fg_calib import Job, Measurements, Noise, Options, SolverError, assess, build_problem, solve
 from fg_calib.assessment import solve_job
 from fg_calib.diagnostics import setup_check as mistakes
 from fg_calib.diagnostics.setup_check import EXPLAINED, FAR, REDUCTION, check_setup
@@ -103,10 +103,12 @@ ANGLES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("mistake", ANGLES)
 def test_other_angles_than_roll_pitch_yaw_are_named(tmp_path, mistake):
-    m = measured(ur5e(tmp_path))
+    robot = ur5e(tmp_path)
+    m, names = measured(robot), (*(f"q{i}" for i in range(1, 7)), "x", "y", "z", "roll", "pitch", "yaw")
     angles = ANGLES[mistake](Rotation.from_matrix(m.rotation.copy()))
-    job = read_job(write_job(tmp_path, m, angles=angles, model="pose"))
-    assert f"if {mistake}" in str(check_setup(job.robot, job.tables[0].measurements, "pose"))
+    columns = dict(zip(names, np.hstack([m.readings, m.position, angles]).T, strict=True))
+    table = Measurements.from_frame(columns, robot, noise=Noise(*SIGMA))
+    assert f"if {mistake}" in str(check_setup(robot, table, "pose"))
 
 
 def scaled(robot, unit, factor):
@@ -142,11 +144,12 @@ def test_a_solver_that_gives_up_names_the_mistake_too(tmp_path, monkeypatch):
     def gives_up(*_, **__):
         raise SolverError("no step can be solved")
 
-    m = measured(ur5e(tmp_path))
-    job = write_job(tmp_path, replace(m, position=m.position * 1e3), model="pose")
+    robot = ur5e(tmp_path)
+    m = measured(robot)
+    job = Job(None, robot, replace(m, position=m.position * 1e3), Options("pose"))
     monkeypatch.setattr(solver, "_fit", gives_up)
     with pytest.raises(SolverError, match=r"^no step can be solved; position .* if x, y, z are in mm, not m"):
-        solve_job(read_job(job))
+        solve_job(job)
 
 
 @pytest.mark.sampled(1)

@@ -1,5 +1,7 @@
 """Measurements from arrays: the same as from tables, and every mistake named with array and row."""
 
+from datetime import date
+
 import numpy as np
 import polars as pl
 import pytest
@@ -95,6 +97,8 @@ def test_a_frame_has_units_and_its_cells_are_named():
         ({}, "a frame without columns"),
         ({"q1": [1.0], "q2": [1.0, 2.0]}, "no table"),
         ({"q1": [1.0]}, "1 joint columns"),
+        ({"q1": [True, False], "q2": [0.0, 0.0]}, "q1: type Boolean, expected numbers$"),
+        ({"q1": [date(2024, 1, 1)] * 2, "q2": [0.0, 0.0]}, "q1: type Date, expected numbers$"),
     ):
         with pytest.raises(InputError, match=f"^frame: {message}"):
             Measurements.from_frame(wrong, ROBOT)

@@ -9,7 +9,7 @@ from exported import UR10
 from month import SIGMA, TOLERANCE, arm, calibrated, measured, placed, seen
 from oracle import central_differences
 from scipy import stats
-from simulated import pairs_between, plus, true_robot, with_changes
+from simulated import pairs_between, plus, specified, true_robot, with_changes
 from sparing import as_case
 
 from fg_calib import InputError, Measurements, Robot, Table, calibrate
@@ -146,8 +146,7 @@ def test_many_pairs_of_few_configurations_are_judged_without_a_suspect_each():
 def test_noise_that_is_larger_than_specified_is_no_drift(known, factor):
     calibration, true, _ = known
     rows = measured(true, 30, np.random.default_rng(6), sigma=(factor * SIGMA[0], factor * SIGMA[1]))
-    smaller = {name: getattr(rows, name) / factor for name in ("sigma_position", "sigma_orientation")}
-    found = calibration.check(replace(rows, **smaller))
+    found = calibration.check(specified(rows, 1.0 / factor))
     assert found.explanations == ()
     assert found.verdict == ("fail" if factor > 2 else "pass")
     assert any("noise" in line or "times as large" in line for line in (*found.reasons, *found.cautions))

@@ -1,11 +1,9 @@
 """Small motions that a convention has no parameter for: named, and errors only where they explain the misfit."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from jobs import UR5E, ur5e
-from simulated import measure, small_arm, true_robot, with_changes
+from simulated import measure, small_arm, specified, true_robot, with_changes
 
 from fg_calib import Robot, assess, build_problem, read_robot, solve
 from fg_calib.observability import missing_motions
@@ -79,7 +77,7 @@ def test_what_the_convention_lacks_is_an_error_only_where_it_explains_the_misfit
         true = true.with_values([0.0 if p.kind == "beta" else p.nominal for p in true.parameters])
     m = measure(true, 60, rng, sigma=SIGMA)
     if not tilted:
-        m = replace(m, sigma_position=m.sigma_position / 5, sigma_orientation=m.sigma_orientation / 5)
+        m = specified(m, 1 / 5)
     verdict = assess(solve(build_problem(ur5e(tmp_path, **DH), m, model=model))).verdict
     assert verdict.errors[0].startswith("reduced chi-square")
     assert (LACKS in verdict.errors, LACKS in verdict.notes) == (tilted, not tilted)

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from exported import matrix
 from oracle import tool_pose
 from refusals import refusal
 from scenarios import CAMERA, EXACT, GRID, INSTRUMENTS, SIGMA, WALL, scenario
@@ -32,9 +33,7 @@ def exact(which):
 
 def as_matrix(frame):
     """4x4 of a `Placement`."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = frame.rotation, frame.position
-    return T
+    return matrix(frame.rotation, frame.position)
 
 
 def names_of(labels):

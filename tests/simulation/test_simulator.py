@@ -9,7 +9,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from exported import TREE
+from exported import TREE, matrix
 from oracle import tool_poses
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
@@ -40,8 +40,7 @@ def simulation(shipped):
 def measured(simulation):
     """The true poses in the measurement frame by 4x4 products, and how the measured ones differ: position, rotation
     vector about the tool's axes."""
-    world_T_base = np.eye(4)
-    world_T_base[:3, :3], world_T_base[:3, 3] = simulation.frame.rotation, simulation.frame.position
+    world_T_base = matrix(simulation.frame.rotation, simulation.frame.position)
     T = world_T_base @ tool_poses(simulation.true_robot, simulation.true_readings)
     m = simulation.measurements
     turned = np.swapaxes(T[:, :3, :3], 1, 2) @ m.rotation

@@ -7,7 +7,7 @@ import pytest
 from oracle import central_differences
 from reported import format_report
 from scipy.stats import kstest
-from simulated import LARGE, measure, measure_drawn, pairs_between, plus, small_arm, true_robot
+from simulated import LARGE, measure, measure_drawn, pairs_between, plus, small_arm, specified, true_robot
 from touches import SIGMA, TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import Pairing, Table, assess, build_problem, calibrate, solve
@@ -71,8 +71,7 @@ def test_a_kind_with_too_little_left_keeps_its_specified_noise(monkeypatch):
     monkeypatch.setattr(noise, "LEAST_REDUNDANCY", 11.0)
     robot = small_arm(tolerance=LARGE)
     m = measure_drawn(robot, 16, seed=10, sigma=(1e-3, 5e-4))
-    twice = replace(m, sigma_position=2.0 * m.sigma_position, sigma_orientation=2.0 * m.sigma_orientation)
-    solution = estimate_noise(build_problem(robot, twice, model="distance-rotation"))
+    solution = estimate_noise(build_problem(robot, specified(m, 2.0), model="distance-rotation"))
     assert "distance" not in factors_of(solution)
     assert factors_of(solution)["angle"] != 1.0
     distance, angle = assess(solution).fit.goodness.kinds
@@ -84,8 +83,7 @@ def test_a_kind_with_too_little_left_keeps_its_specified_noise(monkeypatch):
 
 def test_kept_parameters_are_estimated_with_estimated_noise_too():
     robot = small_arm()
-    m = measure_drawn(robot, 40, seed=12)
-    m = replace(m, sigma_position=2 * m.sigma_position, sigma_orientation=2 * m.sigma_orientation)
+    m = specified(measure_drawn(robot, 40, seed=12), 2.0)
     solution = estimate_noise(build_problem(robot, m, model="pose", gauge="keep"))
     assert factors_of(solution) == pytest.approx({"orientation": 0.5, "position": 0.5}, rel=0.2)
     assert solution.problem.whole.state.factors == solution.problem.state.factors

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from scipy.stats import chi2
-from simulated import measure, small_arm, true_robot
+from simulated import measure_drawn, small_arm
 
 from fg_calib import assess, build_problem, solve
 from fg_calib.graph import prior_rows, square_root, unknown_prior_rows
@@ -15,17 +15,10 @@ SPECIFIED = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
 TRUE = {"a": 3e-3, "d": 3e-4, "alpha": 8e-3, "theta": 1e-3}
 
 
-def drawn_problem(model="pose", n=12, seed=0, n_test=0, **choices):
-    """A problem of an arm whose errors are other than specified, and its true robot."""
-    rng = np.random.default_rng(seed)
-    true = true_robot(small_arm(tolerance=TRUE), rng)
-    m = measure(true, n, rng, sigma=(1e-4, 1e-4), n_test=n_test)
-    return build_problem(small_arm(tolerance=SPECIFIED), m, model=model, **choices), true
-
-
 def test_a_correction_varies_by_what_the_data_take_off_its_prior_variance():
     """Prior T and posterior s: the correction over T has the variance 1 - (s / T)^2."""
-    problem, _ = drawn_problem("pose", n=4)
+    m = measure_drawn(small_arm(tolerance=TRUE), 4, seed=0, sigma=(1e-4, 1e-4))
+    problem = build_problem(small_arm(tolerance=SPECIFIED), m, model="pose")
     found = assess(solve(problem))
     by_name = {p.name: p for p in found.estimates.parameters}
     priors = found.fit.priors

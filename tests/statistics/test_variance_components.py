@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 from dense import dense
-from simulated import measure, pairs_between, small_arm, true_robot
+from simulated import measure, pairs_between, small_arm, specified, true_robot
 from touches import TOLERANCE, TOOL_POINT, corners, touch
 
 from fg_calib import Measurements, Pairing, Table, assess, build_problem, solve
@@ -18,32 +18,16 @@ from fg_calib.statistics.variance_components import NoiseComponents, estimate_no
 SIGMA, SIGMA_JOINT = (1e-3, 5e-4), 1e-3
 
 
-def specified(m, own, joint):
-    """Measurements whose noise is specified so many times as large as it is."""
-    changes = {name: getattr(m, name) for name in ("sigma_position", "sigma_orientation")}
-    changes = {name: own * sigma for name, sigma in changes.items() if sigma is not None}
-    changes["sigmas"] = {name: own * sigma for name, sigma in m.sigmas.items()}
-    if m.pairs is not None:
-        changes["pairs"] = replace(m.pairs, sigma_distance=own * m.pairs.sigma_distance)
-    if m.groups is not None:
-        pairs = m.groups.pairs
-        changes["groups"] = replace(m.groups, pairs=replace(pairs, sigma_distance=own * pairs.sigma_distance))
-    return replace(m, sigma_joint=joint * m.sigma_joint, **changes)
-
-
 def tracker_and_bar(true, rng, n=30):
     """Positions, and lengths between the same configurations measured directly: their joint noise is the same."""
     q = rng.uniform(-np.pi, np.pi, (n, true.n_joints))
     stood = q + SIGMA_JOINT * rng.normal(size=q.shape)
     ends = np.tile(np.arange(n), 2), np.concatenate([np.roll(np.arange(n), 1), np.roll(np.arange(n), 3)])
     pairs = pairs_between(true, stood, ends, rng, sigma=(5e-4, 0.0))
-    same = {"readings": q, "ids": np.arange(n).astype(str), "test": np.zeros(n, dtype=bool), "named": True}
-    same |= {"rotation": None, "sigma_orientation": None, "sigma_joint": np.full(true.n_joints, SIGMA_JOINT)}
-    p = pose(true, stood).position + SIGMA[0] * rng.normal(size=(n, 3))
-    return (
-        Measurements(position=p, sigma_position=np.full((n, 3), SIGMA[0]), source="tracker.csv", **same),
-        Measurements(position=None, sigma_position=None, pairs=pairs, source="bar.csv", **same),
-    )
+    p, same = pose(true, stood).position, {"ids": range(n), "sigma_joint": SIGMA_JOINT}
+    p = p + SIGMA[0] * rng.normal(size=(n, 3))
+    tracker = Measurements.from_arrays(q, position=p, sigma_position=SIGMA[0], source="tracker.csv", **same)
+    return tracker, replace(Measurements.from_arrays(q, source="bar.csv", **same), pairs=pairs)
 
 
 def touched(true, rng):
