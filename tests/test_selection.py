@@ -239,7 +239,8 @@ def test_joints_that_rise_under_load_are_named(value, prior, severity):
     arm = with_prior(arm_with(Compliance(MASSES, [2, 3])), prior, "compliance")
     true = arm.with_values([value if p.kind == "compliance" else p.nominal for p in arm.parameters])
     found = getattr(calibrate(arm, measured(true, 1), model="position").assessment.verdict, severity)
-    assert found[0].startswith("joints rise under load (compliance in sigma: theta2.compliance -")
+    text = "joints rise under load (compliance in sigma: theta2.compliance -"
+    assert any(one.startswith(text) for one in found)
 
 
 def test_a_robust_loss_does_not_take_for_outliers_what_an_effect_explains():

@@ -9,13 +9,8 @@ with r the residuals of the model's fit, J its columns, those of the priors too,
 m its rank and n the residuals that noise can make differ freely. It has an F distribution whatever the size of the
 noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k.
 
-*Lack of fit* adds effects of `robot.effects` that the model lacks, stage by stage; the statistics of the stages are
-independent:
-
-1. compliance of joints that turn: gravity along z of the base, masses at the tool and on every link after the joint;
-2. every small motion of every link, harmonics of one and two periods a turn (eccentric encoders and gears), gains of
-   joints that slide: a constant load of these is their zero;
-3. the same masses of an arm that is mounted otherwise, gravity along x and y.
+*Lack of fit* adds effects that the model lacks, stage by stage (see `lacking_effects`); the statistics of the stages
+are independent.
 
 A *change point* is a small motion of tool or base from one row of a table on, for every row tried. Other effects
 explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all links.
@@ -28,6 +23,7 @@ large, and priors too wide, would make the ratio F too large, so both are made a
 MacKay's fixed point, with tr L S^-1 L^T the number of coefficients that the rows determine (see `error_states`).
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -38,13 +34,12 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.sparse import csr_array
 
-from fg_calib.graph import Problem, SchurComplement, Solution, State, Variables, WhitenedBlock, subsampled
-from fg_calib.graph.variables import build_variables, prior_rows, unknown_prior_rows
-from fg_calib.inputs import Booleans, Floats, Integers, Record
-from fg_calib.measurements import residuals
+from fg_calib.diagnostics.lacking_effects import LINK, STAGES, causes_of, widened
+from fg_calib.graph import Problem, SchurComplement, Solution, subsampled
+from fg_calib.graph.variables import prior_rows, unknown_prior_rows
+from fg_calib.inputs import Booleans, Floats, Record
 from fg_calib.observability import MissingMotion
-from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Effect, Element, Parameter, Robot
-from fg_calib.robot.effects import Compliance, Gain, Harmonics, Mass
+from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS
 
 MAX_ROWS = 10_000
 """Rows by which residuals are tested: more would take long, and are not needed."""
@@ -70,18 +65,8 @@ _RANK = 1e-8
 _NOTHING = 1e-10
 """Size of a column over the largest below which it is rounding errors."""
 
-LINK, OFFSET = "2 small motion of link ", "offset "
-"""How names of columns that a model does not have begin: see `regress`."""
-
-_STAGES = ("1 ", "2 ", "3 ")
-"""How names of the columns of each stage begin."""
-
-_WORDS = {
-    "1 gravity": "yields to gravity",
-    "2 position": "errs with its position (gear, encoder)",
-    "3 side load": "yields to loads along x and y of the base (is gravity there? key `gravity`)",
-}
-"""Effects of single joints, by how the names of their columns begin, before the number of the joint."""
+OFFSET = "offset "
+"""How names of the columns of offsets begin, before the number of the table."""
 
 LIKE_NOISE = 1e-4
 """P-value below which residuals are systematic."""
@@ -195,7 +180,7 @@ class Regression(Record):
     """The fit of a solution, linearised, and columns that it does not have.
 
     These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of
-    tables that were not estimated (`OFFSET`, the number of the table), and effects of joints (see `_WORDS`).
+    tables that were not estimated (`OFFSET`, the number of the table), and effects (see `lacking_effects`).
 
     Attributes:
         problem: The problem of the rows, which count as their noise says: at most `MAX_ROWS`, evenly drawn.
@@ -214,9 +199,18 @@ class Regression(Record):
     @cached_property
     def fit_with_noise(self) -> LinearFit:
         """The fit with the noise that one with all columns leaves, at most that specified."""
-        with_all = self.fit.test(self.named(""))[2]
-        variance = 1.0 if with_all is self.fit else float(with_all.r @ with_all.r) / with_all.dof
-        return replace(self.fit, variance=min(variance, 1.0))
+        variances = [float(after.r @ after.r) / after.dof for _, after in self.staged(self.fit)]
+        return replace(self.fit, variance=min([1.0, *variances[-1:]]))
+
+    def staged(self, fit: LinearFit) -> Iterator[tuple[float, LinearFit]]:
+        """The p-value of each stage next to those before it, and the fit with all of these.
+
+        Stages that add nothing, or leave too few degrees of freedom, are left out.
+        """
+        for stage in STAGES:
+            p, _, after = fit.test(self.named(stage))
+            if after is not fit:
+                yield p, (fit := after)
 
     def named(self, *begin: str, rows: Booleans | None = None) -> Floats:
         """The whitened columns whose names begin so, zero but in some rows if these are given, shape (n, k)."""
@@ -238,21 +232,18 @@ def find_systematic(regression: Regression) -> Systematic | None:
     problem, whole = regression.problem, regression.fit
     if problem.rows.counted_as_private or whole.dof < 2 * LEAST_LEFT:
         return None
-    clipped = fit = whole.clipped()
-    least, n = 1.0, 0
-    for stage in _STAGES:
-        p, _, after = fit.test(regression.named(stage))
-        if after is not fit:
-            least, n, fit = min(least, p), n + 1, after
-    if not n:
+    clipped = whole.clipped()
+    stages = list(regression.staged(clipped))
+    if not stages:
         return None
-    if (p := of_several(least, n)) >= LIKE_NOISE:
+    if (p := of_several(min(p for p, _ in stages), len(stages))) >= LIKE_NOISE:
         return Systematic(p)
-    best, cause, gain = clipped, "", clipped.information - fit.information
-    for words, name in _causes(problem.robot).items():
+    best, cause = clipped, ""
+    for words, name in causes_of(problem.robot).items():
         after = clipped.test(regression.named(name))[2]
         if after.information < best.information:
             best, cause = after, words
+    gain = clipped.information - min(fit.information for _, fit in stages)
     others = " and others" * (clipped.information - best.information < 0.5 * gain)
     return Systematic(p, cause and cause + others, _regional_variance(problem, whole))
 
@@ -279,15 +270,6 @@ def _regional_variance(problem: Problem, fit: LinearFit) -> float:
             seen = (h > LEAST_SHARE) & (h < 1.0 - LEAST_SHARE)
             squares += ((U.T @ (Q.T @ fit.r[rows]))[seen] ** 2 / (h * (1.0 - h))[seen]).tolist()
     return float(np.mean(squares)) if squares else 1.0
-
-
-def _causes(robot: Robot) -> dict[str, str]:
-    """How the names of the columns of each single effect begin, by what it is in words."""
-    found = {f"{joint.name} {_WORDS[e]}": f"{e} {k}," for k, joint in enumerate(robot.joints) for e in _WORDS}
-    for link in range(robot.n_joints + 1):
-        where = {0: "the base", robot.n_joints: "the tool"}.get(link, f"the link after {robot.joints[link - 1].name}")
-        found[f"{where} has an error that no estimated parameter describes"] = f"{LINK}{link}."
-    return found
 
 
 def find_change(regression: Regression) -> Change | None:
@@ -356,16 +338,14 @@ def regress(solution: Solution) -> Regression:
     if problem.state.weights is not None or problem.n_residuals > MAX_ROWS:
         problem = subsampled(problem, min(1.0, MAX_ROWS / problem.n_residuals), parameters)
     rows, at, offsets = problem.rows, problem.variables.at(parameters), _offsets(problem)
-    variables, values = with_link_motions(problem, parameters)
+    variables, values, trigs = widened(problem, parameters)
     plain, n_core, n_curves = at.without_curves(), variables.n_columns, problem.variables.n_curves
     columns = np.where(plain.columns >= 0, plain.columns + n_core - plain.n_columns, -1)
     columns[list(offsets)] = n_core + plain.n_nuisance + np.arange(len(offsets))
     wide = replace(plain, chains=variables.at(values).chains, n_columns=n_core, columns=columns)
     wide = replace(wide, n_nuisance=plain.n_nuisance + len(offsets))
-    names = _lacking(problem.robot, problem.data.readings[:1])[0]
-    of_joints = [_of_joints(problem, part, at, len(names)) for part in rows.parts]
-    private = np.hstack([np.concatenate(of_joints), rows.private(wide)])
-    all_names = [*names, *(name if name.startswith(LINK) else "" for name in variables.names)]
+    private, known = rows.with_readings(trigs).private(wide), np.isin(variables.names, problem.variables.names)
+    all_names = np.where(known, "", variables.names).tolist()
     all_names += [""] * plain.n_nuisance + [f"{OFFSET}{table}," for table in offsets.values()]
     more, J, r = np.array(all_names) != "", private[:, :-1], private[:, -1]
     if solution.problem.state.weights is not None:
@@ -378,8 +358,7 @@ def regress(solution: Solution) -> Regression:
     own = states.whiten(own) / scale
     r_prior, J_prior = prior_rows(variables, values)
     r_unknown, J_unknown = (each[n_curves:] for each in unknown_prior_rows(problem.variables, parameters))
-    J_prior = J_prior[:, [not name.startswith(LINK) for name in variables.names]]
-    J_prior = np.pad(J_prior, ((0, 0), (0, plain.n_nuisance)))
+    J_prior = np.pad(J_prior[:, known], ((0, 0), (0, plain.n_nuisance)))
     J_unknown = np.delete(J_unknown, np.s_[at.n_columns : at.n_columns + n_curves], axis=1)
     basis = basis_of(np.concatenate([own[:, :-1], J_prior, J_unknown]))
     r, ones = np.concatenate([own[:, -1], r_prior, r_unknown]), np.ones(len(r_prior) + len(r_unknown))
@@ -425,60 +404,6 @@ def _eliminate(
     root = V * np.sqrt(kept)
     free = 1.0 - np.concatenate([np.sum(np.asarray(L @ (factor / scale * root)) ** 2, axis=1), np.sum(root**2, axis=1)])
     return SchurComplement(csr_array(scipy.sparse.hstack([shared.loadings, loadings * (factor / scale)]))), free, scale
-
-
-def with_link_motions(problem: Problem, at: Floats) -> tuple[Variables, Floats]:
-    """The core's variables at a parameter vector with the links' small motions too, and their parameter vector.
-
-    Six columns are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as there
-    are joints.
-    """
-    robot = problem.robot
-    elements, parameters, n = list(robot.elements), list(robot.parameters), len(robot.parameters)
-    for owner in range(robot.n_joints, -1, -1):
-        place = robot.end_of(owner)
-        for kind in FRAME_KINDS:
-            elements.insert(place, Element(PARAMETER_KINDS[kind].axis, parameter=len(parameters)))
-            parameters.append(Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0))
-    wide = replace(robot, elements=tuple(elements), parameters=tuple(parameters))
-    unknown = [table.unknown_frame for table in problem.data.tables]
-    values = np.concatenate([at[:n], np.zeros(len(parameters) - n), at[problem.variables.frame_span]])
-    return build_variables(wide, unknown, problem.variables.priors), values
-
-
-def _of_joints(problem: Problem, part: WhitenedBlock, at: State, m: int) -> Floats:
-    """Derivatives of a block in the m effects of joints that the robot lacks, before errors are shared: (n_rows, m)."""
-    J = residuals.linearise(part.at(at), at.chains[part.table].without_columns().with_turn_columns())[1]
-    readings, n, moved = problem.data.tables[part.table].measurements.readings, problem.robot.n_joints, np.zeros(m)
-    for k, rows in enumerate(part.block.ends.T):
-        _, joints, values = _lacking(problem.robot, readings[rows])
-        moved = moved + J[:, :, k * n + joints] * values[:, None]
-    return np.broadcast_to(moved, (*J.shape[:2], m)).reshape(part.n_rows, m)
-
-
-def _lacking(robot: Robot, readings: Floats) -> tuple[list[str], Integers, Floats]:
-    """Terms of effects of single joints that a robot lacks: their names, their joints, and their values.
-
-    It has the loads in a direction at joints that are compliant under a gravity that is not across it. An error curve
-    holds harmonics and gain of its joint.
-    """
-    arm, n, names, joints, values = robot.geometry, robot.n_joints, list[str](), list[int](), list[Floats]()
-    slides, has = [k for k, joint in enumerate(robot.joints, 1) if joint.prismatic], {p.name for p in robot.parameters}
-    loads = ([Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, max(n, 2))]) if len(slides) < n else ()
-    compliant = [(e.terms(arm), e.gravity) for e in robot.effects if isinstance(e, Compliance)]
-    loaded = [{t.owner for terms, g in compliant for t in terms if g == "estimate" or g[k]} for k in range(3)]
-    candidates: list[tuple[str, Effect, set[int]]] = [("2 position", Gain(slides), set())] * bool(slides)
-    candidates += [("2 position", Harmonics(), set())] * bool(loads)
-    for name, g, owners in zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), loaded, strict=True):
-        candidates += [(name, Compliance(masses, gravity=g), owners) for masses in loads]
-    for name, effect, owners in candidates:
-        terms, own = effect.terms(arm), set() if name != "2 position" else has
-        keys = [(t.name, f"{t.name.rpartition('.')[0]}.curve[0]") for t in terms]
-        new = [k for k, t in enumerate(terms) if t.owner not in owners and own.isdisjoint(keys[k])]
-        names += [f"{name} {terms[k].owner - 1}," for k in new]
-        joints += [terms[k].owner - 1 for k in new]
-        values.append(effect.values(arm, readings, {}, np.zeros(len(terms)))[:, new, 0])
-    return names, np.array(joints, dtype=np.int64), np.hstack(values)
 
 
 def basis_of(columns: Floats, fitted: Floats | None = None, least: float = 0.0) -> Floats:

@@ -84,14 +84,9 @@ def _prefix(robot: Robot, joint: int) -> str:
     return f"{own}{joint + 1}" if robot.convention in CONVENTIONS else robot.joints[joint].name
 
 
-def _moving(robot: Robot, joint: int) -> tuple[int, Element]:
-    """Index of the element that a joint's reading moves, and the element."""
-    return next((i, e) for i, e in enumerate(robot.elements) if e.joint == joint and e.basis is None)
-
-
 def _own(robot: Robot, joint: int, kind: str, sigma: float, slope: int | None = None) -> Term:
     """A term that turns a joint about its own axis."""
-    place, e = _moving(robot, joint)
+    place, e = robot.moving[joint]
     of = joint if slope is None else slope
     return Term(f"{_prefix(robot, joint)}.{kind}", sigma, joint + 1, place, e.axis, e.sign, of)
 
@@ -239,7 +234,7 @@ class _Moments:
     ) -> None:
         self.robot, self.readings, self._cross = robot, readings, np.cross(np.eye(3), -gravity)
         ends = [robot.end_of(m.link) for m in masses]
-        of_joints = (_moving(robot, j)[0] + k for j in range(robot.n_joints) for k in (0, 1))
+        of_joints = (robot.moving[j][0] + k for j in range(robot.n_joints) for k in (0, 1))
         self._frames = _frames(robot, readings, {robot.end_of(0), *ends, *of_joints})
         frames = zip(masses, map(self._frames.__getitem__, ends), strict=True)
         at = [p + sum(x * axis for x, axis in zip(m.at(context).T, axes, strict=True)) for m, (axes, p) in frames]
@@ -257,7 +252,7 @@ class _Moments:
 
         Along the axis of a slide it is that of a unit mass, in proportion to the reading.
         """
-        i, e = _moving(self.robot, joint)
+        i, e = self.robot.moving[joint]
         u = self._frames[i + 1][0][axis] * (self.readings[:, joint] if axis == e.axis else 1.0)
         return self._along(self._frames[place][0][2:], u)
 
@@ -276,6 +271,8 @@ def _frames(robot: Robot, readings: Floats, wanted: Collection[int]) -> dict[int
             found[i] = axes.copy(), p
         reading = 0.0 if e.joint is None else readings[:, e.joint]
         value = e.constant + e.sign * (reading + (0.0 if e.parameter is None else nominal[e.parameter]))
+        if e.joint is None and not value:
+            continue
         if e.axis < Axis.RX:
             p = p + value * axes[e.axis]
         else:
@@ -345,7 +342,7 @@ class Compliance(_Loaded, Record):
     def _loads(self, robot: Robot, joint: int) -> list[tuple[int, int]]:
         """Free first moments that turn a joint: number of the link from 1, and axis; none of known masses."""
         links = [] if self.masses is not None else range(joint, robot.n_joints)
-        slides = [(i + 1, int(_moving(robot, i)[1].axis)) for i in links if i > joint and robot.joints[i].prismatic]
+        slides = [(i + 1, int(robot.moving[i][1].axis)) for i in links if i > joint and robot.joints[i].prismatic]
         return [(i + 1, axis) for i in links for axis in (0, 1)] + [one for one in slides if one[1] == Axis.TZ]
 
     def terms(self, robot: Robot) -> list[Term]:
@@ -356,7 +353,7 @@ class Compliance(_Loaded, Record):
         terms = [_own(robot, i, "compliance", 1e-4, -1) for i in joints]
         for i, axis in [(i, axis) for i in joints for axis in (Axis.RX, Axis.RY) if self.lateral]:
             name = f"{_prefix(robot, i)}.compliance_{'xy'[axis - Axis.RX]}"
-            terms.append(Term(name, 1e-4, i + 1, _moving(robot, i)[0] - 1, axis))
+            terms.append(Term(name, 1e-4, i + 1, robot.moving[i][0] - 1, axis))
         if self.gravity == "estimate":
             names = ("base.tilt_x", "base.tilt_y", "")
             terms += [t._replace(name=name, sigma=2e-2, owner=0) for t in terms for name in names]
@@ -388,7 +385,7 @@ class Compliance(_Loaded, Record):
         parts = [self._torques(robot, readings, context, joints, gravity)]
         if self.lateral and self.masses is not None:
             moments = _Moments(robot, readings, context, gravity, self.masses)
-            parts += [moments.of_masses(_moving(robot, i)[0], slice(2)) for i in joints]
+            parts += [moments.of_masses(robot.moving[i][0], slice(2)) for i in joints]
         return np.hstack(parts)
 
     def _torques(
@@ -397,7 +394,7 @@ class Compliance(_Loaded, Record):
         """Torque in each joint's own sense, of each load, shape (n, n_own), [N m] or [m/s^2]."""
         moments, columns = _Moments(robot, readings, context, gravity, self.masses or ()), list[Floats]()
         for i in joints:
-            place, e = _moving(robot, i)
+            place, e = robot.moving[i]
             each = [moments.of_unit(place, link - 1, axis) for link, axis in self._loads(robot, i)]
             each = each or [moments.of_masses(place, slice(2, 3))]
             columns += [e.sign * m for m in each]
@@ -423,6 +420,14 @@ class Bending(_Loaded, Record):
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         moments = _Moments(robot, readings, context, np.array(self.gravity), self.masses)
         return _with_slopes(moments.of_masses(robot.end_of(0), slice(2)))
+
+
+def last_moves(readings: Floats) -> Floats:
+    """Sign of each joint's last move before each row, 0 before the first, shape (n, n_joints)."""
+    sides = np.zeros(readings.shape)
+    for k, move in enumerate(np.diff(readings, axis=0)):
+        sides[k + 1] = np.where(np.abs(move) < LEAST_MOVE, sides[k], np.sign(move))
+    return sides
 
 
 class Backlash(_Loaded, Record):
@@ -470,12 +475,7 @@ class Backlash(_Loaded, Record):
             sides = np.full((len(given), robot.n_joints), np.nan)
             sides[:, joints] = given
             return {self.side: sides}
-        if readings is None:
-            return {}
-        sides, moves = np.zeros(readings.shape), np.diff(readings, axis=0)
-        for k, move in enumerate(moves):
-            sides[k + 1] = np.where(np.abs(move) < LEAST_MOVE, sides[k], np.sign(move))
-        return {self.side: sides}
+        return {} if readings is None else {self.side: last_moves(readings)}
 
 
 class Coupling(Effect, Record):

@@ -420,6 +420,12 @@ class Robot(inputs.Record):
         return replace(self, elements=elements, parameters=parameters, effects=())
 
     @cached_property
+    def moving(self) -> list[tuple[int, Element]]:
+        """Index of the element that each joint's reading moves, and the element."""
+        places = {e.joint: i for i, e in enumerate(self.elements) if e.joint is not None and e.basis is None}
+        return [(places[j], self.elements[places[j]]) for j in range(self.n_joints)]
+
+    @cached_property
     def terms(self) -> tuple[tuple[Term, ...], ...]:
         """The terms that are elements, effect by effect."""
         return tuple(tuple(t for t in e.terms(self.geometry) if t.after is not None) for e in self.effects)

@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from reported import format_report
+from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
 from simulated import measure, measure_points, plus, small_arm, true_robot
 from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
 from touches import corners, touch
 
-from fg_calib import Table, assess, build_problem, calibrate, solve
+from fg_calib import Measurements, Table, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics import LIKE_NOISE, basis_of
-from fg_calib.diagnostics.unmodelled_effects import LINK, find_change, find_systematic, forgotten_offsets, regress
+from fg_calib.diagnostics.lacking_effects import LINK
+from fg_calib.diagnostics.unmodelled_effects import find_change, find_systematic, forgotten_offsets, regress
 from fg_calib.graph import prior_rows, unknown_prior_rows
-from fg_calib.robot import Compliance, ErrorCurve, Harmonics, Mass, Robot, pose
+from fg_calib.robot import Robot, build_chain, forward, pose
+from fg_calib.robot.effects import Backlash, Bending, Compliance, Coupling, ErrorCurve, Harmonics, Mass
 from fg_calib.statistics import estimate_noise, spread_of
 
 
@@ -88,17 +91,51 @@ def test_p_values_of_noise_are_uniform_with_error_curves_even_where_their_prior_
 def test_a_missing_harmonic_is_named_next_to_modelled_compliance():
     found = find_systematic(regress(with_curves(np.random.default_rng(1), harmonic=3e-4)))
     assert found.p_value < 1e-6
-    assert found.cause == "j2 errs with its position (gear, encoder)"
+    assert found.cause == "j2 errs with its position (gear, encoder: `error_curve`)"
 
 
 def test_what_a_robot_has_is_no_candidate():
     names = {name for name in regress(with_curves(np.random.default_rng(1))).names.tolist() if LINK not in name}
-    assert {name[:-3] for name in names} == {"2 position", "3 side load"}
-    assert {name for name in names if name.startswith("2")} == {"2 position 2,"}  # the gain of the joint that slides
+    shared = {"3 side load", "4 bending", "4 tilt", "6 backlash", "6 coupling", "7 masses"}
+    assert {name.rpartition(" ")[0] for name in names} == {"2 position", *shared}
+    assert [name for name in names if name.startswith("2")] == ["2 position 3.gain0_0"]  # of the joint that slides
     hung = regress(with_curves(np.random.default_rng(1), gravity=(9.81, 0.0, 0.0))).names.tolist()
-    assert sum(name.startswith("3 side load") for name in hung) == 2 * 3  # along y alone, of joints that turn
-    assert sum(name.startswith("1 gravity") for name in hung) == 2 * 3
-    assert not any("load" in name for name in regress(with_curves(np.random.default_rng(1), gravity="estimate")).names)
+    assert sum(name.startswith("3 side load") for name in hung) == 3  # along y alone, of joints that turn
+    assert sum(name.startswith("1 gravity") for name in hung) == 3
+    tilted = regress(with_curves(np.random.default_rng(1), gravity="estimate")).names.tolist()
+    assert not any("side load" in name for name in tilted)
+
+
+WRONG = [Mass(4, 10.0, (-0.1, 0.2, 0.1)), Mass(2, 5.0)]
+
+
+@pytest.mark.parametrize(
+    ("effect", "name", "size", "cause"),
+    [
+        (Compliance(MASSES), "theta2.compliance", 2e-5, "j2 yields to gravity"),
+        (Compliance(MASSES, gravity=(0.0, 9.81, 0.0)), "theta2.compliance", 2e-5, "j2 yields to loads along x and y"),
+        (Compliance(MASSES, lateral=True), "theta2.compliance_x", 2e-5, "j2 tilts under gravity"),
+        (Bending(MASSES), "base.bending", 1e-5, "the base gives way"),
+        (Harmonics((5,)), "theta1.sin5", 5e-4, "j1 errs several times a turn"),
+        (Backlash(), "theta1.backlash", 2e-4, "j1 errs with the direction of its last move"),
+        (Coupling([(1, 2)]), "theta2.coupling1", 1e-3, "j2 turns with a joint near it"),
+        (Compliance(MASSES), "theta2.compliance", 1e-4, "j2 bears another load"),
+    ],
+)
+@pytest.mark.parametrize("model", ["position", "pose"])
+def test_each_effect_that_is_missing_is_named(effect, name, size, cause, model):
+    robot, rng = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}), np.random.default_rng(1)
+    full = robot.with_effects(effect)
+    true = full.with_values(full.nominal + size * np.array([p.name == name for p in full.parameters]))
+    q = rng.uniform(-2.5, 2.5, (100, 4)) * [1.0, 1.0, 0.2, 1.0]
+    at = forward(build_chain(true), true.trig(q, {"moves": np.sign(np.diff(q, axis=0, prepend=q[:1]))}))
+    position = at.position + 1e-4 * rng.normal(size=(100, 3))
+    rotation = (Rotation.from_matrix(at.rotation) * Rotation.from_rotvec(2e-4 * rng.normal(size=(100, 3)))).as_matrix()
+    m = Measurements.from_arrays(q, position=position, rotation=rotation, sigma_position=1e-4, sigma_orientation=2e-4)
+    fitted = robot.with_effects(Compliance(WRONG)) if "another" in cause else robot
+    found = find_systematic(regress(solve(build_problem(fitted, m, model=model))))
+    assert found.p_value < 1e-6
+    assert found.cause.startswith(cause)
 
 
 def test_curves_are_eliminated_as_dense_columns_with_their_priors_would_be():
@@ -133,7 +170,7 @@ def test_what_residuals_follow_is_said_first_and_a_loss_that_takes_it_for_outlie
     sag = of_joint(1, lambda *at: 10.0 * gravity(*at))
     robot, m = measured("6R", np.random.default_rng(1), effect=sag, n=60, n_test=60)
     errors = calibrate(robot, m, model="position", frame="unknown", loss=loss).assessment.verdict.errors
-    assert errors[0].startswith("systematic residuals: q2 yields to gravity (p = ")
+    assert errors[0].startswith("systematic residuals: q2 yields to gravity (`compliance`) (p = ")
     assert not any("loss: gnc" in text or ", or outliers" in text for text in errors)
     assert any(text.startswith("least squares predicts the test rows better") for text in errors) == (loss == "gnc")
 
@@ -143,7 +180,9 @@ def test_an_effect_that_noise_estimated_far_above_the_specified_would_hide_is_an
     robot, m = measured("6R", np.random.default_rng(1), effect=of_joint(1, lambda *at: size * gravity(*at)), n=60)
     found = calibrate(robot, m, model="position", frame="unknown", estimate_noise=True).assessment.verdict
     assert (bool(found.errors), "times that specified" in " ".join(found.warnings)) == (error, True)
-    assert (found.errors or found.warnings)[0].startswith("systematic residuals: q2 yields to gravity (p = ")
+    assert (found.errors or found.warnings)[0].startswith(
+        "systematic residuals: q2 yields to gravity (`compliance`) (p = "
+    )
 
 
 def test_an_effect_is_seen_among_outliers_that_a_loss_rejects():

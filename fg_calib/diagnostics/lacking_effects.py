@@ -1,0 +1,150 @@
+"""The effects that a robot lacks, and small motions of its links, as columns of a wider robot.
+
+A test of residuals adds them stage by stage (see `unmodelled_effects`):
+
+1. compliance of joints that turn: gravity along z of the base, masses of the model or else at the tool and on links;
+2. every small motion of every link, harmonics of one and two periods a turn (eccentric encoders and gears), gains of
+   joints that slide: a constant load of these is their zero;
+3. the same masses of an arm that is mounted otherwise, gravity along x and y;
+4. joints that tilt, and a base that gives way, under these masses;
+5. harmonics of three to eight periods a turn;
+6. backlash by the last move in the order of rows, and joints that turn with a neighbour;
+7. other masses than those of the model: free first moments.
+
+The name of a column begins with its stage and what it is, then has the number of its joint: `4 tilt 2.compliance5_7`.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fg_calib.graph import Problem, Variables
+from fg_calib.graph.variables import build_variables
+from fg_calib.inputs import Floats, Record
+from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Effect, Element, Parameter, Robot
+from fg_calib.robot.effects import GRAVITY, Backlash, Bending, Compliance, Coupling, Gain, Harmonics, Mass, last_moves
+from fg_calib.robot.model import Context, Term, kind_of
+
+STAGES = tuple(f"{k} " for k in range(1, 8))
+"""How names of the columns of each stage begin."""
+
+LINK = "2 small motion of link "
+"""How those of small motions of links begin, before the number of the joint that moves the link."""
+
+_WORDS = {
+    "1 gravity": "yields to gravity (`compliance`)",
+    "2 position": "errs with its position (gear, encoder: `error_curve`)",
+    "3 side load": "yields to loads along x and y of the base (is gravity there? key `gravity`)",
+    "4 tilt": "tilts under gravity (`compliance: lateral`)",
+    "5 position": "errs several times a turn (gear, encoder: `error_curve`)",
+    "6 backlash": "errs with the direction of its last move (`backlash`)",
+    "6 coupling": "turns with a joint near it (`coupling`)",
+    "7 masses": "bears another load than its masses make (`masses`)",
+}
+"""Effects of single joints, by how the names of their columns begin, before the number of the joint."""
+
+_BENDING = "4 bending"
+"""The same of the base."""
+
+
+class LackingEffect(Effect, Record):
+    """Terms of an effect that a robot lacks, by names of their own.
+
+    Attributes:
+        number: Its number among others.
+        name: How they begin, before the number of the joint: see `_WORDS`.
+        effect: The effect.
+        n_terms: How many terms it has.
+        which: Numbers of those that the robot lacks.
+    """
+
+    number: int
+    name: str
+    effect: Effect
+    n_terms: int
+    which: tuple[int, ...]
+
+    def terms(self, robot: Robot) -> list[Term]:
+        every = self.effect.terms(robot)
+        first, owners = [t.name for t in every], [t.owner for t in every]
+        kinds = [f"{kind_of(name)}{self.number}_{first.index(name)}" for name in first]
+        return [every[k]._replace(name=f"{self.name} {owners[k]}.{kinds[k]}") for k in self.which]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        return self.effect.values(robot, readings, context, np.zeros(self.n_terms))[:, self.which]
+
+
+def lacking_effects(robot: Robot) -> list[LackingEffect]:
+    """Effects that a robot lacks.
+
+    It has the loads in a direction at joints that are compliant under a gravity that is not across it. An error curve
+    holds harmonics and gain of its joint.
+    """
+    arm, n, has = robot.geometry, robot.n_joints, {p.name for p in robot.parameters}
+    slides = [k for k, joint in enumerate(robot.joints, 1) if joint.prismatic]
+    own = [e for e in robot.effects if isinstance(e, Compliance)]
+    compliant = [(e.terms(arm), e.gravity) for e in own]
+    masses = [e.masses for e in own if e.masses] or [[Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, max(n, 2))]]
+    down = next((e.gravity for e in own if e.gravity != "estimate"), GRAVITY)
+    pairs = [(i, j) for i in range(1, n + 1) for j in range(max(i - 2, 1), min(i + 2, n) + 1) if i != j]
+    candidates: list[tuple[str, Effect]] = [("2 position", Gain(slides))] * bool(slides)
+    candidates += [("6 coupling", Coupling(pairs))] if pairs else []
+    if len(slides) < n:
+        candidates += [("2 position", Harmonics()), ("5 position", Harmonics(range(3, 9))), ("6 backlash", Backlash())]
+        for some in masses:
+            sides = zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), strict=True)
+            candidates += [(name, Compliance(some, gravity=g)) for name, g in sides]
+            candidates += [("4 tilt", Compliance(some, lateral=True, gravity=down)), (_BENDING, Bending(some, down))]
+        candidates += [("7 masses", Compliance(None, e.joints, gravity=down)) for e in own if e.masses]
+    found = list[LackingEffect]()
+    for number, (name, effect) in enumerate(candidates):
+        terms = effect.terms(arm)
+        new = [k for k, t in enumerate(terms) if t.name not in has]
+        if "position" in name:
+            new = [k for k in new if f"{terms[k].name.rpartition('.')[0]}.curve[0]" not in has]
+        elif name == "4 tilt":
+            new = [k for k in new if not terms[k].name.endswith(".compliance")]
+        elif isinstance(effect, Compliance) and effect.masses:
+            axis = int(np.argmax(effect.gravity))
+            loaded = {t.owner for terms, g in compliant for t in terms if g == "estimate" or g[axis]}
+            new = [k for k, t in enumerate(terms) if t.owner not in loaded]
+        found.append(LackingEffect(number, name, effect, len(terms), tuple(new)))
+    return found
+
+
+def widened(problem: Problem, at: Floats) -> tuple[Variables, Floats, list[Floats]]:
+    """The core's variables at a parameter vector with links' small motions and effects that the robot lacks.
+
+    Six columns are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as there
+    are joints.
+
+    Returns:
+        The variables, their parameter vector, and readings of each table for the kernels.
+    """
+    robot, bare = problem.robot, problem.robot.geometry
+    elements, parameters = list(bare.elements), list(bare.parameters)
+    for owner in range(robot.n_joints, -1, -1):
+        place = bare.end_of(owner)
+        for kind in FRAME_KINDS:
+            elements.insert(place, Element(PARAMETER_KINDS[kind].axis, parameter=len(parameters)))
+            parameters.append(Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0))
+    wide = replace(bare, elements=tuple(elements), parameters=tuple(parameters))
+    wide = wide.with_effects(*robot.effects, *lacking_effects(robot))
+    own = {p.name: (p, value) for p, value in zip(robot.parameters, at.tolist(), strict=False)}
+    each = [own.get(p.name, (replace(p, tolerance=None), 0.0)) for p in wide.parameters]
+    wide = replace(wide, parameters=tuple(p for p, _ in each))
+    values = np.append([value for _, value in each], at[problem.variables.frame_span])
+    tables = [table.measurements for table in problem.data.tables]
+    trigs = [wide.trig(m.readings, {"moves": last_moves(m.readings), **m.context}, values) for m in tables]
+    unknown = [table.unknown_frame for table in problem.data.tables]
+    return build_variables(wide, unknown, problem.variables.priors), values, trigs
+
+
+def causes_of(robot: Robot) -> dict[str, str]:
+    """How the names of the columns of each single effect begin, by what it is in words."""
+    found = {f"{joint.name} {_WORDS[e]}": f"{e} {k}." for k, joint in enumerate(robot.joints, 1) for e in _WORDS}
+    found["the base gives way to the arm's weight (`base_bending`)"] = _BENDING
+    for link in range(robot.n_joints + 1):
+        where = {0: "the base", robot.n_joints: "the tool"}.get(link, f"the link after {robot.joints[link - 1].name}")
+        found[f"{where} has an error that no estimated parameter describes"] = f"{LINK}{link}."
+    return found
