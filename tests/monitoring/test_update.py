@@ -104,10 +104,9 @@ def test_a_joint_of_fixed_parameters_has_no_zero_to_change():
 def test_growth_is_added_to_what_was_known():
     """With hardly any new rows, variances are the old ones and the growth, whatever the correlation."""
     calibration, true, rng = calibrated(7)
-    later = "2100-01-01"
     days = (np.datetime64("2100-01-01T00:00:00") - np.datetime64(calibration.result.date[:19])) / np.timedelta64(1, "D")
     coarse = measured(true, 3, rng, sigma=(10.0, 10.0))
-    updated = calibration.update(coarse, growth={"theta": 1e-6, "theta4": 2e-6}, date=later)
+    updated = calibration.update(coarse, growth={"theta": 1e-6, "theta4": 2e-6}, date="2100-01-01")
     for name, rate in (("theta2", 1e-6), ("theta4", 2e-6), ("a2", 0.0)):
         was, now = calibration.parameters[name].sigma, updated.parameters[name].sigma
         assert now == pytest.approx(np.hypot(was, rate * np.sqrt(days)), rel=1e-4)

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from instruments import measured_by
 from refusals import refusal
-from simulated import measure, measure_drawn, small_arm, true_robot, write_job
+from simulated import TOOL, measure, measure_drawn, small_arm, true_robot, write_job
 
 from fg_calib import Limits, Options, calibrate
 
-TOOL = ("tool.x", "tool.y", "tool.z")
-ROBOT = small_arm(tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.01), estimate=TOOL)
+ROBOT = small_arm(tolerance=dict.fromkeys(("a", "d", "alpha", "theta"), 0.01), estimate=TOOL[:3])
 
 
 def measured(n_test=20):

@@ -7,7 +7,7 @@ import pytest
 from instruments import measured_by
 from refusals import refusal
 from simulated import measure_drawn, small_arm
-from touches import corners, touch
+from touches import TOOL_POINT, corners, touch
 
 from fg_calib import CustomMeasurements, InputError, Job, Measurements, Options, ProblemError, Table, calibrate
 from fg_calib.assessment import solve_job
@@ -16,7 +16,6 @@ from fg_calib.statistics.cross_validation import _train_tables, wide
 from fg_calib.statistics.cross_validation import cross_validate as cross_validate_with
 
 LARGE = {"a": 0.01, "d": 0.01, "alpha": 0.01, "theta": 0.01}
-TOOL = ("tool.x", "tool.y", "tool.z")
 
 
 def cross_validate(job, *given, **more):
@@ -24,7 +23,7 @@ def cross_validate(job, *given, **more):
 
 
 def poses(seed=0, n=40, n_test=0, tolerance=LARGE, **more):
-    robot = small_arm(tolerance=tolerance, estimate=TOOL)
+    robot = small_arm(tolerance=tolerance, estimate=TOOL_POINT)
     return robot, measure_drawn(robot, n, seed, sigma=(1e-4, 1e-4), n_test=n_test, **more)
 
 
