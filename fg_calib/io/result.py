@@ -213,11 +213,11 @@ class Run(Section):
     n_residuals: int
     chi2: Figure
     dof: int
-    p_value: Probability | None
+    p_value: Probability | None = of("chi2_p_value")
     verdict: Literal["good", "doubtful"]
     parameters: dict[str, tuple[float, float | None, str]]
     inputs: dict[str, str] = {}
-    rows: tuple[str, ...] = ()
+    rows: tuple[str, ...] = of("carried.rows", ())
 
 
 class Result(Section):
@@ -358,12 +358,9 @@ class Result(Section):
     @property
     def run(self) -> Run:
         """This result as one run of a history."""
-        known = set(self.covariance.names)
-        verdict: Literal["good", "doubtful"] = "good" if self.trustworthy else "doubtful"
+        known, verdict = set(self.covariance.names), "good" if self.trustworthy else "doubtful"
         parameters = {p.name: (p.estimate, p.sigma, p.unit) for p in self.parameters if p.name in known}
-        keys = ("date", "n_residuals", "chi2", "dof", "inputs")
-        same = {key: getattr(self, key) for key in keys} | {"p_value": self.chi2_p_value, "rows": self.carried.rows}
-        return Run(verdict=verdict, parameters=parameters, **same)
+        return Run.model_validate(SimpleNamespace(**vars(self) | {"verdict": verdict, "parameters": parameters}))
 
     def unit_of(self, kind: str) -> str:
         """The unit of a kind of residual: `m`, `rad` or `px`."""
