@@ -71,11 +71,8 @@ class Pool(Brief):
     @property
     def known(self) -> Floats:
         """Whitened rows of earlier measurements, in the columns of the poses' rows, shape (m, n_columns)."""
-        n = len(self.rows.scales)
-        if self.before is None:
-            return np.zeros((0, n))
-        wide = rows_in_columns_of(self.before, self.problem)
-        return np.pad(wide, ((0, 0), (0, n - wide.shape[1])))
+        wide = np.zeros((0, 0)) if self.before is None else rows_in_columns_of(self.before, self.problem)
+        return np.pad(wide, ((0, 0), (0, len(self.rows.scales) - wide.shape[1])))
 
     @property
     def references(self) -> Integers:
@@ -118,10 +115,8 @@ def select_rows(table: Table, order: Mapping[str, int]) -> Table:
     m = table.measurements
     ids = m.ids.tolist()
     rows = np.array(sorted((k for k, n in enumerate(ids) if n in order), key=lambda k: order[ids[k]]), dtype=np.int64)
-    part = m.select(rows)
-    if m.groups is not None:
-        part = replace(part, groups=replace(m.groups, index=m.groups.index[rows]))
-    return replace(table, measurements=part)
+    groups = None if m.groups is None else replace(m.groups, index=m.groups.index[rows])
+    return replace(table, measurements=replace(m.select(rows), groups=groups))
 
 
 def _between_used(table: Table, *, known: bool) -> Table:

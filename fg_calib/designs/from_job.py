@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from fg_calib import assessment, graph, measurements, observability, simulation
 from fg_calib.designs.candidates import Pool, pool_of
 from fg_calib.initialization import Camera
-from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError
+from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Floats, InputError, expect
 from fg_calib.job import Job
 from fg_calib.robot import pose
 from fg_calib.simulation import Configurations, Errors, Instrument, Placement, Plane, RandomReadings, Scenario, Spot
@@ -32,10 +32,9 @@ def solve_for_design(job: Job) -> graph.Problem:
         ProblemError: The measurements lack what the model needs, or do not suffice.
         SolverError: GTSAM could not solve a step at all.
     """
-    for table in job.tables:
-        if table.measurements.pairs is not None:
-            expected = "tables of poses, which pairs may be formed from"
-            raise InputError(table.measurements.source, "pairs that are measured directly", expected)
+    expected = "tables of poses, which pairs may be formed from"
+    for m in (table.measurements for table in job.tables):
+        expect(m.pairs is None, m.source, "pairs that are measured directly", expected)
     gauge = "prior" if job.options.gauge == "keep" else job.options.gauge
     options = replace(job.options, gauge=gauge, folds=None, encoder="propagated")
     solution = assessment.solve_job(replace(job, options=options))

@@ -259,8 +259,8 @@ class Posterior(Brief):
         """RMS error of the tool over a task by error curves, were all else known, [m]."""
         if not self.problem.variables.n_curves:
             return 0.0
-        known = {name: np.zeros_like(getattr(self.covariance, name))
-                 for name in ("tangent", "undetermined", "undetermined_at_nominal")}  # fmt: skip
+        names = ("tangent", "undetermined", "undetermined_at_nominal")
+        known = {name: np.zeros_like(getattr(self.covariance, name)) for name in names}
         base, fitted = prediction.errors_at(replace(self.covariance, **known), task.readings)
         return (fitted if task.fitted else base).position or 0.0
 
