@@ -516,17 +516,16 @@ def image_files(given: Sequence[Path]) -> list[Path]:
     Raises:
         InputError: There are none, or two of one name: an image is known by its name without the ending.
     """
-    files: list[Path] = []
+    names: dict[str, Path] = {}
     for path in given:
         found = [path]
         if path.is_dir():
             found = sorted(f for f in path.iterdir() if f.suffix.lower() in _ENDINGS and not f.name.startswith("."))
         expect(found, str(path), "no images", f"files that end in {', '.join(_ENDINGS)}")
-        files += found
-    names: dict[str, Path] = {}
-    for file in files:
-        if (other := names.setdefault(file.stem, file)) != file:
-            raise InputError(str(file), f"a second image called {file.stem!r}", f"one, as {other.name} is called so")
+        for file in found:
+            if (other := names.setdefault(file.stem, file)) != file:
+                second = f"a second image called {file.stem!r}"
+                raise InputError(str(file), second, f"one, as {other.name} is called so")
     return list(names.values())
 
 

@@ -746,11 +746,10 @@ def _read_job(file: _ScenarioInFile, source: str, context: FileContext) -> tuple
     alone = file.instruments is None
     given = dict(file.job) if file.job is not None else {"model": "distance-rotation"} if alone else {}
     written = {"robot", "measurements", "pairs", "frame", "units", "truth"}
-    of_instruments = {"model", "pairing", "targets", "anchors", "tolerance", "offset", "camera"}
+    written |= set() if alone else {"model", "pairing", "targets", "anchors", "tolerance", "offset", "camera"}
+    hint = "it follows from the scenario or its instruments"
     for key in given:
-        if key in written or (key in of_instruments and not alone):
-            hint = "it follows from the scenario or its instruments"
-            raise InputError(f"{source}: job", f"found key {key!r}", "none", hint)
+        inputs.expect(key not in written, f"{source}: job", f"found key {key!r}", "none", hint)
     noise = given.pop("noise", None)
     if isinstance(noise, dict) and isinstance(file.noise, dict) and "joint" in file.noise:
         noise = {"joint": file.noise["joint"]} | noise

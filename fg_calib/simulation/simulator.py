@@ -24,7 +24,6 @@ from dataclasses import astuple, dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fg_calib import initialization, inputs, io, measurements, parallel
@@ -32,7 +31,7 @@ from fg_calib.inputs import PAIR_MODELS, POSE_MODELS, Booleans, Brief, Floats, F
 from fg_calib.measurements import INSTRUMENTS, Groups, KnownPoint, Labels, Measurements, Noise, Pairs, Table
 from fg_calib.robot import N_STARTS, Poses, Robot, Thermal, build_chain, forward, outside_joints, pose, solve_inverse
 from fg_calib.simulation.scenario import BoardViews, Configurations, Instrument, Placement, Plane, Scenario, Spot
-from fg_calib.simulation.views import find_readings
+from fg_calib.simulation.views import Words, find_readings
 
 MAX_BASE_M = 5.0
 """How far from the world's origin an unknown frame puts the base, along each axis, [m]."""
@@ -74,7 +73,7 @@ class Visits(NamedTuple):
 
     readings: Floats
     true_readings: Floats
-    ids: NDArray[np.str_]
+    ids: Words
     test: Booleans
 
     def select(self, rows: Integers | Booleans) -> "Visits":

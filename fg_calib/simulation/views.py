@@ -91,8 +91,7 @@ def draw_candidates(robot: Robot, of: Configurations, generator: np.random.Gener
     most, hopeless = MAX_DRAWN_EACH * patience * n, MAX_DRAWN_IN_VAIN * patience
     if isinstance(of, GivenReadings):
         most = hopeless = len(of.readings)
-    taken, asked = np.empty((0, robot.n_joints)), 0
-    counts: Counter[str] = Counter()
+    taken, asked, counts = np.empty((0, robot.n_joints)), 0, Counter[str]()
     while len(taken) < n and asked < most and (len(taken) or asked < hopeless):
         share = len(taken) / asked if len(taken) else 1.0
         k = int(1.1 * (n - len(taken)) / share) + 10 if asked else min(n, MAX_DRAWN_IN_VAIN)
