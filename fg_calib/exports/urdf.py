@@ -33,7 +33,7 @@ from jinja2 import Template
 from scipy.spatial.transform import Rotation
 
 from fg_calib.exports.dh import Links, in_table, links_of, transform
-from fg_calib.inputs import Floats, InputError, Record, UrBase, etree
+from fg_calib.inputs import Floats, InputError, Record, UrBase, etree, expect
 from fg_calib.robot import FRAME_KINDS, Joint, Robot, frame_values
 
 FARTHEST_SLIDE = 1000.0
@@ -121,10 +121,9 @@ def ur_kinematics(robot: Robot, base: UrBase) -> tuple[dict[str, dict[str, float
     Raises:
         InputError: The arm has not six revolute joints.
     """
-    slides = sum(joint.prismatic for joint in robot.joints)
-    if robot.n_joints != len(UR_LINKS) or slides:
-        found = f"{robot.n_joints} joints, {slides} of which slide"
-        raise InputError(robot.name, found, "six joints that turn, as ur_description has")
+    slides = [joint.prismatic for joint in robot.joints]
+    found = f"{robot.n_joints} joints, {sum(slides)} of which slide"
+    expect(slides == [False] * len(UR_LINKS), robot.name, found, "six joints that turn, as ur_description has")
     arm = in_table(robot, "dh-hayati").robot
     kinematics = {}
     before = transform(theta=-np.pi if base == "base_link" else 0.0) @ _frame_of(arm, "base")

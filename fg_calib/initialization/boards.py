@@ -57,8 +57,7 @@ def boards_from_image(camera: Camera, image: Floats, sigma: Floats | None = None
     seen, there = undistorted(camera, image[:, :2])
     if not _spread(image[there, 2:]) or not np.ptp(seen[there], axis=0).any():
         return []
-    H = _homography(image[there, 2:], seen[there], weight[there] * [camera.fx, camera.fy])
-    if H is None:
+    if (H := _homography(image[there, 2:], seen[there], weight[there] * [camera.fx, camera.fy])) is None:
         return []
     starts = _two_poses(H, image[there, 2:], seen[there])
     refined = (_refined_on_most(camera, image[there], weight[there], start) for start in starts)

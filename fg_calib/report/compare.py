@@ -113,8 +113,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
     thereby known, so their sigma is None. "parameters" is empty where it did not run.
     """
     job = comparison.job
-    pairs = next((table for table in job.tables if table.uses_pairs), None)
-    measured = pairs is not None and pairs.measurements.pairs is not None
+    pairings = ("measured" if t.measurements.pairs is not None else str(t.pairing) for t in job.tables if t.uses_pairs)
     return tables.document_of(
         "comparison",
         comparison,
@@ -122,7 +121,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
         robot=job.robot.name,
         model=job.model,
         frame="unknown" if any(table.unknown_frame for table in job.tables) else job.tables[0].frame,
-        pairing="measured" if measured else None if pairs is None else str(pairs.pairing),
+        pairing=next(pairings, None),
         truth_known=job.truth is not None,
         nominal={"residual_rms": comparison.rms_before, "errors": comparison.errors_before},
         estimates=[_estimate(comparison, e) for e in comparison.estimates],
