@@ -23,7 +23,7 @@ large, and priors too wide, would make the ratio F too large, so both are made a
 MacKay's fixed point, with tr L S^-1 L^T the number of coefficients that the rows determine (see `error_states`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -35,11 +35,12 @@ from scipy import special
 from scipy.sparse import csr_array
 
 from fg_calib.diagnostics.lacking_effects import LINK, STAGES, causes_of, widened
-from fg_calib.graph import Problem, SchurComplement, Solution, subsampled
+from fg_calib.graph import Problem, SchurComplement, Solution, relinearized_at, subsampled
 from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.inputs import Booleans, Floats, Record
 from fg_calib.observability import MissingMotion
 from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS
+from fg_calib.statistics import KindFit
 
 MAX_ROWS = 10_000
 """Rows by which residuals are tested: more would take long, and are not needed."""
@@ -64,6 +65,9 @@ _RANK = 1e-8
 
 _NOTHING = 1e-10
 """Size of a column over the largest below which it is rounding errors."""
+
+MOST_UNEVEN, LEAST_NOISE = 1.2, 1e-3
+"""Ratio of observed to specified noise of one kind over that of another up to which they are equal; least of them."""
 
 OFFSET = "offset "
 """How names of the columns of offsets begin, before the number of the table."""
@@ -223,8 +227,12 @@ def of_several(p: float, n: int) -> float:
     return -float(np.expm1(n * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
-def find_systematic(regression: Regression) -> Systematic | None:
+def find_systematic(regression: Regression, even: Regression | None = None) -> Systematic | None:
     """Systematic residuals, of all rows whatever their robust weights, and the single effect that explains them best.
+
+    Args:
+        regression: The rows.
+        even: The same with equal noise of all kinds, which the tests take for granted: see `with_even_noise`.
 
     Returns:
         None where it cannot be told: too few rows, or rows that share errors but are weighted as independent.
@@ -232,7 +240,8 @@ def find_systematic(regression: Regression) -> Systematic | None:
     problem, whole = regression.problem, regression.fit
     if problem.rows.counted_as_private or whole.dof < 2 * LEAST_LEFT:
         return None
-    clipped = whole.clipped()
+    regression = even or regression
+    clipped = regression.fit.clipped()
     stages = list(regression.staged(clipped))
     if not stages:
         return None
@@ -330,6 +339,21 @@ def _offsets(problem: Problem) -> dict[int, int]:
     places = np.flatnonzero(np.isin(unknowns.owners, numbers) & (columns < 0)).tolist()
     each = ((place, s) for place in places for s in problem.data.blocks)
     return {place: s.table for place, s in each if np.any(s.nuisances[s.train] == place)}
+
+
+def with_even_noise(solution: Solution, kinds: Sequence[KindFit]) -> Solution:
+    """A solution with the noise that the residuals of each kind have, where their ratios to what is specified differ.
+
+    Else what is specified too large for one kind, or too small, makes residuals of noise systematic.
+    """
+    problem, known = solution.problem, [kind for kind in kinds if kind.degrees >= LEAST_LEFT and kind.typical > 0.0]
+    sizes = {(kind.table, kind.kind): max(kind.typical, LEAST_NOISE) for kind in known}
+    if max(sizes.values(), default=1.0) < MOST_UNEVEN * min(sizes.values(), default=1.0):
+        return solution
+    given = problem.state.factors
+    factors = {**given, **{key: size * given.get(key, 1.0) for key, size in sizes.items()}}
+    state = replace(problem.state, factors=factors)
+    return replace(solution, problem=relinearized_at(problem, solution.parameters, state))
 
 
 def regress(solution: Solution) -> Regression:

@@ -186,7 +186,9 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     change = effects.find_change(regression) if suspicious and regression is not None else None
     if change is not None and solution.estimated_noise is not None and change.left > ESTIMATED_LEFT:
         change = None  # for the noise holds what a change would have to explain
-    systematic = None if regression is None or change is not None else effects.find_systematic(regression)
+    systematic, even = None, effects.with_even_noise(solution, fit.goodness.kinds)
+    if regression is not None and change is None:
+        systematic = effects.find_systematic(regression, None if even is solution else effects.regress(even))
     case = Case(solution, spread, fit, identifiability, regression, change, systematic)
     found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}
     doubts = any(s.severity == "error" for each in found.values() for s in each)

@@ -267,6 +267,17 @@ def test_noise_specified_too_large_is_no_effect():
     assert find_systematic(regress(solve(build_problem(robot, wide, model="pose")))).p_value > 1e-3
 
 
+def test_noise_specified_too_large_for_one_kind_is_no_effect():
+    """The test takes the ratio of observed to specified noise as equal, and is given rows where it is."""
+    tolerance = {"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3}
+    robot = Robot.from_dh([[0.1, np.pi / 2 * (k % 2), 0.05, 0.0] for k in range(7)], tolerance=tolerance)
+    m = measure(robot, 200, np.random.default_rng(5), sigma=(1e-4, 2e-4))
+    wide = replace(m, sigma_orientation=10.0 * m.sigma_orientation)
+    solution = solve(build_problem(robot, wide, model="pose", frame="unknown"))
+    assert find_systematic(regress(solution)).p_value < 1e-3
+    assert assess(solution).verdict.systematic.p_value > 1e-2
+
+
 # --- instrument offsets ------------------------------------------------------------------------------------------
 
 
