@@ -1,14 +1,17 @@
 """`fg-calib correct`: tables of targets in, tables of commands out."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
 from oracle import tool_pose
 from scipy.spatial.transform import Rotation
+from simulated import measure, small_arm
 
-from fg_calib import Calibration, read_robot
+from fg_calib import Calibration, calibrate, read_robot
+from fg_calib.robot import Thermal
 
 JOINTS = [f"q{i + 1}" for i in range(7)]
 
@@ -63,6 +66,16 @@ def test_a_program_of_joint_values_and_json(result, fg_calib, tmp_path):
         assert np.abs(there - tool_pose(nominal, row)).max() < 1e-9
         away = np.linalg.norm((tool_pose(found.robot, row) - there)[:3, 3])
         assert target["uncorrected"]["position"] == pytest.approx(away, rel=1e-6)
+
+
+def test_what_is_assumed_of_targets_is_said(fg_calib, tmp_path):
+    robot = small_arm({"a": 1e-3, "theta": 1e-3}).with_effects(Thermal())
+    m = replace(measure(robot, 20, np.random.default_rng(1)), context={"temperature": np.linspace(18.0, 25.0, 20)})
+    calibrate(robot, m, model="position").save(tmp_path / "result")
+    for more, at, said in (("", "", True), (",temperature", ",22", False)):
+        (tmp_path / "targets.csv").write_text(f"q1,q2,q3,q4{more}\n0.1,0.2,0.1,0.3{at}\n")
+        ended = fg_calib("correct", tmp_path / "result", tmp_path / "targets.csv")
+        assert ("Taken for granted: temperature 20." in ended.out) == said, ended.err
 
 
 @pytest.mark.slow

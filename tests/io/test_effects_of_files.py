@@ -1,11 +1,24 @@
 """The key `effects` of robot files: read, written and read back, masses of URDFs in their places."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refusals import refusal
 
-from fg_calib.io import Column, Units, read_joint_table, read_measurements, read_robot, read_urdf, write_robot
+from fg_calib import Measurements, Table
+from fg_calib.io import (
+    Column,
+    Units,
+    read_joint_table,
+    read_measurements,
+    read_robot,
+    read_urdf,
+    write_csv,
+    write_robot,
+)
 from fg_calib.robot import Backlash, Compliance, ErrorCurve, Harmonics, Mass
+from fg_calib.simulation import table_columns
 
 HEAD = """\
 name: arm
@@ -129,27 +142,30 @@ def two_arms(folder, base, tip):
     return read_robot(folder / "robot.yaml")
 
 
-@pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base")])
+@pytest.mark.parametrize("ends", [("base", "fore"), ("fore", "base"), ("hand", "base")])
 def test_masses_of_a_urdf_are_where_its_links_are(ends, tmp_path):
     """Torques by the potential of all links, those of the other arm where its joints stand; written and read back."""
     from yourdfpy import URDF
 
     robot, q = two_arms(tmp_path, *ends), np.array([[0.4, -0.9, 0.7, 0.2], [1.0, 0.3, -1.1, 0.4]])
-    turning = ["shoulder", "elbow"] if ends[0] == "base" else ["elbow", "shoulder"]
-    assert [p.name for p in robot.parameters if p.kind == "compliance"] == [f"{name}.compliance" for name in turning]
+    moving, n = [joint.name for joint in robot.joints], robot.n_joints
+    outside = [name for name, kind, *_ in JOINTS if kind != "fixed" and name not in moving]
+    turning = [k for k, joint in enumerate(robot.joints) if not joint.prismatic]
+    assert [p.name for p in robot.parameters if p.kind == "compliance"] == [f"{moving[k]}.compliance" for k in turning]
     urdf = URDF.load(str(tmp_path / "arm.urdf"), load_meshes=False, build_scene_graph=True)
 
     def potential(readings):
-        urdf.update_cfg(dict(zip(turning + OUTSIDE, readings, strict=True)))
+        urdf.update_cfg(dict(zip(moving + outside, readings, strict=True)))
         points = {n: urdf.get_transform(n, ends[0]) @ [*map(float, COM[n].split()), 1.0] for n in COM}
         return -9.81 * sum(MASSES[n] * points[n][2] for n in COM)
 
-    outside = dict(zip(OUTSIDE, q.T[2:], strict=True))
+    context = dict(zip(outside, q.T[n:], strict=True))
     write_robot(tmp_path / "again.yaml", robot, urdf_name="arm.urdf")
-    for arm, context, at in ((read_robot(tmp_path / "again.yaml"), outside, q), (robot, {}, q * [1, 1, 0, 0])):
-        found = arm.effects[0].values(arm.geometry, q[:, :2], context, np.zeros(2))[:, :, 0]
+    again, at_zero = read_robot(tmp_path / "again.yaml"), np.where(np.arange(4) < n, q, 0.0)
+    for arm, known, at in ((again, context, q), (robot, {}, at_zero)):
+        found = arm.effects[0].values(arm.geometry, q[:, :n], known, np.zeros(len(turning)))[:, :, 0]
         for row, torque in zip(at, found, strict=True):
-            expected = [(potential(row + h) - potential(row - h)) / 2e-5 for h in 1e-5 * np.eye(2, 4)]
+            expected = [(potential(row + h) - potential(row - h)) / 2e-5 for h in 1e-5 * np.eye(4)[turning]]
             assert torque == pytest.approx(expected, abs=1e-7)
 
 
@@ -165,6 +181,16 @@ def test_joints_outside_the_chain_are_columns_that_a_table_may_have(tmp_path, ca
     found = read_joint_table(tmp_path / "q.csv", robot, Units("mm", "deg"))[2]
     assert found == {"other_slide": pytest.approx([0.3])}
     assert robot.effects[0].assumed(found) == ["joints outside the chain at 0"]
+
+
+def test_joints_outside_the_chain_are_written_in_the_units_of_a_table(tmp_path):
+    robot = two_arms(tmp_path, "base", "fore")
+    context = dict(zip(OUTSIDE, np.array([[0.5, -0.4], [0.1, 0.2]]), strict=True))
+    m = replace(Measurements.from_arrays(np.zeros((2, 2)), position=np.zeros((2, 3))), source="t.csv", context=context)
+    units = Units("mm", "deg")
+    write_csv(tmp_path / "t.csv", table_columns(Table(m, None), robot, units)["t.csv"])
+    found = read_measurements(tmp_path / "t.csv", robot, units=units).context
+    assert np.array([found[name] for name in OUTSIDE]) == pytest.approx(np.array([context[name] for name in OUTSIDE]))
 
 
 @pytest.mark.parametrize(("before", "broken", "said"), [
