@@ -9,7 +9,8 @@ A test of residuals adds them stage by stage (see `unmodelled_effects`):
 4. joints that tilt, and a base that gives way, under these masses;
 5. harmonics of three to eight periods a turn;
 6. backlash by the last move in the order of rows, and joints that turn with a neighbour;
-7. other masses than those of the model: free first moments.
+7. other masses than those of the model: free first moments;
+8. zeros of joints that drift in the order of rows, as heat makes them do.
 
 The name of a column begins with its stage and what it is, then has the number of its joint: `4 tilt 2.compliance5_7`.
 """
@@ -22,14 +23,28 @@ from fg_calib.graph import Problem, Variables
 from fg_calib.graph.variables import build_variables
 from fg_calib.inputs import Floats, Record
 from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Effect, Element, Parameter, Robot
-from fg_calib.robot.effects import GRAVITY, Backlash, Bending, Compliance, Coupling, Gain, Harmonics, Mass, last_moves
+from fg_calib.robot.effects import (
+    GRAVITY,
+    Backlash,
+    Bending,
+    Compliance,
+    Coupling,
+    Gain,
+    Harmonics,
+    Mass,
+    Thermal,
+    last_moves,
+)
 from fg_calib.robot.model import Context, Term, kind_of
 
-STAGES = tuple(f"{k} " for k in range(1, 8))
+STAGES = tuple(f"{k} " for k in range(1, 9))
 """How names of the columns of each stage begin."""
 
 LINK = "2 small motion of link "
 """How those of small motions of links begin, before the number of the joint that moves the link."""
+
+DRIFT = "8 drift"
+"""How those of drifts of joints begin."""
 
 _WORDS = {
     "1 gravity": "yields to gravity (`compliance`)",
@@ -40,6 +55,7 @@ _WORDS = {
     "6 backlash": "errs with the direction of its last move (`backlash`)",
     "6 coupling": "turns with a joint near it (`coupling`)",
     "7 masses": "bears another load than its masses make (`masses`)",
+    DRIFT: "drifts in the order of rows (heat: `thermal`)",
 }
 """Effects of single joints, by how the names of their columns begin, before the number of the joint."""
 
@@ -89,6 +105,7 @@ def lacking_effects(robot: Robot) -> list[LackingEffect]:
     pairs = [(i, j) for i in range(1, n + 1) for j in range(max(i - 2, 1), min(i + 2, n) + 1) if i != j]
     candidates: list[tuple[str, Effect]] = [("2 position", Gain(slides))] * bool(slides)
     candidates += [("6 coupling", Coupling(pairs))] if pairs else []
+    candidates += [(DRIFT, Thermal(0.0, lengths=False, zeros=True, column="order of rows"))] * (len(slides) < n)
     if len(slides) < n:
         candidates += [("2 position", Harmonics()), ("5 position", Harmonics(range(3, 9))), ("6 backlash", Backlash())]
         for some in masses:
@@ -135,7 +152,8 @@ def widened(problem: Problem, at: Floats) -> tuple[Variables, Floats, list[Float
     wide = replace(wide, parameters=tuple(p for p, _ in each))
     values = np.append([value for _, value in each], at[problem.variables.frame_span])
     tables = [table.measurements for table in problem.data.tables]
-    trigs = [wide.trig(m.readings, {"moves": last_moves(m.readings), **m.context}, values) for m in tables]
+    given = [{"moves": last_moves(m.readings), "order of rows": np.linspace(-1.0, 1.0, len(m.ids))} for m in tables]
+    trigs = [wide.trig(m.readings, of | dict(m.context), values) for m, of in zip(tables, given, strict=True)]
     unknown = [table.unknown_frame for table in problem.data.tables]
     return build_variables(wide, unknown, problem.variables.priors), values, trigs
 

@@ -13,7 +13,8 @@ noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k.
 are independent.
 
 A *change point* is a small motion of tool or base from one row of a table on, for every row tried. Other effects
-explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all links.
+explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all links
+and slow drifts of joints.
 A *missing convention parameter* is the same test of small motions between links. An *offset* is added to every length
 of a table to anchors; it hides in the arm's parameters: 0.25 mm of a ball bar made residuals 1.1 times as large as
 specified.
@@ -34,7 +35,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.sparse import csr_array
 
-from fg_calib.diagnostics.lacking_effects import LINK, STAGES, causes_of, widened
+from fg_calib.diagnostics.lacking_effects import DRIFT, LINK, STAGES, causes_of, widened
 from fg_calib.graph import Problem, SchurComplement, Solution, relinearized_at, subsampled
 from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.inputs import Booleans, Floats, Record
@@ -303,7 +304,7 @@ def find_change(regression: Regression) -> Change | None:
         return None
     p, left, what, k = min(found)
     moved = regression.named(links[what], rows=at >= k)
-    p_with, left_with, _ = fit.test(regression.named(LINK))[2].test(moved)
+    p_with, left_with, _ = fit.test(regression.named(LINK, DRIFT))[2].test(moved)
     if max(of_several(p, len(found)), p_with) >= P_VALUE or max(left, left_with) > CHANGE_LEFT:
         return None
     return Change(what, k, float(np.sum(fit.test(moved)[2].r ** 2) / np.sum(fit.r**2)))

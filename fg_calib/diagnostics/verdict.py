@@ -59,9 +59,6 @@ MAX_NOISE_FACTOR = 1.2
 LEAST_COMPLIANCE = -4.0
 """Compliance in its sigma below which it is negative: gravity never lifts a joint."""
 
-ESTIMATED_LEFT = 0.5
-"""Part of chi-square that a change leaves at most where noise was estimated."""
-
 
 class Statement(Record):
     """A statement about a result: one line, how severe it is, and whether it applies.
@@ -184,8 +181,6 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     regression = None if problem.evaluated else effects.regress(solution)
     suspicious = solution.estimated_noise is not None or any(kind.verdict not in FINE for kind in fit.goodness.kinds)
     change = effects.find_change(regression) if suspicious and regression is not None else None
-    if change is not None and solution.estimated_noise is not None and change.left > ESTIMATED_LEFT:
-        change = None  # for the noise holds what a change would have to explain
     systematic, even = None, effects.with_even_noise(solution, fit.goodness.kinds)
     if regression is not None and change is None:
         systematic = effects.find_systematic(regression, None if even is solution else effects.regress(even))

@@ -18,7 +18,7 @@ from fg_calib.diagnostics.lacking_effects import LINK
 from fg_calib.diagnostics.unmodelled_effects import find_change, find_systematic, forgotten_offsets, regress
 from fg_calib.graph import prior_rows, unknown_prior_rows
 from fg_calib.robot import Robot, build_chain, forward, pose
-from fg_calib.robot.effects import Backlash, Bending, Compliance, Coupling, ErrorCurve, Harmonics, Mass
+from fg_calib.robot.effects import Backlash, Bending, Compliance, Coupling, ErrorCurve, Harmonics, Mass, Thermal
 from fg_calib.statistics import estimate_noise, spread_of
 
 
@@ -96,7 +96,7 @@ def test_a_missing_harmonic_is_named_next_to_modelled_compliance():
 
 def test_what_a_robot_has_is_no_candidate():
     names = {name for name in regress(with_curves(np.random.default_rng(1))).names.tolist() if LINK not in name}
-    shared = {"3 side load", "4 bending", "4 tilt", "6 backlash", "6 coupling", "7 masses"}
+    shared = {"3 side load", "4 bending", "4 tilt", "6 backlash", "6 coupling", "7 masses", "8 drift"}
     assert {name.rpartition(" ")[0] for name in names} == {"2 position", *shared}
     assert [name for name in names if name.startswith("2")] == ["2 position 3.gain0_0"]  # of the joint that slides
     hung = regress(with_curves(np.random.default_rng(1), gravity=(9.81, 0.0, 0.0))).names.tolist()
@@ -120,6 +120,7 @@ WRONG = [Mass(4, 10.0, (-0.1, 0.2, 0.1)), Mass(2, 5.0)]
         (Backlash(), "theta1.backlash", 2e-4, "j1 errs with the direction of its last move"),
         (Coupling([(1, 2)]), "theta2.coupling1", 1e-3, "j2 turns with a joint near it"),
         (Compliance(MASSES), "theta2.compliance", 1e-4, "j2 bears another load"),
+        (Thermal(lengths=False, zeros=True), "theta2.drift", 5e-5, "j2 drifts in the order of rows"),
     ],
 )
 @pytest.mark.parametrize("model", ["position", "pose"])
@@ -128,14 +129,17 @@ def test_each_effect_that_is_missing_is_named(effect, name, size, cause, model):
     full = robot.with_effects(effect)
     true = full.with_values(full.nominal + size * np.array([p.name == name for p in full.parameters]))
     q = rng.uniform(-2.5, 2.5, (100, 4)) * [1.0, 1.0, 0.2, 1.0]
-    at = forward(build_chain(true), true.trig(q, {"moves": np.sign(np.diff(q, axis=0, prepend=q[:1]))}))
+    context = {"moves": np.sign(np.diff(q, axis=0, prepend=q[:1])), "temperature": np.linspace(15.0, 25.0, 100)}
+    at = forward(build_chain(true), true.trig(q, context))
     position = at.position + 1e-4 * rng.normal(size=(100, 3))
     rotation = (Rotation.from_matrix(at.rotation) * Rotation.from_rotvec(2e-4 * rng.normal(size=(100, 3)))).as_matrix()
     m = Measurements.from_arrays(q, position=position, rotation=rotation, sigma_position=1e-4, sigma_orientation=2e-4)
     fitted = robot.with_effects(Compliance(WRONG)) if "another" in cause else robot
-    found = find_systematic(regress(solve(build_problem(fitted, m, model=model))))
+    regression = regress(solve(build_problem(fitted, m, model=model)))
+    found = find_systematic(regression)
     assert found.p_value < 1e-6
     assert found.cause.startswith(cause)
+    assert find_change(regression) is None
 
 
 def test_curves_are_eliminated_as_dense_columns_with_their_priors_would_be():
