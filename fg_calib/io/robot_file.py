@@ -159,7 +159,7 @@ def _links_of(tree: _Tree, chain: list[tuple[_UrdfJoint, bool]], base: str, plac
                 at = np.eye(4)
         return Mass(owner, mass, tuple((at[:3, :3] @ com + at[:3, 3]).tolist()), "", tuple(hinges))
 
-    links: dict[str | None, Any] = {str(i): partial(Mass, i) for i in range(number + 1)}
+    links: dict[str | None, Any] = {str(i): partial(Mass, i) for i in range(number + 2)}
     for link in tree.links:
         if (below := next((one for one in tree.up(link) if one in on_chain), None)) is not None:
             links[link] = partial(made, below, link)
@@ -649,7 +649,7 @@ def _build_rows(file: _DhRobot | _PoeRobot, place: str, estimate: Sequence[str])
         else:
             builder.add_convention_joint(joint, _values(row, file.convention, file.units, here))
     builder.add_frame("tool", file.tool.si(file.units, f"{place}: tool"), len(names) + 1, False)
-    links = {str(i): partial(Mass, i) for i in range(len(names) + 1)}
+    links = {str(i): partial(Mass, i) for i in range(len(names) + 2)}
     robot = _with_effects(builder, file.effects, links, place, **file.choices(place, estimate))
     return replace(robot, units=(file.units.length, file.units.angle))
 

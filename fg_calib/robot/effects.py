@@ -33,7 +33,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from fg_calib.inputs import MOST_SIZE, Floats, InputError, Record, as_floats, check_names, check_number, shown
+from fg_calib.inputs import MOST_SIZE, Floats, InputError, Record, as_floats, check_names, check_number, expect, shown
 from fg_calib.robot.model import CONVENTIONS, Axis, Context, Effect, Element, Joint, Parameter, Robot, Term, names_of
 
 _log = logging.getLogger(__name__)
@@ -69,12 +69,11 @@ def _joints(robot: Robot, joints: Joints, what: str, *, sliding: bool = False) -
     able = [i for i, joint in enumerate(robot.joints) if sliding or not joint.prismatic]
     if joints == "all":
         return able
-    numbers, expected = [i + 1 for i in able], f"joints{' that turn' * (not sliding)}, of"
+    numbers = [i + 1 for i in able]
+    expected = f"joints{' that turn' * (not sliding)}, of {', '.join(map(str, numbers))}"
     for number in joints:
-        if isinstance(number, bool) or number not in numbers:
-            raise InputError(f"{what}: joints", f"found {shown(number)}", f"{expected} {', '.join(map(str, numbers))}")
-    if not joints or len({*joints}) < len(joints):
-        raise InputError(f"{what}: joints", f"found {shown(joints)}", "different joints")
+        expect(number in numbers and number is not True, f"{what}: joints", f"found {shown(number)}", expected)
+    expect(0 < len({*joints}) == len(joints), f"{what}: joints", f"found {shown(joints)}", "different joints")
     return [int(number) - 1 for number in joints]
 
 
@@ -127,8 +126,8 @@ class Harmonics(Effect, Record):
         super().__post_init__()
         for order in self.orders:
             check_number("orders", order, above=True, most=MOST_TERMS)
-        if len({f"{order:.9g}" for order in self.orders}) != (len(self.orders) or 1):
-            raise InputError("orders", f"found {shown(self.orders)}", "different numbers, such as [1, 2]")
+        different = 0 < len({f"{order:.9g}" for order in self.orders}) == len(self.orders)
+        expect(different, "orders", f"found {shown(self.orders)}", "different numbers, such as [1, 2]")
 
     def terms(self, robot: Robot) -> list[Term]:
         names = [(f"{m:.9g}".replace(".", "_"), f) for m in self.orders for f in ("sin", "cos")]
@@ -288,15 +287,19 @@ class _Loaded(Effect):
     masses: Sequence[Mass] | None
     gravity: Sequence[float] | Literal["estimate"]
 
+    def bound(self, robot: Robot) -> Effect:
+        last, n = max((m.link for m in self.masses or ()), default=0), robot.n_joints
+        expect(last <= n + 1, "masses", f"found link {last}", f"0 (the base) to {n + 1} (the tool)")
+        return self
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.by_loads and self.masses is not None:
             figures = [(m.link, m.mass, *m.com) for m in self.masses]
             if not figures or np.any(as_floats("masses", figures, "(n, 5)")[:, :2] < 0.0):
                 raise InputError("masses", f"found {shown(self.masses)}", "a Mass for each link, 0 kg or more")
-        gravity = as_floats("gravity", GRAVITY if self.gravity == "estimate" else self.gravity, "(3)")
-        if not 0.0 < np.linalg.norm(gravity) < MOST_GRAVITY:
-            raise InputError("gravity", f"found {shown(self.gravity)}", "m/s^2, such as [0, 0, -9.81]")
+        size = np.linalg.norm(as_floats("gravity", GRAVITY if self.gravity == "estimate" else self.gravity, "(3)"))
+        expect(0.0 < size < MOST_GRAVITY, "gravity", f"found {shown(self.gravity)}", "m/s^2, such as [0, 0, -9.81]")
 
     def assumed(self, known: Collection[str] = ()) -> list[str]:
         words = [f"{m.column} {m.mass:g} kg" for m in self.masses or () if m.column and m.column not in known]
@@ -490,8 +493,8 @@ class Coupling(Effect, Record):
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes = [len(pair) if isinstance(pair, tuple) else 1 for pair in {*self.pairs}]
-        if sizes != [2] * (len(self.pairs) or 1):
-            raise InputError("pairs", f"found {shown(self.pairs)}", "different pairs of joints, such as [[4, 5]]")
+        of_two = sizes == [2] * (len(self.pairs) or 1)
+        expect(of_two, "pairs", f"found {shown(self.pairs)}", "different pairs of joints, such as [[4, 5]]")
 
     def _places(self, robot: Robot) -> list[list[int]]:
         return [_joints(robot, pair, "coupling", sliding=True) for pair in self.pairs]

@@ -454,8 +454,7 @@ class Robot(inputs.Record):
         shape = shape_of("readings", readings, expected)
         inputs.expect(len(shape) == 2 and shape[1] == self.n_joints, "readings", f"shape {shape}", expected)
         for name, given in (context or {}).items():
-            if len(given) != shape[0]:
-                raise InputError(f"context {name}", f"{len(given)} rows", f"{shape[0]}, one a configuration")
+            inputs.expect(len(given) == shape[0], f"context {name}", f"{len(given)} rows", f"{shape[0]}, one a row")
         prismatic = np.array([j.prismatic for j in self.joints])
         trig = np.empty((*shape, 2))
         np.cos(readings, out=trig[:, :, 0])

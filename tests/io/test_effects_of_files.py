@@ -34,7 +34,7 @@ EFFECTS = """\
 effects:
   compliance:
     joints: [2, 3]
-    masses: {2: {mass: 12.0, com: [0.3, 0, 0.1]}, 3: {mass: 4.0}}
+    masses: {2: {mass: 12.0, com: [0.3, 0, 0.1]}, 3: {mass: 4.0}, 4: {mass: 1.0}}
     payload: {mass: 2.0, com: [0, 0, 0.06], column: load}
     gravity: [0, 0, 9.81]
   harmonics: {orders: [1, 2.5]}
@@ -63,7 +63,7 @@ def read(tmp_path):
 def test_effects_are_read_with_their_options(read):
     robot = read(HEAD + EFFECTS)
     compliance, harmonics = robot.effects[:2]
-    masses = [Mass(2, 12.0, (0.3, 0.0, 0.1)), Mass(3, 4.0), Mass(3, 2.0, (0, 0, 0.06), "load")]
+    masses = [Mass(2, 12.0, (0.3, 0.0, 0.1)), Mass(3, 4.0), Mass(4, 1.0), Mass(3, 2.0, (0, 0, 0.06), "load")]
     assert compliance == Compliance(masses, [2, 3], gravity=[0.0, 0.0, 9.81])
     assert robot.effects[-1].gravity == compliance.gravity
     assert read(HEAD + "effects: {backlash: true}\n").effects == (Backlash(),)

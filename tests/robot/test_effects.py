@@ -232,6 +232,7 @@ def test_units_of_a_gain_in_files_and_options():
     [
         ([Gain([5])], "gain: joints: found 5, expected joints, of 1, 2, 3, 4"),
         ([Gain(), Gain([1])], "robot: two effects with the parameter theta1.gain, expected one"),
+        ([Compliance([Mass(9, 1.0)])], "masses: found link 9, expected 0 (the base) to 5 (the tool)"),
         (["gain"], "effects: found 'gain', expected effects, such as Harmonics([1, 2])"),
     ],
 )
