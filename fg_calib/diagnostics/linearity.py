@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from fg_calib.graph import Solution, subsampled
 from fg_calib.inputs import Floats, Record, SolverError
+from fg_calib.prediction.tool_pose import with_curve_errors
 from fg_calib.robot import forward, pose, without_rigid_motion
 from fg_calib.statistics import Spread
 
@@ -106,16 +107,11 @@ class AmbiguousRows(Record):
     turned: tuple[str, ...] = ()
 
 
-def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> AmbiguousRows:
-    """Lengths and angles of ambiguous sign or direction; of many an even sample.
-
-    Args:
-        solution: The solution.
-        sqrt_cov: A square root S of the posterior covariance S S^T of the core, shape (n_columns, k).
-        rank: Number of determined directions.
-    """
+def find_ambiguous_rows(solution: Solution, spread: Spread) -> AmbiguousRows:
+    """Lengths and angles of ambiguous sign or direction; of many an even sample."""
     problem, at = solution.problem, solution.problem.variables.at(solution.parameters)
-    prior = np.diag(problem.variables.prior_scales)
+    prior, n = np.diag(problem.variables.prior_scales), problem.variables.n_columns
+    trigs = problem.data.trigs(problem.robot, solution.parameters)
     n_rows, names, share, turned = 0, list[str](), 0.0, list[str]()
     if not problem.pair_blocks:
         return AmbiguousRows()
@@ -124,9 +120,11 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
         if s.kind.ends != 2 or not set(s.kind.names) <= {"distance", "angle"}:
             continue
         rows = s.train[:: -(-len(s.train) // MAX_ROWS)]
-        end = forward(at.chains[s.table], problem.data.trigs(problem.robot)[s.table], s.ends[rows].ravel())
+        chain, trig = at.chains[s.table], trigs[s.table][s.ends[rows].ravel()]
+        end = forward(chain, trig)
         R = end.rotation.reshape(-1, 2, 3, 3)
-        moved = np.diff(end.jacobian.reshape(len(rows), 2, 6, -1)[..., : len(prior)], axis=1)[:, 0]
+        motion = with_curve_errors(spread, chain, trig, end.jacobian)
+        moved = np.diff(motion.reshape(len(rows), 2, 6, -1), axis=1)[:, 0]
         places = problem.data.places[s.table][s.ends[rows]]
         for k, unit in enumerate(s.kind.units):
             used, sigma, is_length = s.used[rows, k], noise.sigma[rows, k], unit == "m"
@@ -137,16 +135,18 @@ def find_ambiguous_rows(solution: Solution, sqrt_cov: Floats, rank: int) -> Ambi
             f = np.linalg.norm(vector, axis=1)
             to_180 = np.inf if is_length else np.pi - f
             direction = vector / np.maximum(f, 1e-300)[:, None]
-            prior_along = np.sum((direction[:, None] @ J @ prior) ** 2, axis=(1, 2))
-            flips = np.sum((J @ prior) ** 2, axis=(1, 2)) > np.maximum(f / 2.0, 2.0 * sigma) ** 2
+            by_prior = J[..., :n] @ prior
+            prior_along = np.sum((direction[:, None] @ by_prior) ** 2, axis=(1, 2))
+            flips = np.sum(by_prior**2, axis=(1, 2)) > np.maximum(f / 2.0, 2.0 * sigma) ** 2
             flips |= prior_along > np.maximum(to_180 / 2.0, 2.0 * sigma) ** 2
-            leverage, across = _without_itself(direction, J @ sqrt_cov, np.maximum(sigma, 1e-300))
+            A = np.concatenate([J[..., :n] @ spread.root, J[..., n:]], axis=2)
+            leverage, across = _without_itself(direction, A, np.maximum(sigma, 1e-300))
             half = 0.5 * np.maximum(f, 1e-300)
             turns = 0.25 * across / (half if is_length else np.tan(half)) > MAX_SECOND_ORDER * sigma
             for found, which in ((names, flips), (turned, turns)):
                 found += ["-".join(problem.end_names[i + 1] for i in pair) for pair in places[which & used]]
             n_rows += int(used.sum())
-            share += float(leverage[flips & used].sum()) * (len(s.train) / len(rows)) / max(rank, 1)
+            share += float(leverage[flips & used].sum()) * (len(s.train) / len(rows)) / max(spread.rank, 1)
     return AmbiguousRows(n_rows, tuple(names), min(share, 1.0), tuple(turned))
 
 

@@ -399,7 +399,7 @@ def check_signs(case: Case) -> Iterator[Statement]:
     Near 180 degrees a vector has one other sign only: where there are more rows than they determine, a wrong sign shows
     in chi-square. Vectors near 0 point anywhere, which fits.
     """
-    rows = find_ambiguous_rows(case.solution, case.spread.root, case.spread.rank)
+    rows = find_ambiguous_rows(case.solution, case.spread)
     return check_linear(rows, check_linearity(case.solution, case.spread), case.fit.chi_square.too_large)
 
 

@@ -155,11 +155,11 @@ def tool_derivatives(
     """
     trig = covariance.variables.robot.trig(readings, context, covariance.parameters)
     at = forward(chain, trig)
-    motion = _with_curves(covariance, chain, trig, at.jacobian[:, :, : chain.n_columns])
+    motion = with_curve_errors(covariance, chain, trig, at.jacobian[:, :, : chain.n_columns])
     return at.position, motion, at.jacobian[:, :, chain.n_columns :]
 
 
-def _with_curves(covariance: TangentCovariance, chain: Chain, trig: Floats, jacobian: Floats) -> Floats:
+def with_curve_errors(covariance: TangentCovariance, chain: Chain, trig: Floats, jacobian: Floats) -> Floats:
     """Derivatives in a chain's columns as rows of a covariance, shape (n, 6, n_columns + n_curves)."""
     v, curves = covariance.variables, covariance.curves
     rows = np.zeros((*jacobian.shape[:2], v.n_columns + len(curves)))
@@ -194,7 +194,7 @@ def predict_poses(
     chain, trig = chain.at(covariance.parameters), v.robot.trig(readings, context, covariance.parameters)
     at, covariances = forward(chain, trig), np.empty((len(readings), 6, 6))
     for rows in _chunks(len(readings)):
-        motion = _with_curves(covariance, chain, trig[rows], at.jacobian[rows])
+        motion = with_curve_errors(covariance, chain, trig[rows], at.jacobian[rows])
         covariances[rows] = [covariance.covariance(one) for one in motion[:, [3, 4, 5, 0, 1, 2]]]
     return at.position, at.rotation, covariances
 

@@ -11,7 +11,8 @@ from fg_calib import Measurements, Pairing, Robot, assess, build_problem, solve
 from fg_calib.diagnostics import linearity, verdict
 from fg_calib.diagnostics.linearity import AmbiguousRows, Nonlinearity, check_linearity, find_ambiguous_rows
 from fg_calib.graph import unsolved
-from fg_calib.robot import pose
+from fg_calib.robot import ErrorCurve, pose
+from fg_calib.statistics import spread_of
 
 WIDE = {"a": 1e-2, "d": 1e-2, "alpha": 1e-2, "theta": 1e-2}
 SIGMA = 1e-5
@@ -91,6 +92,16 @@ def test_nonlinearity_is_reported_with_its_size_and_rows():
 ROWS = [[0.5, 0, 0, 0], [2e-3, 0, 0, 0]]
 
 
+def test_what_zeros_and_error_curves_share_makes_no_direction_ambiguous():
+    """A zero is known no better than its curve's prior, but what the joint turns is."""
+    robot = small_arm({"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
+    robot, rng = robot.with_effects(ErrorCurve([1, 2], knots=36, sigma=1e-3)), np.random.default_rng(1)
+    true = robot.with_values(robot.nominal + 1e-3 * rng.normal(size=len(robot.parameters)))
+    m = measure(true, 60, rng, sigma=(5e-5, 1e-4))
+    solution = solve(build_problem(robot, m, model="distance-rotation", pairing=Pairing("star")))
+    assert not find_ambiguous_rows(solution, spread_of(solution)).turned
+
+
 def test_rows_of_ambiguous_sign_are_those_that_the_prior_lets_pass_zero_or_half_a_turn():
     """A wrist of radius 2 mm, by hand: the vector of pair k has the prior sigma 2 |sin(turn / 2)| of a2."""
     robot = Robot.from_dh(ROWS, "dh")
@@ -102,7 +113,8 @@ def test_rows_of_ambiguous_sign_are_those_that_the_prior_lets_pass_zero_or_half_
     def rows(tolerance):
         a2 = Robot.from_dh(ROWS, "dh", tolerance={"a": tolerance}).with_estimated(["a2"])
         problem = build_problem(a2, Measurements.from_arrays(q, pairs=pairs), model="distance")
-        return find_ambiguous_rows(unsolved(problem), np.array([[1e-5 / np.linalg.norm(moved)]]), 1)
+        solution, root = unsolved(problem), np.array([[1e-5 / np.linalg.norm(moved)]])
+        return find_ambiguous_rows(solution, replace(spread_of(solution), root=root, rank=1))
 
     # At 1 mrad the vector moves by 0.01 mm, below twice the noise; from 0.2 rad on by more than half its length.
     moved = 2.0 * np.sin(turns / 2.0)
