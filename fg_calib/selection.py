@@ -39,8 +39,8 @@ from fg_calib.statistics.variance_components import settle
 SETTLED = 3e-3
 """Relative change of a prior sigma below which it has settled: a tenth of what it is known to at best."""
 
-LEAST_SIGMA = 1e-9
-"""Smallest prior sigma of an error curve, [rad]."""
+LEAST_SIGMA, MOST_SIGMA = 1e-9, 1e-2
+"""Smallest and largest prior sigma of an error curve, [rad]: a worse gear has another fault, which a curve takes up."""
 
 MAX_ROUNDS = 1000
 """Rounds of a fixed point between two fits."""
@@ -156,7 +156,8 @@ def _next_sigma(solution: graph.Solution, sigma: float) -> float:
     for _ in range(MAX_ROUNDS):
         variance = s**2 / (1.0 + information * s**2)
         gamma = float(np.sum(information * variance))
-        before, s = s, max(np.sqrt(np.sum((variance * right) ** 2) / max(gamma, LEAST_SHARE)), LEAST_SIGMA / sigma)
+        found = np.sqrt(np.sum((variance * right) ** 2) / max(gamma, LEAST_SHARE))
+        before, s = s, float(np.clip(found, LEAST_SIGMA / sigma, MOST_SIGMA / sigma))
         if abs(s / before - 1.0) < 0.1 * SETTLED:
             break
     return float(s * sigma)

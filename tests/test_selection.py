@@ -69,6 +69,15 @@ def test_a_specified_sigma_of_curves_is_kept():
     assert {p.tolerance for p in found.parameters if p.kind == "curve"} == {3.0 * SIGMA}
 
 
+def test_curves_next_to_another_missing_effect_stay_curves():
+    """Of joints that give way by degrees; without a bound the sigma grew without end."""
+    true = arm_with(Compliance(MASSES, [2, 3]))
+    true = true.with_values([1e-3 if p.kind == "compliance" else p.nominal for p in true.parameters])
+    problem = build_problem(arm_with(ErrorCurve([2, 3], 20)), measured(true, 1, n=20), Options(model="position"))
+    (sigma,) = {p.tolerance for p in estimate_curve_sigma(problem).problem.robot.parameters if p.kind == "curve"}
+    assert sigma == pytest.approx(selection.MOST_SIGMA)
+
+
 MASSES = [Mass(3, 10.0, (0.2, 0.0, 0.1))]
 LISTED = (Harmonics([1, 2]), Compliance(MASSES, [2, 3]), Gain(), ErrorCurve([2, 3], 20))
 """Effects that are to be chosen from, not in the order in which they are tried."""

@@ -3,12 +3,12 @@
 A test of residuals adds them stage by stage (see `unmodelled_effects`):
 
 1. compliance of joints that turn: gravity along z of the base, masses of the model or else at the tool and on links;
-2. every small motion of every link, harmonics of one and two periods a turn (eccentric encoders and gears), gains of
-   joints that slide: a constant load of these is their zero;
+2. every small motion of every link, harmonics of one and two periods a turn (eccentric encoders and gears), gains; a
+   constant load of joints that slide is their zero;
 3. the same masses of an arm that is mounted otherwise, gravity along x and y;
 4. joints that tilt, and a base that gives way, under these masses;
 5. harmonics of three to eight periods a turn;
-6. backlash by the last move in the order of rows, and joints that turn with a neighbour;
+6. backlash by the last move in the order of rows, and joints that move with one near them;
 7. other masses than those of the model: free first moments;
 8. zeros of joints that drift in the order of rows, as heat makes them do.
 
@@ -43,24 +43,27 @@ STAGES = tuple(f"{k} " for k in range(1, 9))
 LINK = "2 small motion of link "
 """How those of small motions of links begin, before the number of the joint that moves the link."""
 
-DRIFT = "8 drift"
-"""How those of drifts of joints begin."""
+NEXT = 2
+"""How far apart in their order joints are that gears couple."""
+
+MASSES, DRIFT = "7 masses", "8 drift"
+"""How those of other masses than the model's, and of drifts of joints, begin."""
 
 _WORDS = {
     "1 gravity": "yields to gravity (`compliance`)",
-    "2 position": "errs with its position (gear, encoder: `error_curve`)",
+    "2 gain": "errs in proportion to its position (`gain`)",
+    "2 position": "errs once or twice a turn (gear, encoder: `harmonics`)",
     "3 side load": "yields to loads along x and y of the base (is gravity there? key `gravity`)",
     "4 tilt": "tilts under gravity (`compliance: lateral`)",
     "5 position": "errs several times a turn (gear, encoder: `error_curve`)",
     "6 backlash": "errs with the direction of its last move (`backlash`)",
-    "6 coupling": "turns with a joint near it (`coupling`)",
-    "7 masses": "bears another load than its masses make (`masses`)",
+    MASSES: "bears another load than its masses make (`masses`)",
     DRIFT: "drifts in the order of rows (heat: `thermal`)",
 }
 """Effects of single joints, by how the names of their columns begin, before the number of the joint."""
 
-_BENDING = "4 bending"
-"""The same of the base."""
+_BENDING, _COUPLING = "4 bending", "6 coupling"
+"""The same of the base, and of joints that turn with another one, before the numbers of both."""
 
 
 class LackingEffect(Effect, Record):
@@ -90,6 +93,11 @@ class LackingEffect(Effect, Record):
         return self.effect.values(robot, readings, context, np.zeros(self.n_terms))[:, self.which]
 
 
+def _near(n: int) -> list[tuple[int, int]]:
+    """Numbers of joints that may turn each other: next to each other, or next but one."""
+    return [(i, j) for i in range(1, n + 1) for j in range(1, n + 1) if 0 < abs(i - j) <= NEXT]
+
+
 def lacking_effects(robot: Robot) -> list[LackingEffect]:
     """Effects that a robot lacks.
 
@@ -102,9 +110,8 @@ def lacking_effects(robot: Robot) -> list[LackingEffect]:
     compliant = [(e.terms(arm), e.gravity) for e in own]
     masses = [e.masses for e in own if e.masses] or [[Mass(n + 1, 1.0)], [Mass(k, 1.0) for k in range(1, max(n, 2))]]
     down = next((e.gravity for e in own if e.gravity != "estimate"), GRAVITY)
-    pairs = [(i, j) for i in range(1, n + 1) for j in range(max(i - 2, 1), min(i + 2, n) + 1) if i != j]
-    candidates: list[tuple[str, Effect]] = [("2 position", Gain(slides))] * bool(slides)
-    candidates += [("6 coupling", Coupling(pairs))] if pairs else []
+    candidates: list[tuple[str, Effect]] = [("2 gain", Gain())]
+    candidates += [(f"{_COUPLING} {i} on", Coupling([(i, j)])) for i, j in _near(n)]
     candidates += [(DRIFT, Thermal(0.0, lengths=False, zeros=True, column="order of rows"))] * (len(slides) < n)
     if len(slides) < n:
         candidates += [("2 position", Harmonics()), ("5 position", Harmonics(range(3, 9))), ("6 backlash", Backlash())]
@@ -112,12 +119,12 @@ def lacking_effects(robot: Robot) -> list[LackingEffect]:
             sides = zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), strict=True)
             candidates += [(name, Compliance(some, gravity=g)) for name, g in sides]
             candidates += [("4 tilt", Compliance(some, lateral=True, gravity=down)), (_BENDING, Bending(some, down))]
-        candidates += [("7 masses", Compliance(None, e.joints, gravity=down)) for e in own if e.masses]
+        candidates += [(MASSES, Compliance(None, e.joints, gravity=down)) for e in own if e.masses]
     found = list[LackingEffect]()
     for number, (name, effect) in enumerate(candidates):
         terms = effect.terms(arm)
         new = [k for k, t in enumerate(terms) if t.name not in has]
-        if "position" in name:
+        if name[0] in "25":
             new = [k for k in new if f"{terms[k].name.rpartition('.')[0]}.curve[0]" not in has]
         elif name == "4 tilt":
             new = [k for k in new if not terms[k].name.endswith(".compliance")]
@@ -162,6 +169,9 @@ def causes_of(robot: Robot) -> dict[str, str]:
     """How the names of the columns of each single effect begin, by what it is in words."""
     found = {f"{joint.name} {_WORDS[e]}": f"{e} {k}." for k, joint in enumerate(robot.joints, 1) for e in _WORDS}
     found["the base gives way to the arm's weight (`base_bending`)"] = _BENDING
+    for i, j in _near(robot.n_joints):
+        words = f"{robot.joints[j - 1].name} moves with {robot.joints[i - 1].name} (`coupling: [[{i}, {j}]]`)"
+        found[words] = f"{_COUPLING} {i} on {j}."
     for link in range(robot.n_joints + 1):
         where = {0: "the base", robot.n_joints: "the tool"}.get(link, f"the link after {robot.joints[link - 1].name}")
         found[f"{where} has an error that no estimated parameter describes"] = f"{LINK}{link}."

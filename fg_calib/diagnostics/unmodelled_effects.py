@@ -10,7 +10,7 @@ m its rank and n the residuals that noise can make differ freely. It has an F di
 noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k.
 
 *Lack of fit* adds effects that the model lacks, stage by stage (see `lacking_effects`); the statistics of the stages
-are independent.
+are independent. Where rows are few and residuals large each effect is tried alone too.
 
 A *change point* is a small motion of tool or base from one row of a table on, for every row tried. Other effects
 explain a part of it, so it has to explain nearly all of the misfit, also next to constant small motions of all links
@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.sparse import csr_array
 
-from fg_calib.diagnostics.lacking_effects import DRIFT, LINK, STAGES, causes_of, widened
+from fg_calib.diagnostics.lacking_effects import DRIFT, LINK, MASSES, STAGES, causes_of, widened
 from fg_calib.graph import Problem, SchurComplement, Solution, relinearized_at, subsampled
 from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.inputs import Booleans, Floats, Record
@@ -228,12 +228,16 @@ def of_several(p: float, n: int) -> float:
     return -float(np.expm1(n * np.log1p(-min(p, 1.0 - 1e-16))))
 
 
-def find_systematic(regression: Regression, even: Regression | None = None) -> Systematic | None:
+def find_systematic(
+    regression: Regression, even: Regression | None = None, *, thorough: bool = True
+) -> Systematic | None:
     """Systematic residuals, of all rows whatever their robust weights, and the single effect that explains them best.
 
     Args:
         regression: The rows.
         even: The same with equal noise of all kinds, which the tests take for granted: see `with_even_noise`.
+        thorough: Whether all effects are tried alone too where those of a stage together explain nothing, and of few
+            rows leave no degrees of freedom; else other masses than those of the model.
 
     Returns:
         None where it cannot be told: too few rows, or rows that share errors but are weighted as independent.
@@ -244,18 +248,18 @@ def find_systematic(regression: Regression, even: Regression | None = None) -> S
     regression = even or regression
     clipped = regression.fit.clipped()
     stages = list(regression.staged(clipped))
-    if not stages:
-        return None
-    if (p := of_several(min(p for p, _ in stages), len(stages))) >= LIKE_NOISE:
-        return Systematic(p)
-    best, cause = clipped, ""
-    for words, name in causes_of(problem.robot).items():
-        after = clipped.test(regression.named(name))[2]
-        if after.information < best.information:
-            best, cause = after, words
-    gain = clipped.information - min(fit.information for _, fit in stages)
-    others = " and others" * (clipped.information - best.information < 0.5 * gain)
-    return Systematic(p, cause and cause + others, _regional_variance(problem, whole))
+    p = of_several(min((p for p, _ in stages), default=1.0), max(len(stages), 1))
+    wanted = "" if thorough or p < LIKE_NOISE else MASSES
+    causes = {words: name for words, name in causes_of(problem.robot).items() if name.startswith(wanted)}
+    each = ((words, *clipped.test(regression.named(name))) for words, name in causes.items())
+    alone = [(fit.information, words, p) for words, p, _, fit in each if fit is not clipped]
+    of_one = of_several(min((p for *_, p in alone), default=1.0), max(len(alone), 1))
+    if min(p, of_one) >= LIKE_NOISE:
+        return Systematic(p) if stages else None
+    least, cause, _ = min([*alone, (clipped.information, "", 1.0)])
+    gain = clipped.information - min([least, *(fit.information for _, fit in stages)])
+    others = " and others" * (clipped.information - least < 0.5 * gain)
+    return Systematic(min(p, of_one), cause and cause + others, _regional_variance(problem, whole))
 
 
 def _regional_variance(problem: Problem, fit: LinearFit) -> float:

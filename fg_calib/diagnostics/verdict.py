@@ -143,7 +143,8 @@ class Case(Record):
         found = self.systematic
         if found is None or found.p_value >= effects.LIKE_NOISE or self.setup.explanations:
             return ""
-        return f"{found.cause or 'unmodelled effects'} (p = {max(found.p_value, 1e-300):.1g})"
+        cause = found.cause or "no effect alone explains them (`effects: select`)"
+        return f"{cause} (p = {max(found.p_value, 1e-300):.1g})"
 
     @property
     def too_large(self) -> bool:
@@ -183,7 +184,8 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     change = effects.find_change(regression) if suspicious and regression is not None else None
     systematic, even = None, effects.with_even_noise(solution, fit.goodness.kinds)
     if regression is not None and change is None:
-        systematic = effects.find_systematic(regression, None if even is solution else effects.regress(even))
+        other = None if even is solution else effects.regress(even)
+        systematic = effects.find_systematic(regression, other, thorough=suspicious)
     case = Case(solution, spread, fit, identifiability, regression, change, systematic)
     found = {check: [statement for statement in check(case) if statement.applies] for check in CHECKS}
     doubts = any(s.severity == "error" for each in found.values() for s in each)

@@ -20,6 +20,7 @@ from pydantic import model_validator
 from fg_calib.inputs import InputError, as_floats, check_names, check_type, did_you_mean, expect, shown, within
 from fg_calib.io.yaml import Number, Positive, Schema, validate
 from fg_calib.robot import EFFECT_KINDS, EFFECTS, Effect, Mass, Robot
+from fg_calib.robot.effects import GUESS
 
 STANDARD = ("error_curve", "compliance", "harmonics", "gain")
 """What `select` tries where nothing is listed."""
@@ -86,7 +87,7 @@ def read_effects(given: Mapping[str, Any], place: str, links: Mapping[Any, Any],
             needed = not free and (key != "backlash" or options.get("side") == "load")
             if needed and not loaded and None in links:
                 masses = masses or tuple(links[None]())
-            expected = NO_MASSES if key == "compliance" else "the mass and com of each link"
+            expected = NO_MASSES if key == "compliance" else f"the mass and com of each link ({GUESS})"
             expect(masses or not needed, here, "no masses", expected)
             if free and "payload" in given[key]:
                 raise InputError(here, "a payload with free masses", "masses: urdf, or by link")

@@ -53,6 +53,9 @@ GRAVITY = (0.0, 0.0, -9.81)
 MOST_GRAVITY = 100.0
 """Size of no gravity that an arm works under, [m/s^2]: it is in mm/s^2."""
 
+GUESS = "a guess, such as 5 kg each, is better than none"
+"""What to do where masses are needed and not known: compliances make up for most of the error."""
+
 MOST_TERMS = 1000
 """Highest order of a harmonic, and most knots a turn."""
 
@@ -336,7 +339,7 @@ class Compliance(_Loaded, Record):
         super().__post_init__()
         if self.masses is None and (self.gravity == "estimate" or self.lateral):
             what = "lateral" if self.lateral else "gravity: estimate"
-            raise InputError("masses", f"found free masses with {what}", "urdf, or masses by link")
+            raise InputError("masses", f"found free masses with {what}", f"urdf, or masses by link ({GUESS})")
 
     @property
     def by_loads(self) -> bool:
@@ -418,7 +421,7 @@ class Bending(_Loaded, Record):
     by_loads = Compliance.by_loads
 
     def terms(self, robot: Robot) -> list[Term]:
-        return [Term("base.bending", 1e-5, 0, robot.end_of(0) - 1, axis) for axis in (Axis.RX, Axis.RY)]
+        return [Term("base.bending", 1e-4, 0, robot.end_of(0) - 1, axis) for axis in (Axis.RX, Axis.RY)]
 
     def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
         moments = _Moments(robot, readings, context, np.array(self.gravity), self.masses)

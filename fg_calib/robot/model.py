@@ -481,9 +481,8 @@ class Robot(inputs.Record):
             InputError: A joint that there is not, or two effects with the same parameters.
         """
         inputs.expect(not self.effects, self.name, "it has effects already", "all of them together")
-        for effect in effects:
-            if not isinstance(effect, Effect):
-                raise InputError("effects", f"found {shown(effect)}", "effects, such as Harmonics([1, 2])")
+        for e in effects:
+            inputs.expect(isinstance(e, Effect), "effects", f"found {shown(e)}", "effects, such as Harmonics([1, 2])")
         effects = tuple(effect.bound(self) for effect in effects)
         parameters, more = list(self.parameters), dict[int, list[Element]]()
         places = {p.name: i for i, p in enumerate(parameters)}

@@ -35,7 +35,7 @@ EFFECTS = {
 }
 """What moves the tool of the 6R arm by 2 to 4 sigma."""
 
-CAUSES = {"gravity": "q2 yields to gravity", "gain": "q3 errs with its position"}
+CAUSES = {"gravity": "q2 yields to gravity", "gain": "q3 errs in proportion to its position"}
 
 
 @pytest.mark.sampled(2)
@@ -46,7 +46,7 @@ def test_an_effect_of_a_few_sigma_is_seen_whatever_noise_is_specified_and_is_no_
         solution = solve(problem_of(robot, m, "position"))
         found = find_systematic(regress(solution))
         assert found.p_value < 1e-6
-        assert found.cause.startswith(CAUSES.get(effect, "q2 errs with its position"))
+        assert found.cause.startswith(CAUSES.get(effect, "q2 errs once or twice a turn"))
         assert find_change(regress(solution)) is None
 
 
@@ -91,14 +91,14 @@ def test_p_values_of_noise_are_uniform_with_error_curves_even_where_their_prior_
 def test_a_missing_harmonic_is_named_next_to_modelled_compliance():
     found = find_systematic(regress(with_curves(np.random.default_rng(1), harmonic=3e-4)))
     assert found.p_value < 1e-6
-    assert found.cause == "j2 errs with its position (gear, encoder: `error_curve`)"
+    assert found.cause == "j2 errs once or twice a turn (gear, encoder: `harmonics`)"
 
 
 def test_what_a_robot_has_is_no_candidate():
     names = {name for name in regress(with_curves(np.random.default_rng(1))).names.tolist() if LINK not in name}
-    shared = {"3 side load", "4 bending", "4 tilt", "6 backlash", "6 coupling", "7 masses", "8 drift"}
-    assert {name.rpartition(" ")[0] for name in names} == {"2 position", *shared}
-    assert [name for name in names if name.startswith("2")] == ["2 position 3.gain0_0"]  # of the joint that slides
+    others = {"3 side", "4 bending", "4 tilt", "6 backlash", "6 coupling", "7 masses", "8 drift"}
+    assert {" ".join(name.split()[:2]) for name in names} == {"2 gain", *others}
+    assert [name for name in names if name.startswith("2")] == ["2 gain 3.gain0_2"]  # of the joint that slides
     hung = regress(with_curves(np.random.default_rng(1), gravity=(9.81, 0.0, 0.0))).names.tolist()
     assert sum(name.startswith("3 side load") for name in hung) == 3  # along y alone, of joints that turn
     assert sum(name.startswith("1 gravity") for name in hung) == 3
@@ -118,27 +118,29 @@ WRONG = [Mass(4, 10.0, (-0.1, 0.2, 0.1)), Mass(2, 5.0)]
         (Bending(MASSES), "base.bending", 1e-5, "the base gives way"),
         (Harmonics((5,)), "theta1.sin5", 5e-4, "j1 errs several times a turn"),
         (Backlash(), "theta1.backlash", 2e-4, "j1 errs with the direction of its last move"),
-        (Coupling([(1, 2)]), "theta2.coupling1", 1e-3, "j2 turns with a joint near it"),
+        (Coupling([(1, 2)]), "theta2.coupling1", 1e-3, "j2 moves with j1 (`coupling: [[1, 2]]`)"),
         (Compliance(MASSES), "theta2.compliance", 1e-4, "j2 bears another load"),
         (Thermal(lengths=False, zeros=True), "theta2.drift", 5e-5, "j2 drifts in the order of rows"),
     ],
 )
-@pytest.mark.parametrize("model", ["position", "pose"])
-def test_each_effect_that_is_missing_is_named(effect, name, size, cause, model):
+@pytest.mark.parametrize(("model", "n"), [("position", 40), ("position", 100), ("pose", 100)])
+def test_each_effect_that_is_missing_is_named(effect, name, size, cause, model, n):
     robot, rng = small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 2e-3, "theta": 2e-3}), np.random.default_rng(1)
     full = robot.with_effects(effect)
     true = full.with_values(full.nominal + size * np.array([p.name == name for p in full.parameters]))
-    q = rng.uniform(-2.5, 2.5, (100, 4)) * [1.0, 1.0, 0.2, 1.0]
-    context = {"moves": np.sign(np.diff(q, axis=0, prepend=q[:1])), "temperature": np.linspace(15.0, 25.0, 100)}
+    q = rng.uniform(-2.5, 2.5, (n, 4)) * [1.0, 1.0, 0.2, 1.0]
+    context = {"moves": np.sign(np.diff(q, axis=0, prepend=q[:1])), "temperature": np.linspace(15.0, 25.0, n)}
     at = forward(build_chain(true), true.trig(q, context))
-    position = at.position + 1e-4 * rng.normal(size=(100, 3))
-    rotation = (Rotation.from_matrix(at.rotation) * Rotation.from_rotvec(2e-4 * rng.normal(size=(100, 3)))).as_matrix()
+    position = at.position + 1e-4 * rng.normal(size=(n, 3))
+    rotation = (Rotation.from_matrix(at.rotation) * Rotation.from_rotvec(2e-4 * rng.normal(size=(n, 3)))).as_matrix()
     m = Measurements.from_arrays(q, position=position, rotation=rotation, sigma_position=1e-4, sigma_orientation=2e-4)
     fitted = robot.with_effects(Compliance(WRONG)) if "another" in cause else robot
     regression = regress(solve(build_problem(fitted, m, model=model)))
-    found = find_systematic(regression)
+    found, quick = (find_systematic(regression, thorough=thorough) for thorough in (True, False))
     assert found.p_value < 1e-6
     assert found.cause.startswith(cause)
+    if "drifts" in cause:  # the last stage: of few rows nothing is left to it
+        assert (quick.p_value < 1e-6) == (n == 100)
     assert find_change(regression) is None
 
 
@@ -205,7 +207,7 @@ def test_noise_of_instruments_with_landmarks_is_not_systematic_and_a_gain_is(ins
     healthy, spoilt = (find_systematic(regress(solve(build_problem(robot, [one])))) for one in (table, wrong))
     assert healthy.p_value > LIKE_NOISE
     assert spoilt.p_value < 1e-6
-    assert "errs with its position" in spoilt.cause
+    assert spoilt.cause.startswith("j2 errs ")
 
 
 def test_sigmas_grow_by_what_regions_of_joint_space_differ_by_but_not_beyond_priors():
