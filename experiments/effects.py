@@ -9,6 +9,7 @@ No measurement frame is known or estimated: the data are how far the tool moved 
 | ranks | how many coefficients of an effect add to the rank of the geometry, next to poses in an unknown frame |
 | arm | the paper's arm with gravity and eccentricities, calibrated with and without them in the model |
 | honesty | squared errors over covariance (NEES) and coverage of 95 % intervals, of a 5-joint arm with effects |
+| named | which effect the report names, of one that the same arm has and its model lacks |
 
 `ranks` has 500 random configurations, chained. In `arm` compliances are 2e-7 rad/(N m), links weigh 15 to 60 kg, first
 and second harmonics are 0.02 deg (1 sigma, every joint); errors of the geometry and noise are the paper's, and a star
@@ -44,22 +45,26 @@ from paper import paper_scenario
 from scipy.spatial.transform import Rotation
 from validation import scenario_of, with_priors
 
-from fg_calib import Measurements, Noise, Options, Pairing, Robot, Scenario, build_problem, simulate, solve
+from fg_calib import Measurements, Noise, Options, Pairing, Scenario, build_problem, simulate, solve
 from fg_calib.baseline import real_errors
+from fg_calib.diagnostics import LIKE_NOISE
+from fg_calib.diagnostics.unmodelled_effects import find_systematic, regress
 from fg_calib.observability import identifiability_of, true_problem
 from fg_calib.prediction import errors_at
-from fg_calib.robot import (
+from fg_calib.robot import Robot, build_chain, forward
+from fg_calib.robot.effects import (
     Backlash,
+    Bending,
     Compliance,
     Coupling,
-    Effect,
     ErrorCurve,
     Gain,
     Harmonics,
     Mass,
-    build_chain,
-    forward,
+    Thermal,
+    last_moves,
 )
+from fg_calib.robot.model import Effect
 from fg_calib.selection import estimate_curve_sigma
 from fg_calib.simulation import Errors, RandomReadings
 from fg_calib.statistics import spread_of, with_left_out
@@ -243,6 +248,20 @@ MAX_RATIO = 2.0
 N, SIGMA_POSITION, SIGMA_ORIENTATION = 90, 1e-4, 2e-4
 
 
+def measured(true: Robot, rng: np.random.Generator) -> Measurements:
+    """Poses of a true arm with noise, while it warms up by 10 K."""
+    q = rng.uniform(-2.5, 2.5, (N, true.n_joints))
+    context = {"moves": last_moves(q), "temperature": np.linspace(15.0, 25.0, N)}
+    at, turns = forward(build_chain(true), true.trig(q, context)), SIGMA_ORIENTATION * rng.normal(size=(N, 3))
+    return Measurements.from_arrays(
+        q,
+        position=at.position + SIGMA_POSITION * rng.normal(size=(N, 3)),
+        rotation=at.rotation @ Rotation.from_rotvec(turns).as_matrix(),
+        sigma_position=SIGMA_POSITION,
+        sigma_orientation=SIGMA_ORIENTATION,
+    )
+
+
 def honesty(task: Task) -> Row:
     """NEES of geometry and effects, and coverage, of one draw."""
     name, _, model = task[0].rpartition(", ")
@@ -250,15 +269,7 @@ def honesty(task: Task) -> Row:
     robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE).with_effects(*effects)
     sigma = np.array([p.tolerance or 0.0 for p in robot.parameters])
     true = robot.with_values(robot.nominal + sigma * rng.normal(size=len(sigma)))
-    q = rng.uniform(-2.5, 2.5, (N, robot.n_joints))
-    at, turns = forward(build_chain(true), true.trig(q)), SIGMA_ORIENTATION * rng.normal(size=(N, 3))
-    data = Measurements.from_arrays(
-        q,
-        position=at.position + SIGMA_POSITION * rng.normal(size=(N, 3)),
-        rotation=at.rotation @ Rotation.from_rotvec(turns).as_matrix(),
-        sigma_position=SIGMA_POSITION,
-        sigma_orientation=SIGMA_ORIENTATION,
-    )
+    data = measured(true, rng)
     told = [replace(p, tolerance=wrong * p.tolerance) if p.kind == "curve" else p for p in robot.parameters]
     options = Options(model=model, frame=VIEWS[model], gauge="prior")
     solution = estimate_curve_sigma(build_problem(replace(robot, parameters=tuple(told)), data, options))
@@ -296,6 +307,55 @@ def honesty_summary(tasks: Sequence[Task], rows: Sequence[Row]) -> Row:
     return found
 
 
+# --- named ------------------------------------------------------------------------------------------------------------
+
+MISSING: dict[str, tuple[str, float, Effect, str]] = {
+    "compliance": ("theta3.compliance", 2e-5, Compliance(LOADS), "q3 yields to gravity"),
+    "lateral": ("theta3.compliance_x", 2e-5, Compliance(LOADS, lateral=True), "q3 tilts"),
+    "bending": ("base.bending", 1e-5, Bending(LOADS), "the base gives way"),
+    "gain": ("theta3.gain", 5e-4, Gain(), "q3 errs in proportion"),
+    "harmonic 2": ("theta3.sin2", 3e-4, Harmonics(), "q3 errs once or twice a turn"),
+    "harmonic 5": ("theta3.sin5", 3e-4, Harmonics([5]), "q3 errs several times a turn"),
+    "backlash": ("theta3.backlash", 2e-4, Backlash(), "q3 errs with the direction"),
+    "coupling": ("theta3.coupling2", 5e-4, Coupling([(2, 3)]), "q3 moves with q2"),
+    "drift": ("theta3.drift", 5e-5, Thermal(lengths=False, zeros=True), "q3 drifts"),
+    "nothing": ("", 0.0, Gain(), ""),
+}
+
+
+def named(task: Task) -> Row:
+    """Whether the effect that an arm has, and its model lacks, is found in residuals, and named."""
+    name, _, model = task[0].rpartition(", ")
+    rng, (coefficient, size, effect, cause) = np.random.default_rng(task[1]), MISSING[name]
+    robot = Robot.from_dh(ROWS, "dh", tool=[0.1, 0, 0.2], tolerance=TOLERANCE)
+    full = robot.with_effects(effect)
+    errors = [
+        size if p.name == coefficient else p.scale * rng.normal() * (p.kind in TOLERANCE) for p in full.parameters
+    ]
+    data = measured(full.with_values(full.nominal + errors), rng)
+    solution = solve(build_problem(robot, data, Options(model=model, frame=VIEWS[model], gauge="prior")))
+    found = find_systematic(regress(solution))
+    systematic = found is not None and found.p_value < LIKE_NOISE
+    right = systematic and found is not None and found.cause.startswith(cause)
+    return {"found": systematic, "right": right if cause else not systematic}
+
+
+def named_summary(tasks: Sequence[Task], rows: Sequence[Row]) -> Row:
+    """Counts by cell."""
+    cells = by_cell(tasks, rows).items()
+    return {
+        name: {key: int(np.sum(of)) for key, of in every.items()} | {"n": len(every["right"])} for name, every in cells
+    }
+
+
+def named_answer(found: Row) -> str:
+    """Counts by effect, of each kind of measurements."""
+    each = {name: " ".join(str(found[f"{name}, {view}"]["right"]) for view in VIEWS) for name in MISSING}
+    n = next(iter(found.values()))["n"]
+    cells = ", ".join(f"{name} {counts}" for name, counts in each.items())
+    return f"Named right by poses, positions, pairs, of {n} each ({N} configurations): {cells}"
+
+
 QUESTIONS = (
     Question("ranks", "What of an arm's effects do distances and rotation angles see, without any frame?",
              lambda n, s: [(a, m, e) for a in ARMS for m in MODELS for e in EFFECTS], ranks, ranks_summary,
@@ -305,6 +365,9 @@ QUESTIONS = (
     Question("honesty", "Are sigmas true?",
              lambda n, s: [(f"{name}, {view}", s + k) for name in SETS for view in VIEWS for k in range(n)], honesty,
              honesty_summary, honesty_answer, (40, 2)),
+    Question("named", "What does a model lack?",
+             lambda n, s: [(f"{name}, {view}", s + k) for name in MISSING for view in VIEWS for k in range(n)], named,
+             named_summary, named_answer, (20, 2)),
 )  # fmt: skip
 
 if __name__ == "__main__":
