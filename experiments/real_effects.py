@@ -249,7 +249,7 @@ def half_answer(found: Row) -> str:
 
 def named_answer(found: Row) -> str:
     """Median and what is named next, by set."""
-    cells = [f"{name} {row['median']:.3f} mm: {row['cause']}" for name, row in found.items()]
+    cells = [f"{name} {row['median']:.3f} mm: {row['cause'].partition(' (')[0]}" for name, row in found.items()]
     return "; ".join(cells) or "the data are missing"
 
 
