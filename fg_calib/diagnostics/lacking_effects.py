@@ -16,6 +16,7 @@ The name of a column begins with its stage and what it is, then has the number o
 """
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from fg_calib.robot.effects import (
     Thermal,
     last_moves,
 )
-from fg_calib.robot.model import Context, Term, kind_of
+from fg_calib.robot.model import Context, Term, kind_of, names_of
 
 STAGES = tuple(f"{k} " for k in range(1, 9))
 """How names of the columns of each stage begin."""
@@ -136,16 +137,14 @@ def lacking_effects(robot: Robot) -> list[LackingEffect]:
     return found
 
 
-def widened(problem: Problem, at: Floats) -> tuple[Variables, Floats, list[Floats]]:
-    """The core's variables at a parameter vector with links' small motions and effects that the robot lacks.
+@lru_cache(maxsize=4)
+def widened_robot(robot: Robot) -> Robot:
+    """A robot with its links' small motions and the effects that it lacks.
 
-    Six columns are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as there
-    are joints.
-
-    Returns:
-        The variables, their parameter vector, and readings of each table for the kernels.
+    Six parameters are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as
+    there are joints.
     """
-    robot, bare = problem.robot, problem.robot.geometry
+    bare, own = robot.geometry, {p.name: p for p in robot.parameters}
     elements, parameters = list(bare.elements), list(bare.parameters)
     for owner in range(robot.n_joints, -1, -1):
         place = bare.end_of(owner)
@@ -154,15 +153,23 @@ def widened(problem: Problem, at: Floats) -> tuple[Variables, Floats, list[Float
             parameters.append(Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0))
     wide = replace(bare, elements=tuple(elements), parameters=tuple(parameters))
     wide = wide.with_effects(*robot.effects, *lacking_effects(robot))
-    own = {p.name: (p, value) for p, value in zip(robot.parameters, at.tolist(), strict=False)}
-    each = [own.get(p.name, (replace(p, tolerance=None), 0.0)) for p in wide.parameters]
-    wide = replace(wide, parameters=tuple(p for p, _ in each))
-    values = np.append([value for _, value in each], at[problem.variables.frame_span])
-    tables = [table.measurements for table in problem.data.tables]
-    given = [{"moves": last_moves(m.readings), "order of rows": np.linspace(-1.0, 1.0, len(m.ids))} for m in tables]
-    trigs = [wide.trig(m.readings, of | dict(m.context), values) for m, of in zip(tables, given, strict=True)]
-    unknown = [table.unknown_frame for table in problem.data.tables]
-    return build_variables(wide, unknown, problem.variables.priors), values, trigs
+    return replace(wide, parameters=tuple(own.get(p.name, replace(p, tolerance=None)) for p in wide.parameters))
+
+
+def widened(problem: Problem, at: Floats) -> tuple[Variables, Floats, list[Floats]]:
+    """The problem with a `widened_robot`, at a parameter vector.
+
+    Returns:
+        The core's variables, their parameter vector, and readings of each table for the kernels.
+    """
+    wide, tables = widened_robot(problem.robot), problem.data.tables
+    own = dict(zip(names_of(problem.robot.parameters), at.tolist(), strict=False))
+    values = np.append([own.get(p.name, 0.0) for p in wide.parameters], at[problem.variables.frame_span])
+    trigs = list[Floats]()
+    for m in (table.measurements for table in tables):
+        context = {"moves": last_moves(m.readings), "order of rows": np.linspace(-1.0, 1.0, len(m.ids))}
+        trigs.append(wide.trig(m.readings, context | dict(m.context), values))
+    return build_variables(wide, [table.unknown_frame for table in tables], problem.variables.priors), values, trigs
 
 
 def causes_of(robot: Robot) -> dict[str, str]:

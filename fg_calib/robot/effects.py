@@ -371,11 +371,11 @@ class Compliance(_Loaded, Record):
         if self.gravity == "estimate":
             tilts = at[-3:-1]
         along = gravity + np.cross([*tilts, 0.0], gravity)
-        own = self._torques(robot, readings, context, joints, along)
-        if np.any(at[: own.shape[1]]):  # as the joints have turned
-            counts = [len(self._loads(robot, i)) or 1 for i in joints]
+        counts = [len(self._loads(robot, i)) or 1 for i in joints]
+        if np.any(own := at[: sum(counts)]):  # as the joints have turned
+            turns = own * self._torques(robot, readings, context, joints, along)
             readings = readings.copy()
-            readings[:, joints] += np.add.reduceat(own * at[: own.shape[1]], np.cumsum([0, *counts[:-1]]), axis=1)
+            readings[:, joints] += np.add.reduceat(turns, np.cumsum([0, *counts[:-1]]), axis=1)
         parts = [self._moments(robot, readings, context, joints, along)]
         if self.gravity == "estimate":  # k M has the tilts' share already: tilts have its derivatives, less that share
             turned = (np.cross(e, gravity) for e in np.eye(3)[:2])
