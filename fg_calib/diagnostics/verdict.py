@@ -111,7 +111,8 @@ class Case(Record):
         spread: The covariance of what was estimated.
         fit: How well it fits.
         identifiability: Identifiability by the rows, with motions that the robot's convention has no parameter for.
-        regression: Its rows, linearised, with what the model does not have; None where the arm was evaluated.
+        regression: Its rows, linearised, with what the model does not have; None where the arm was evaluated
+            or the solver did not converge.
         change: Change while a table was measured.
         systematic: See `Verdict`.
         setup: The set-up, which is checked after all else.
@@ -179,7 +180,7 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
         identifiability: Identifiability by the rows.
     """
     problem = solution.problem
-    regression = None if problem.evaluated else effects.regress(solution)
+    regression = None if problem.evaluated or not solution.converged else effects.regress(solution)
     suspicious = solution.estimated_noise is not None or any(kind.verdict not in FINE for kind in fit.goodness.kinds)
     change = effects.find_change(regression) if suspicious and regression is not None else None
     systematic, even = None, effects.with_even_noise(solution, fit.goodness.kinds)
