@@ -23,7 +23,7 @@ import numpy as np
 from fg_calib.graph import Problem, Variables
 from fg_calib.graph.variables import build_variables
 from fg_calib.inputs import Floats, Record
-from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Effect, Element, Parameter, Robot
+from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS, Effect, Robot
 from fg_calib.robot.effects import (
     GRAVITY,
     Backlash,
@@ -94,6 +94,19 @@ class LackingEffect(Effect, Record):
         return self.effect.values(robot, readings, context, np.zeros(self.n_terms))[:, self.which]
 
 
+class SmallMotions(Effect, Record):
+    """The six small motions of each link: constant terms at its end."""
+
+    def terms(self, robot: Robot) -> list[Term]:
+        each = [(link, kind) for link in range(robot.n_joints + 1) for kind in FRAME_KINDS]
+        names = [f"{LINK}{link}.{kind}" for link, kind in each]
+        places = [(link, robot.end_of(link) - 1, PARAMETER_KINDS[kind].axis) for link, kind in each]
+        return [Term(name, 1.0, *place) for name, place in zip(names, places, strict=True)]
+
+    def values(self, robot: Robot, readings: Floats, context: Context, at: Floats) -> Floats:
+        return np.broadcast_to([1.0, 0.0], (len(readings), len(at), 2))
+
+
 def _near(n: int) -> list[tuple[int, int]]:
     """Numbers of joints that may turn each other: next to each other, or next but one."""
     return [(i, j) for i in range(1, n + 1) for j in range(1, n + 1) if 0 < abs(i - j) <= NEXT]
@@ -144,15 +157,8 @@ def widened_robot(robot: Robot) -> Robot:
     Six parameters are called `LINK` and the number of their joint: those of the base 0, those of the tool as many as
     there are joints.
     """
-    bare, own = robot.geometry, {p.name: p for p in robot.parameters}
-    elements, parameters = list(bare.elements), list(bare.parameters)
-    for owner in range(robot.n_joints, -1, -1):
-        place = bare.end_of(owner)
-        for kind in FRAME_KINDS:
-            elements.insert(place, Element(PARAMETER_KINDS[kind].axis, parameter=len(parameters)))
-            parameters.append(Parameter(f"{LINK}{owner}.{kind}", kind, owner, 0.0))
-    wide = replace(bare, elements=tuple(elements), parameters=tuple(parameters))
-    wide = wide.with_effects(*robot.effects, *lacking_effects(robot))
+    own = {p.name: p for p in robot.parameters}
+    wide = robot.geometry.with_effects(SmallMotions(), *robot.effects, *lacking_effects(robot))
     return replace(wide, parameters=tuple(own.get(p.name, replace(p, tolerance=None)) for p in wide.parameters))
 
 

@@ -14,10 +14,10 @@ from touches import corners, touch
 
 from fg_calib import Measurements, Table, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics import LIKE_NOISE, basis_of
-from fg_calib.diagnostics.lacking_effects import LINK
+from fg_calib.diagnostics.lacking_effects import LINK, widened_robot
 from fg_calib.diagnostics.unmodelled_effects import find_change, find_systematic, forgotten_offsets, regress
 from fg_calib.graph import prior_rows, unknown_prior_rows
-from fg_calib.robot import Robot, build_chain, forward, pose
+from fg_calib.robot import Joint, Robot, RobotBuilder, build_chain, forward, pose
 from fg_calib.robot.effects import Backlash, Bending, Compliance, Coupling, ErrorCurve, Harmonics, Mass, Thermal
 from fg_calib.statistics import estimate_noise, spread_of
 
@@ -104,6 +104,22 @@ def test_what_a_robot_has_is_no_candidate():
     assert sum(name.startswith("1 gravity") for name in hung) == 3
     tilted = regress(with_curves(np.random.default_rng(1), gravity="estimate")).names.tolist()
     assert not any("side load" in name for name in tilted)
+
+
+@pytest.mark.parametrize("convention", ["dh", "poe"])
+def test_a_wider_robot_has_the_loads_of_the_robot(convention):
+    """Masses are where they were, small motions of links are at their ends."""
+    builder = RobotBuilder("arm", convention)
+    for k, axis in enumerate(([0, 0, 1], [0, 1, 0], [0, 1, 0])):
+        if convention == "poe":
+            builder.add_screw_joint(Joint(f"q{k + 1}"), axis, [0.1 * k, 0.0, 0.3 * k])
+        else:
+            builder.add_convention_joint(Joint(f"q{k + 1}"), {"a": 0.3, "alpha": 0.5, "d": 0.1, "theta": 0.0})
+    robot = builder.build().with_effects(Compliance([Mass(3, 2.0, (0.1, 0.2, 0.3)), Mass(2, 1.0)], lateral=True))
+    q, wide = np.random.default_rng(1).uniform(-2.0, 2.0, (5, 3)), widened_robot(robot)
+    first = 3 + 6 * 4  # after joints and small motions
+    own = robot.trig(q)[:, 3:]
+    assert wide.trig(q)[:, first : first + own.shape[1]] == pytest.approx(own, abs=1e-12)
 
 
 WRONG = [Mass(4, 10.0, (-0.1, 0.2, 0.1)), Mass(2, 5.0)]
