@@ -3,11 +3,13 @@
 Each is a score test: the rows are fitted again, linearly, with more columns than the model has (`regress`), and what
 these gain is compared with chance,
 
-    F = |Q^T r|^2 / m over |r - Q Q^T r|^2 / (n - rank J - m)
+    F = |Q^T r|^2 / m over |e|^2 / f
 
 with r the residuals of the model's fit, J its columns, those of the priors too, Q a basis of what the columns add to J,
-m its rank and n the residuals that noise can make differ freely. It has an F distribution whatever the size of the
-noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k.
+m its rank, e the residuals of rows that are left, and f the degrees of freedom of rows alone: those that noise can make
+differ freely, less the trace of the rows' part of J and Q. Priors are guesses, and say nothing of the noise. F has an F
+distribution whatever the size of the noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k. Gross rows
+get a column each.
 
 *Lack of fit* adds effects that the model lacks, stage by stage (see `lacking_effects`); the statistics of the stages
 are independent. Where rows are few and residuals large each effect is tried alone too.
@@ -24,7 +26,7 @@ large, and priors too wide, would make the ratio F too large, so both are made a
 MacKay's fixed point, with tr L S^-1 L^T the number of coefficients that the rows determine (see `error_states`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 
@@ -41,7 +43,6 @@ from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.inputs import Booleans, Floats, Record
 from fg_calib.observability import MissingMotion
 from fg_calib.robot import FRAME_KINDS, PARAMETER_KINDS
-from fg_calib.statistics import KindFit
 
 MAX_ROWS = 10_000
 """Rows by which residuals are tested: more would take long, and are not needed."""
@@ -83,8 +84,8 @@ turn by an angle times their residuals."""
 LEAST_SHARE = 1e-3
 """Share of the information below which a region of joint space says nothing of a direction."""
 
-MOST_TYPICAL = 4.0
-"""Size in robust sigmas beyond which a residual is a gross error."""
+MOST_TYPICAL, MOST_GROSS = 5.0, 20
+"""Size in robust sigmas beyond which a residual is a gross error; and how many of these are looked for."""
 
 
 class Systematic(Record):
@@ -130,25 +131,41 @@ class Offset(Record):
 
 
 class LinearFit(Record):
-    """The linearised fit of rows and priors, and its score tests.
+    """The linearised fit of rows and priors, and its score tests, whose noise is that of the rows alone.
 
     Attributes:
         r: Residuals of the fit, rows first, then priors, shape (n,).
         fitted: Orthonormal basis of its columns, shape (n, rank).
         free: Variance of each residual by noise before the fit, shape (n,).
-        dof: Degrees of freedom.
+        n_rows: How many of them are of rows.
+        n: How many of these noise can make differ freely.
         variance: Of the noise: what a fit with all columns leaves.
     """
 
     r: Floats
     fitted: Floats
     free: Floats
-    dof: int
+    n_rows: int
+    n: int
     variance: float = 1.0
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom of the rows: what priors determine takes none."""
+        return self.n - float(np.sum(self.fitted[: self.n_rows] ** 2))
+
+    @property
+    def square(self) -> float:
+        """Sum of the squares of the rows' residuals."""
+        return float(self.r[: self.n_rows] @ self.r[: self.n_rows])
 
     def padded(self, columns: Floats) -> Floats:
         """Columns of the rows, shape (n_rows, m), of the priors too."""
         return np.pad(columns, ((0, len(self.r) - len(columns)), (0, 0)))
+
+    def with_basis(self, new: Floats) -> "LinearFit":
+        """The fit with more columns, orthonormal and orthogonal to its own."""
+        return replace(self, r=self.r - new @ (new.T @ self.r), fitted=np.hstack([self.fitted, new]))
 
     def test(self, columns: Floats) -> "tuple[float, float, LinearFit]":
         """A score test of more columns of the rows, shape (n_rows, m).
@@ -158,27 +175,33 @@ class LinearFit(Record):
             them; 1, 1 and this fit where they add nothing, or leave too few degrees of freedom.
         """
         new = basis_of(self.padded(columns), self.fitted, SECOND_ORDER * float(np.linalg.norm(self.r)))
-        r, m = self.r - new @ (new.T @ self.r), new.shape[1]
-        after = replace(self, r=r, fitted=np.hstack([self.fitted, new]), dof=self.dof - m)
-        total, rest = float(self.r @ self.r), float(r @ r)
+        after, m = self.with_basis(new), new.shape[1]
         if not m or after.dof < LEAST_LEFT:
             return 1.0, 1.0, self
-        left = max(rest - after.dof * self.variance, 0.0) / max(total - self.dof * self.variance, 1e-300)
-        return float(special.fdtrc(m, after.dof, ((total - rest) / m) / max(rest / after.dof, 1e-300))), left, after
+        gain, noise = float(np.sum((new.T @ self.r) ** 2)), max(after.square / after.dof, 1e-300)
+        left = max(after.square - after.dof * self.variance, 0.0)
+        part = left / max(self.square - self.dof * self.variance, 1e-300)
+        return float(special.fdtrc(m, after.dof, gain / m / noise)), part, after
 
-    def clipped(self) -> "LinearFit":
-        """The fit of residuals that are cut at `MOST_TYPICAL` robust sigmas: gross errors hide effects."""
-        free = self.free - np.sum(self.fitted**2, axis=1)
-        size, seen = np.sqrt(np.maximum(free, 0.0)), free > LEAST_SHARE
-        most = MOST_TYPICAL * 1.4826 * float(np.median(np.abs(self.r[seen]) / size[seen])) * size
-        r = np.clip(self.r, -most, most)
-        return replace(self, r=r - self.fitted @ (self.fitted.T @ r))
+    def without_gross(self) -> "LinearFit":
+        """The fit with a column for each row whose residual is gross, one after the other: these hide effects."""
+        fit = self
+        for _ in range(MOST_GROSS):
+            free = (fit.free - np.sum(fit.fitted**2, axis=1))[: fit.n_rows]
+            ratio = np.abs(fit.r[: fit.n_rows]) / np.sqrt(np.maximum(free, LEAST_SHARE))
+            typical = 1.4826 * float(np.median(ratio[free > LEAST_SHARE])) if np.any(free > LEAST_SHARE) else np.inf
+            worst = int(np.argmax(np.where(free > LEAST_SHARE, ratio, 0.0)))
+            if ratio[worst] <= MOST_TYPICAL * typical:
+                break
+            unit = np.eye(len(fit.r), 1, -worst)
+            new = unit - fit.fitted @ (fit.fitted.T @ unit)
+            fit = fit.with_basis(new / np.linalg.norm(new))
+        return fit
 
     @property
     def information(self) -> float:
         """Schwarz's criterion, whose least value chooses among models."""
-        n = self.dof + self.fitted.shape[1]
-        return float(n * np.log(self.r @ self.r) + self.fitted.shape[1] * np.log(n))
+        return float(self.n * np.log(self.square) + self.fitted.shape[1] * np.log(self.n))
 
 
 class Regression(Record):
@@ -204,7 +227,7 @@ class Regression(Record):
     @cached_property
     def fit_with_noise(self) -> LinearFit:
         """The fit with the noise that one with all columns leaves, at most that specified."""
-        variances = [float(after.r @ after.r) / after.dof for _, after in self.staged(self.fit)]
+        variances = [after.square / after.dof for _, after in self.staged(self.fit)]
         return replace(self.fit, variance=min([1.0, *variances[-1:]]))
 
     def staged(self, fit: LinearFit) -> Iterator[tuple[float, LinearFit]]:
@@ -246,19 +269,19 @@ def find_systematic(
     if problem.rows.counted_as_private or whole.dof < 2 * LEAST_LEFT:
         return None
     regression = even or regression
-    clipped = regression.fit.clipped()
-    stages = list(regression.staged(clipped))
+    clean = regression.fit.without_gross()
+    stages = list(regression.staged(clean))
     p = of_several(min((p for p, _ in stages), default=1.0), max(len(stages), 1))
     wanted = "" if thorough or p < LIKE_NOISE else MASSES
     causes = {words: name for words, name in causes_of(problem.robot).items() if name.startswith(wanted)}
-    each = ((words, *clipped.test(regression.named(name))) for words, name in causes.items())
-    alone = [(fit.information, words, p) for words, p, _, fit in each if fit is not clipped]
+    each = ((words, *clean.test(regression.named(name))) for words, name in causes.items())
+    alone = [(fit.information, words, p) for words, p, _, fit in each if fit is not clean]
     of_one = of_several(min((p for *_, p in alone), default=1.0), max(len(alone), 1))
     if min(p, of_one) >= LIKE_NOISE:
         return Systematic(p) if stages else None
-    least, cause, _ = min([*alone, (clipped.information, "", 1.0)])
-    gain = clipped.information - min([least, *(fit.information for _, fit in stages)])
-    others = " and others" * (clipped.information - least < 0.5 * gain)
+    least, cause, _ = min([*alone, (clean.information, "", 1.0)])
+    gain = clean.information - min([least, *(fit.information for _, fit in stages)])
+    others = " and others" * (clean.information - least < 0.5 * gain)
     return Systematic(min(p, of_one), cause and cause + others, _regional_variance(problem, whole))
 
 
@@ -326,12 +349,12 @@ def forgotten_offsets(regression: Regression) -> tuple[Offset, ...]:
     """Offsets of instruments that were not estimated, are significant, and smaller than the lengths' own spread."""
     fit, found, blocks = regression.fit, list[Offset](), regression.problem.data.blocks
     for table in _offsets(regression.problem).values():
-        spread = np.std(np.concatenate([s.data[s.train, 0] for s in blocks if s.table == table]))
+        spread = np.std(np.concatenate([s.data[s.train, 0] for s in blocks if s.table == table and s.data.shape[1]]))
         column = fit.padded(regression.named(f"{OFFSET}{table},"))[:, 0]
         p, _, after = fit.test(1e6 * column[:, None])  # kept however short: an offset is linear
         if p < P_VALUE:
             new = column - fit.fitted @ (fit.fitted.T @ column)
-            sigma = np.sqrt(float(after.r @ after.r) / after.dof / float(new @ new))
+            sigma = np.sqrt(after.square / after.dof / float(new @ new))
             size = -float(new @ fit.r) / float(new @ new)
             found += [Offset(table, size, float(sigma))] * int(abs(size) < spread)
     return tuple(found)
@@ -346,17 +369,23 @@ def _offsets(problem: Problem) -> dict[int, int]:
     return {place: s.table for place, s in each if np.any(s.nuisances[s.train] == place)}
 
 
-def with_even_noise(solution: Solution, kinds: Sequence[KindFit]) -> Solution:
+def with_even_noise(solution: Solution, regression: Regression) -> Solution:
     """A solution with the noise that the residuals of each kind have, where their ratios to what is specified differ.
 
     Else what is specified too large for one kind, or too small, makes residuals of noise systematic.
     """
-    problem, known = solution.problem, [kind for kind in kinds if kind.degrees >= LEAST_LEFT and kind.typical > 0.0]
-    sizes = {(kind.table, kind.kind): max(kind.typical, LEAST_NOISE) for kind in known}
+    problem, fit = solution.problem, regression.fit.without_gross()
+    each = ((part.table, part.block) for part in regression.problem.rows.parts)
+    names = [(k, name.partition(".")[0]) for k, block in each for _ in range(block.n) for name in block.kind.names]
+    n = len(names)
+    free, squares = (fit.free - np.sum(fit.fitted**2, axis=1))[:n], fit.r[:n] ** 2
+    of = {name: np.array([other == name for other in names]) for name in dict.fromkeys(names)}
+    known = {name: rows for name, rows in of.items() if np.sum(free[rows]) >= LEAST_LEFT}
+    sizes = {name: max(np.sqrt(np.sum(squares[k]) / np.sum(free[k])), LEAST_NOISE) for name, k in known.items()}
     if max(sizes.values(), default=1.0) < MOST_UNEVEN * min(sizes.values(), default=1.0):
         return solution
     given = problem.state.factors
-    factors = {**given, **{key: size * given.get(key, 1.0) for key, size in sizes.items()}}
+    factors = {**given, **{name: float(size) * given.get(name, 1.0) for name, size in sizes.items()}}
     state = replace(problem.state, factors=factors)
     return replace(solution, problem=relinearized_at(problem, solution.parameters, state))
 
@@ -391,8 +420,7 @@ def regress(solution: Solution) -> Regression:
     J_unknown = np.delete(J_unknown, np.s_[at.n_columns : at.n_columns + n_curves], axis=1)
     basis = basis_of(np.concatenate([own[:, :-1], J_prior, J_unknown]))
     r, ones = np.concatenate([own[:, -1], r_prior, r_unknown]), np.ones(len(r_prior) + len(r_unknown))
-    dof = problem.n_independent + len(ones) - basis.shape[1]
-    fit = LinearFit(r - basis @ (basis.T @ r), basis, np.append(free, ones), dof)
+    fit = LinearFit(r - basis @ (basis.T @ r), basis, np.append(free, ones), len(own), problem.n_independent)
     return Regression(problem, fit, states, J[:, more] / scale, np.array(all_names)[more])
 
 
@@ -412,7 +440,8 @@ def _eliminate(
         specified, 1 at most: else columns take up the pull of the priors.
     """
     m, white = loadings.shape[1], shared.whiten(rows)
-    own = basis_of(white[:, :-1])
+    least = SECOND_ORDER * float(np.linalg.norm(white[:, -1]))  # else zeros alone seem to determine a size
+    own = basis_of(white[:, :-1], least=least)
     rows = np.column_stack([own, white[:, -1] - own @ (own.T @ white[:, -1])])
     L = csr_array(shared.whiten(loadings.toarray())) if shared.n_states else loadings
     g, V = np.linalg.eigh((L.T @ L).toarray())

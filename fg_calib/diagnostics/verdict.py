@@ -183,8 +183,9 @@ def judge(solution: Solution, spread: Spread, fit: Fit, identifiability: Identif
     regression = None if problem.evaluated or not solution.converged else effects.regress(solution)
     suspicious = solution.estimated_noise is not None or any(kind.verdict not in FINE for kind in fit.goodness.kinds)
     change = effects.find_change(regression) if suspicious and regression is not None else None
-    systematic, even = None, effects.with_even_noise(solution, fit.goodness.kinds)
+    systematic = None
     if regression is not None and change is None:
+        even = effects.with_even_noise(solution, regression)
         other = None if even is solution else effects.regress(even)
         systematic = effects.find_systematic(regression, other, thorough=suspicious)
     case = Case(solution, spread, fit, identifiability, regression, change, systematic)

@@ -169,7 +169,8 @@ def test_curves_are_eliminated_as_dense_columns_with_their_priors_would_be():
     Q = basis_of(np.vstack([J, J_0, J_1]))
     r = np.concatenate([r, r_0, r_1])
     assert regression.fit.r @ regression.fit.r == pytest.approx(np.sum((r - Q @ (Q.T @ r)) ** 2), rel=0.05)
-    assert regression.fit.dof == len(r) - Q.shape[1]
+    of_rows = np.r_[: problem.n_residuals, len(r) - len(r_1) : len(r)]  # and of curves
+    assert regression.fit.dof == pytest.approx(len(of_rows) - np.sum(Q[of_rows] ** 2), rel=1e-3)
     curves = regression.fit.r[problem.n_residuals :][: len(r_1)]  # a state is minus its coefficient
     assert np.corrcoef(curves, r_1)[0, 1] < -0.99
 
@@ -287,6 +288,25 @@ def test_noise_specified_too_large_is_no_effect():
     m = measure(true_robot(robot, rng), 60, rng, sigma=(1e-4, 1e-4))
     wide = replace(m, sigma_position=5.0 * m.sigma_position, sigma_orientation=5.0 * m.sigma_orientation)
     assert find_systematic(regress(solve(build_problem(robot, wide, model="pose")))).p_value > 1e-3
+
+
+@pytest.mark.parametrize("model", ["position", "pose"])
+def test_gross_rows_are_outliers_and_hide_no_effect(model):
+    for effect in (None, of_joint(1, lambda *at: 4.0 * gravity(*at))):
+        robot, m = measured("6R", np.random.default_rng(3), effect=effect, n=50)
+        m = replace(m, position=plus(m.position, [4, 20, 33], 0.003))
+        verdict = assess(solve(problem_of(robot, m, model))).verdict
+        assert (verdict.systematic.p_value < LIKE_NOISE) == (effect is not None)
+        assert any("outliers: 3" in text for text in verdict.errors) == (effect is None)
+
+
+def test_priors_that_are_too_wide_are_no_effect():
+    """Their residuals are small, and say nothing of the noise of few rows."""
+    for seed in range(6):
+        robot, m = measured("6R", np.random.default_rng(seed), n=20)
+        wide = [replace(p, tolerance=p.tolerance and 5.0 * p.tolerance) for p in robot.parameters]
+        solution = solve(problem_of(replace(robot, parameters=tuple(wide)), m, "position"))
+        assert find_systematic(regress(solution)).p_value > LIKE_NOISE
 
 
 def test_noise_specified_too_large_for_one_kind_is_no_effect():
