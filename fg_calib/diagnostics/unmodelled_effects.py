@@ -57,7 +57,7 @@ LEAST_SIDE, MAX_TRIED = 6, 100
 """Configurations before and after a change, and rows at which one is tried, evenly spaced if there are more."""
 
 P_VALUE = 1e-6
-"""P-value below which a change, an offset and a missing parameter are significant: other effects mimic a little."""
+"""P-value below which a change, an offset, a missing parameter, and an effect alone are significant: others mimic."""
 
 CHANGE_LEFT, MISSING_LEFT = 0.25, 0.8
 """Part of the excess of chi-square that a change, and a missing parameter of the convention, leave at most."""
@@ -77,9 +77,9 @@ OFFSET = "offset "
 LIKE_NOISE = 1e-4
 """P-value below which residuals are systematic."""
 
-SECOND_ORDER = 10.0
+SECOND_ORDER, OWN_SECOND_ORDER = 100.0, 10.0
 """Length of a column per 1 rad or 1 m, over that of the residuals, below which it is their own: points that are touched
-turn by an angle times their residuals."""
+turn by an angle times their residuals, by an effect times a multiple of them. The second is of the model's columns."""
 
 LEAST_SHARE = 1e-3
 """Share of the information below which a region of joint space says nothing of a direction."""
@@ -277,7 +277,7 @@ def find_systematic(
     each = ((words, *clean.test(regression.named(name))) for words, name in causes.items())
     alone = [(fit.information, words, p) for words, p, _, fit in each if fit is not clean]
     of_one = of_several(min((p for *_, p in alone), default=1.0), max(len(alone), 1))
-    if min(p, of_one) >= LIKE_NOISE:
+    if p >= LIKE_NOISE and of_one >= P_VALUE:
         return Systematic(p) if stages else None
     least, cause, _ = min([*alone, (clean.information, "", 1.0)])
     gain = clean.information - min([least, *(fit.information for _, fit in stages)])
@@ -440,7 +440,7 @@ def _eliminate(
         specified, 1 at most: else columns take up the pull of the priors.
     """
     m, white = loadings.shape[1], shared.whiten(rows)
-    least = SECOND_ORDER * float(np.linalg.norm(white[:, -1]))  # else zeros alone seem to determine a size
+    least = OWN_SECOND_ORDER * float(np.linalg.norm(white[:, -1]))  # else zeros alone seem to determine a size
     own = basis_of(white[:, :-1], least=least)
     rows = np.column_stack([own, white[:, -1] - own @ (own.T @ white[:, -1])])
     L = csr_array(shared.whiten(loadings.toarray())) if shared.n_states else loadings
