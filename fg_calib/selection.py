@@ -194,6 +194,7 @@ def select_effects(job: Job, solve: Callable[[Job], graph.Solution]) -> tuple[Jo
                 test, more = choice.test(fewer, mine)
                 if more and choice.prefers(fewer | more, kept):
                     found[i], kept = test, fewer | more
+                    found[j] = replace(found[j], kept=False, reason=f"{test.effect} in its place")
         if kept == before:
             break
     return _with_effects(job, kept), tuple(found.values())

@@ -11,7 +11,7 @@ differ freely, less the trace of the rows' part of J and Q. Priors are guesses, 
 distribution whatever the size of the noise. The least p-value p of k tests has the p-value 1 - (1 - p)^k. Gross rows
 get a column each.
 
-*Lack of fit* adds effects that the model lacks, stage by stage (see `lacking_effects`); the statistics of the stages
+*Lack of fit* adds effects that the model lacks, stage by stage (see `candidate_effects`); the statistics of the stages
 are independent. Where rows are few and residuals large each effect is tried alone too.
 
 A *change point* is a small motion of tool or base from one row of a table on, for every row tried. Other effects
@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.sparse import csr_array
 
-from fg_calib.diagnostics.lacking_effects import DRIFT, LINK, MASSES, STAGES, causes_of, widened
+from fg_calib.diagnostics.candidate_effects import DRIFT, LINK, MASSES, STAGES, causes_of, widened
 from fg_calib.graph import Problem, SchurComplement, Solution, relinearized_at, subsampled
 from fg_calib.graph.variables import prior_rows, unknown_prior_rows
 from fg_calib.inputs import Booleans, Floats, Record
@@ -208,7 +208,7 @@ class Regression(Record):
     """The fit of a solution, linearised, and columns that it does not have.
 
     These are the six small motions of each link (`LINK`, the number of the joint before it, the kind), the offsets of
-    tables that were not estimated (`OFFSET`, the number of the table), and effects (see `lacking_effects`).
+    tables that were not estimated (`OFFSET`, the number of the table), and effects (see `candidate_effects`).
 
     Attributes:
         problem: The problem of the rows, which count as their noise says: at most `MAX_ROWS`, evenly drawn.

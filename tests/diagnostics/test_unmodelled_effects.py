@@ -14,7 +14,7 @@ from touches import corners, touch
 
 from fg_calib import Measurements, Table, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics import LIKE_NOISE, basis_of
-from fg_calib.diagnostics.lacking_effects import LINK, widened_robot
+from fg_calib.diagnostics.candidate_effects import LINK, widened_robot
 from fg_calib.diagnostics.unmodelled_effects import find_change, find_systematic, forgotten_offsets, regress
 from fg_calib.graph import prior_rows, unknown_prior_rows
 from fg_calib.robot import Joint, Robot, RobotBuilder, build_chain, forward, pose

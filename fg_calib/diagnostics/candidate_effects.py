@@ -1,4 +1,4 @@
-"""The effects that a robot lacks, and small motions of its links, as columns of a wider robot.
+"""Candidates for what a model lacks: effects, and small motions of links, as parameters of a wider robot.
 
 A test of residuals adds them stage by stage (see `unmodelled_effects`):
 
@@ -67,7 +67,7 @@ _BENDING, _COUPLING = "4 bending", "6 coupling"
 """The same of the base, and of joints that turn with another one, before the numbers of both."""
 
 
-class LackingEffect(Effect, Record):
+class CandidateEffect(Effect, Record):
     """Terms of an effect that a robot lacks, by names of their own.
 
     Attributes:
@@ -108,11 +108,11 @@ class SmallMotions(Effect, Record):
 
 
 def _near(n: int) -> list[tuple[int, int]]:
-    """Numbers of joints that may turn each other: next to each other, or next but one."""
+    """Numbers of joints that gears may couple, the driving one first."""
     return [(i, j) for i in range(1, n + 1) for j in range(1, n + 1) if 0 < abs(i - j) <= NEXT]
 
 
-def lacking_effects(robot: Robot) -> list[LackingEffect]:
+def candidates_for(robot: Robot) -> list[CandidateEffect]:
     """Effects that a robot lacks.
 
     It has the loads in a direction at joints that are compliant under a gravity that is not across it. An error curve
@@ -126,15 +126,15 @@ def lacking_effects(robot: Robot) -> list[LackingEffect]:
     down = next((e.gravity for e in own if e.gravity != "estimate"), GRAVITY)
     candidates: list[tuple[str, Effect]] = [("2 gain", Gain())]
     candidates += [(f"{_COUPLING} {i} on", Coupling([(i, j)])) for i, j in _near(n)]
-    candidates += [(DRIFT, Thermal(0.0, lengths=False, zeros=True, column="order of rows"))] * (len(slides) < n)
     if len(slides) < n:
+        candidates += [(DRIFT, Thermal(0.0, lengths=False, zeros=True, column="order of rows"))]
         candidates += [("2 position", Harmonics()), ("5 position", Harmonics(range(3, 9))), ("6 backlash", Backlash())]
         for some in masses:
             sides = zip(("3 side load", "3 side load", "1 gravity"), np.eye(3).tolist(), strict=True)
             candidates += [(name, Compliance(some, gravity=g)) for name, g in sides]
             candidates += [("4 tilt", Compliance(some, lateral=True, gravity=down)), (_BENDING, Bending(some, down))]
         candidates += [(MASSES, Compliance(None, e.joints, gravity=down)) for e in own if e.masses]
-    found = list[LackingEffect]()
+    found = list[CandidateEffect]()
     for number, (name, effect) in enumerate(candidates):
         terms = effect.terms(arm)
         new = [k for k, t in enumerate(terms) if t.name not in has]
@@ -146,7 +146,7 @@ def lacking_effects(robot: Robot) -> list[LackingEffect]:
             axis = int(np.argmax(effect.gravity))
             loaded = {t.owner for terms, g in compliant for t in terms if g == "estimate" or g[axis]}
             new = [k for k, t in enumerate(terms) if t.owner not in loaded]
-        found.append(LackingEffect(number, name, effect, len(terms), tuple(new)))
+        found.append(CandidateEffect(number, name, effect, len(terms), tuple(new)))
     return found
 
 
@@ -158,7 +158,7 @@ def widened_robot(robot: Robot) -> Robot:
     there are joints.
     """
     own = {p.name: p for p in robot.parameters}
-    wide = robot.geometry.with_effects(SmallMotions(), *robot.effects, *lacking_effects(robot))
+    wide = robot.geometry.with_effects(SmallMotions(), *robot.effects, *candidates_for(robot))
     return replace(wide, parameters=tuple(own.get(p.name, replace(p, tolerance=None)) for p in wide.parameters))
 
 
