@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, kstest
 from simulated import measure, measure_points, plus, small_arm, true_robot
 from systematic import PLACED, SIGMA, SIGMA_JOINT, arm, measured, of_joint, problem_of
-from touches import corners, touch
+from touches import corners, reach, touch
 
 from fg_calib import Measurements, Table, assess, build_problem, calibrate, solve
 from fg_calib.diagnostics import LIKE_NOISE, basis_of
@@ -282,6 +282,16 @@ def test_outliers_are_no_change(row):
         assert find_change(regress(solve(problem_of(robot, spoilt, "position")))) is None
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_drift_along_a_sweep_is_no_change(seed):
+    robot, rng = arm("6R"), np.random.default_rng(seed)
+    true, q = true_robot(robot, rng), rng.uniform(-2.0, 2.0, (60, 6))
+    q = q[np.argsort(q[:, 0])]
+    drifted = q + 3e-4 * np.linspace(-1.0, 1.0, 60)[:, None] * (np.arange(6) == 1)
+    m = measure(true, 60, rng, sigma=SIGMA, sigma_joint=SIGMA_JOINT, frame=PLACED, readings=drifted)
+    assert find_change(regress(solve(problem_of(robot, replace(m, readings=q), "position")))) is None
+
+
 def test_noise_specified_too_large_is_no_effect():
     """Else the columns of effects take up the pull of the priors, as residuals are small."""
     rng, robot = np.random.default_rng(5), small_arm(tolerance={"a": 1e-3, "d": 1e-3, "alpha": 1e-3, "theta": 1e-3})
@@ -351,3 +361,13 @@ def test_a_forgotten_offset_is_reported_with_its_size():
     verdict, healthy = assess(solution).verdict, assess(estimated).verdict
     assert any("(`offset: estimate`)" in text for text in (*verdict.errors, *verdict.warnings))
     assert not any("offset: estimate" in text for text in (*healthy.errors, *healthy.warnings, *healthy.notes))
+
+
+def test_a_table_of_contacts_and_lengths_has_an_offset_to_look_for():
+    robot, rng = small_arm(tolerance={"a": 1e-3, "theta": 1e-3}), np.random.default_rng(1)
+    true, k, far = true_robot(robot, rng), np.arange(60) % 3, np.arange(60) % 2 == 0
+    points = pose(true, 0.4 + 0.15 * rng.normal(size=(3, 4))).position
+    q = np.where(far[:, None], rng.uniform(-1.0, 1.0, (60, 4)), reach(true, points[k], rng))
+    lengths = np.where(far, np.linalg.norm(pose(true, q).position - points[k], axis=1), 0.0)
+    m = Measurements.from_arrays(q, anchor=[f"p{i}" for i in k], distance=lengths, sigma_distance=1e-4)
+    assert forgotten_offsets(regress(solve(build_problem(robot, [Table(m, "anchor", frame="known")])))) == ()

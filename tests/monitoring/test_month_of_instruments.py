@@ -7,6 +7,7 @@ from scipy import stats
 from simulated import small_arm
 
 from fg_calib import Noise, calibrate
+from fg_calib.diagnostics import LIKE_NOISE
 from fg_calib.simulation.scenario import Errors
 
 FEW = ("anchors", "stations", "offset")
@@ -48,6 +49,12 @@ def finer(by):
         "noise": Noise(by * SIGMA.position, by * SIGMA.orientation, 0.0, **sigma),
         "errors": Errors("normal", {kind: size for kind, size in tolerance.items() if kind != "tool"}),
     }
+
+
+def test_touches_of_an_update_are_no_effect():
+    """Touched points turn by an angle times their residuals, and effects by multiples of that."""
+    robot, _, old, new = months_of("contact", 0, **finer(1e-3))
+    assert calibrate(robot, old).update(new).assessed[1].verdict.systematic.p_value > LIKE_NOISE
 
 
 @pytest.mark.slow
